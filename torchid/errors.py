@@ -1,0 +1,84 @@
+"""Errors and warnings of torchid: each takes data and writes its own one-line message."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class TorchidError(Exception):
+    """Base of every error that torchid raises on purpose."""
+
+
+class InputError(TorchidError, ValueError):
+    """Something a user supplied cannot be used.
+
+    The message is one line: where it was found (a file or an argument), which field, what was found and what
+    is accepted.
+    """
+
+    def __init__(self, source: object, field: str, found: str, accepted: str) -> None:
+        self.source, self.field, self.found, self.accepted = str(source), field, found, accepted
+        message = f"{source}: {field}: {found}; accepted: {accepted}"
+        super().__init__(" ".join(message.split()))
+
+
+class UrdfError(InputError):
+    """A URDF that does not describe a tree of rigid bodies torchid can use."""
+
+
+class LogError(InputError):
+    """A log that is malformed, inconsistent, or lacks what the run needs."""
+
+
+class ConfigError(InputError):
+    """An experiment file or an override with an unknown key or an unusable value."""
+
+
+class SensorError(InputError):
+    """A sensor set or contact that does not fit the robot."""
+
+
+class UnknownNameError(InputError, KeyError):
+    """A name that nothing answers to; the message lists the nearest valid names."""
+
+    def __init__(self, source: object, field: str, name: str, valid: Iterable[str]) -> None:
+        self.name, self.valid = name, tuple(valid)
+        super().__init__(source, field, f"unknown name '{name}'", nearest(name, self.valid))
+
+    __str__ = Exception.__str__  # KeyError would show the repr of the message
+
+
+class BaseLostError(TorchidError):
+    """The floating base cannot be seen through the projection: rank(S_b V_x) < 6 in some contact state."""
+
+
+class TorchidWarning(UserWarning):
+    """Base of every warning that torchid gives on purpose."""
+
+
+class MasslessBodyWarning(TorchidWarning):
+    """A body that no child follows has no inertia; its inertial parameters stay out of the fit."""
+
+
+class UnphysicalInertiaWarning(TorchidWarning):
+    """A link's or body's inertia belongs to no distribution of positive mass."""
+
+
+
+class BaseLostWarning(TorchidWarning):
+    """As BaseLostError, for those who asked to go on."""
+
+
+class NumericalWarning(TorchidWarning):
+    """A result whose accuracy is limited by the conditioning of the problem."""
+
+
+def nearest(name: str, valid: Iterable[str], limit: int = 3) -> str:
+    """The names in `valid` closest to `name`, or the first few of them, as one readable string."""
+    valid = list(valid)
+    close = difflib.get_close_matches(name, valid, n=limit, cutoff=0.5)
+    if close:
+        return ", ".join(close)
+    shown = ", ".join(valid[:8])
+    return (f"{shown}, ... ({len(valid)} names)" if len(valid) > 8 else shown) or "none"

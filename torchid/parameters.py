@@ -1,0 +1,95 @@
+"""The order of the parameters of a body, and the linear algebra that depends on it.
+
+This is the only module that spells the order (Mistry et al. 2009, eq. 4): twelve numbers per body, inertia about
+the origin of the body's link frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+PARAMETERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "fc", "fv")
+UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6, "N m", "N m s/rad")
+PER_BODY = len(PARAMETERS)
+INERTIAL = slice(0, 10)
+MASS = 0
+FIRST_MOMENT = slice(1, 4)
+INERTIA = slice(4, 10)
+FRICTION = slice(10, 12)
+COULOMB, VISCOUS = 10, 11
+
+INERTIA_AXES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Row and column of the inertia matrix that each of the six inertia numbers stands for."""
+
+PINOCCHIO_ORDER = (0, 1, 2, 3, 4, 5, 7, 6, 8, 9)
+"""`phi[list(PINOCCHIO_ORDER)]` are the ten inertial numbers in Pinocchio's order (Ixx, Ixy, Iyy, Ixz, Iyz, Izz)."""
+
+
+def inertia_matrix(phi: Array) -> Array:
+    """Rotational inertia about the link origin, (..., 3, 3) [kg m^2], of parameters (..., >= 10)."""
+    inertia = np.empty((*phi.shape[:-1], 3, 3))
+    for value, (row, column) in zip(np.moveaxis(phi[..., INERTIA], -1, 0), INERTIA_AXES, strict=True):
+        inertia[..., row, column] = inertia[..., column, row] = value
+    return inertia
+
+
+def inertial_vector(mass: float, com: Array, inertia_com: Array) -> Array:
+    """Ten inertial numbers about the link origin from the usual description.
+
+    Args:
+        mass: [kg].
+        com: centre of mass in the link frame, (3,) [m].
+        inertia_com: rotational inertia about the centre of mass, link axes, (3, 3) [kg m^2].
+    """
+    inertia = inertia_com + mass * (com @ com * np.eye(3) - np.outer(com, com))
+    return np.array([mass, *(mass * com), *(inertia[row, column] for row, column in INERTIA_AXES)])
+
+
+def mass_com_inertia(phi: Array) -> tuple[float, Array, Array]:
+    """Inverse of `inertial_vector`: mass [kg], centre of mass (3,) [m], inertia about it (3, 3) [kg m^2]."""
+    mass = float(phi[MASS])
+    com = phi[FIRST_MOMENT] / mass
+    inertia = inertia_matrix(phi) - mass * (com @ com * np.eye(3) - np.outer(com, com))
+    return mass, com, inertia
+
+
+def pseudo_inertia(phi: Array) -> Array:
+    """Pseudo-inertia matrix, (..., 4, 4), positive semidefinite for every body of positive mass density.
+
+    Source: Wensing, Kim, Slotine, "Linear matrix inequalities for physically consistent inertial parameter
+    identification", RA-L 2018, eq. (17).
+    """
+    inertia = inertia_matrix(phi)
+    pseudo = np.empty((*phi.shape[:-1], 4, 4))
+    trace = np.trace(inertia, axis1=-2, axis2=-1)[..., None, None]
+    pseudo[..., :3, :3] = 0.5 * trace * np.eye(3) - inertia
+    pseudo[..., :3, 3] = pseudo[..., 3, :3] = phi[..., FIRST_MOMENT]
+    pseudo[..., 3, 3] = phi[..., MASS]
+    return pseudo
+
+
+def _from_pseudo_inertia(pseudo: Array) -> Array:
+    second_moment = pseudo[..., :3, :3]
+    trace = np.trace(second_moment, axis1=-2, axis2=-1)[..., None, None]
+    inertia = trace * np.eye(3) - second_moment
+    rows, columns = zip(*INERTIA_AXES, strict=True)
+    return np.concatenate([pseudo[..., 3, 3:], pseudo[..., :3, 3], inertia[..., rows, columns]], axis=-1)
+
+
+def change_of_frame(T_new_old: Array) -> Array:
+    """Matrix X, (10, 10), with `phi_new = X @ phi_old` for one and the same body.
+
+    Args:
+        T_new_old: pose of the old frame in the new one, (4, 4) [m].
+    """
+    pseudo = pseudo_inertia(np.eye(10))
+    return _from_pseudo_inertia(T_new_old @ pseudo @ T_new_old.T).T
+
+
+def consistency_margin(phi: Array) -> Array:
+    """Smallest eigenvalue of the pseudo-inertia over its largest, (...,); negative means physically impossible."""
+    eigenvalues = np.linalg.eigvalsh(pseudo_inertia(phi))
+    return eigenvalues[..., 0] / np.maximum(eigenvalues[..., -1], np.finfo(float).tiny)

@@ -1,0 +1,85 @@
+"""Wrench that each inertial parameter of each body demands, at the base origin in base axes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchid import parameters
+from torchid.regressor.kinematics import BodyStates, cross, rotate
+
+ALL_INERTIAL = tuple(range(parameters.INERTIAL.stop))
+
+
+def _inertia_moments(omega: Tensor, alpha: Tensor) -> dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]:
+    """Moment E alpha + omega x (E omega) of a unit of each inertia number, about and in the frame; by inertia axes."""
+    x, y, z = omega
+    ax, ay, az = alpha
+    xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
+    return {
+        (0, 0): (ax, xz, -xy),
+        (0, 1): (ay - xz, ax + yz, xx - yy),
+        (0, 2): (az + xy, zz - xx, ax - yz),
+        (1, 1): (-yz, ay, xy),
+        (1, 2): (yy - zz, az - xy, ay + xz),
+        (2, 2): (yz, -xz, az),
+    }
+
+
+def _first_moment_wrenches(omega: Tensor, alpha: Tensor, force: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
+    """Force ([alpha]x + [omega]x^2) e_k and moment e_k x specific force, for k = x, y, z, in the frame."""
+    x, y, z = omega
+    ax, ay, az = alpha
+    xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
+    forces = [[-yy - zz, az + xy, xz - ay], [xy - az, -xx - zz, yz + ax], [xz + ay, yz - ax, -xx - yy]]
+    zero = torch.zeros_like(x)
+    fx, fy, fz = force
+    moments = [[zero, -fz, fy], [fz, zero, -fx], [-fy, fx, zero]]
+    return forces, moments
+
+
+def wrench_columns(states: BodyStates, columns: tuple[int, ...]) -> Tensor:
+    """Wrenches of some inertial parameters for all given bodies.
+
+    Args:
+        states: of the frames the parameters are expressed in, k of them.
+        columns: places in the order of `torchid.parameters`, ascending, below 10.
+
+    Returns:
+        (6, k, len(columns), B): force [N], then moment about the base origin [N m], per unit of the parameter.
+
+    Source: the Newton-Euler equations of a body about its frame's origin, sorted by parameter.
+    """
+    inverse = states.rotation.transpose(0, 1)
+    omega, alpha, force = (
+        rotate(inverse, x) for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
+    )
+    kept_axes = [c - parameters.FIRST_MOMENT.start for c in columns if c in (1, 2, 3)]
+    pushes, twists = _first_moment_wrenches(omega, alpha, force)
+    by_axes = _inertia_moments(omega, alpha)
+    spins = [by_axes[parameters.INERTIA_AXES[c - parameters.INERTIA.start]] for c in columns if c >= 4]
+
+    forces, moments = [], []
+    if parameters.MASS in columns:
+        forces.append(states.specific_force[:, :, None])
+        moments.append(torch.zeros_like(forces[0]))
+    if kept_axes:
+        forces.append(_to_base(states.rotation, [pushes[k] for k in kept_axes]))
+        moments.append(_to_base(states.rotation, [twists[k] for k in kept_axes]))
+    if spins:
+        moments.append(_to_base(states.rotation, spins))
+    pulling = torch.cat(forces, 2)
+    moment = torch.cat(moments, 2)
+    lever = cross(states.position[:, :, None], pulling)
+    moment = torch.cat([moment[:, :, : pulling.shape[2]] + lever, moment[:, :, pulling.shape[2] :]], 2)
+    force_rows = torch.nn.functional.pad(pulling, (0, 0, 0, len(spins)))
+    return torch.cat([force_rows, moment])
+
+
+def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
+    """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B)."""
+    components = [torch.stack([vector[axis] for vector in vectors], dim=1) for axis in range(3)]
+    turned = rotation.unsqueeze(3)
+    return torch.addcmul(
+        torch.addcmul(turned[:, 0] * components[0], turned[:, 1], components[1]), turned[:, 2], components[2]
+    )

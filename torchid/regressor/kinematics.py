@@ -1,0 +1,119 @@
+"""Poses, twists and accelerations of all bodies, batch-last, in the base frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchid.regressor.motion import Motion
+from torchid.regressor.tree import KinematicTree
+
+
+@dataclass(frozen=True)
+class BodyStates:
+    """States of the L joint frames (or link frames) at B samples, in base coordinates.
+
+    `rotation` (3, 3, L, B): columns are the frame's axes. `position` (3, L, B) [m] from the base origin.
+    `angular_velocity`, `angular_acceleration` (3, L, B). `specific_force` (3, L, B): acceleration of the frame's origin
+    minus gravity [m/s^2].
+    """
+
+    rotation: Tensor
+    position: Tensor
+    angular_velocity: Tensor
+    angular_acceleration: Tensor
+    specific_force: Tensor
+
+    def select(self, bodies: list[int]) -> BodyStates:
+        """The states of some bodies; a view where they are consecutive."""
+        first, last = bodies[0], bodies[-1]
+        if bodies == list(range(first, last + 1)):
+            pick = slice(first, last + 1)
+            return BodyStates(*(x[..., pick, :] for x in vars(self).values()))
+        index = torch.tensor(bodies, device=self.rotation.device)
+        return BodyStates(*(x.index_select(-2, index) for x in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class JointStates:
+    """Positions, velocities, accelerations of the base's and all L - 1 joints, (L, B); the base's row is 0."""
+
+    position: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+
+
+def joint_states(tree: KinematicTree, motion: Motion) -> JointStates:
+    """All joints, mimic joints included, from the independent ones."""
+    matrix = tree.joint_map
+    moved = [
+        torch.nn.functional.pad(matrix @ x.T, (0, 0, 1, 0))
+        for x in (motion.joint_position, motion.joint_velocity, motion.joint_acceleration)
+    ]
+    constant = torch.nn.functional.pad(tree.joint_constant, (1, 0))[:, None]
+    return JointStates(moved[0] + constant, moved[1], moved[2])
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product along the first axis of two tensors (3, ...)."""
+    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def rotate(rotation: Tensor, x: Tensor) -> Tensor:
+    """Rotation (3, 3, ...) times vectors (3, ...)."""
+    return torch.addcmul(torch.addcmul(rotation[:, 0] * x[0], rotation[:, 1], x[1]), rotation[:, 2], x[2])
+
+
+def poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation (3, 3, L, B) and position (3, L, B) of all joint frames, for joint positions (L, B)."""
+    samples = position.shape[-1]
+    identity = torch.eye(3, dtype=position.dtype, device=position.device)[..., None, None]
+    rotations = [identity.expand(3, 3, 1, samples)]
+    positions = [position.new_zeros(3, 1, samples)]
+    for bodies, above in tree.levels:
+        parent_rotation = rotations[-1][:, :, above]
+        unmoved = torch.stack([rotate(parent_rotation, tree.rotation[:, k][:, bodies]) for k in range(3)], dim=1)
+        origin = positions[-1][:, above] + rotate(parent_rotation, tree.offset[:, bodies])
+        angle = position[bodies] * tree.revolute[bodies]
+        cosine, sine = torch.cos(angle), torch.sin(angle)
+        x, y, z = unmoved.unbind(1)
+        rotations.append(torch.stack([cosine * x + sine * y, cosine * y - sine * x, z], dim=1))
+        positions.append(torch.addcmul(origin, z, position[bodies] * tree.prismatic[bodies]))
+    return torch.cat(rotations, 2)[:, :, tree.depth_first], torch.cat(positions, 1)[:, tree.depth_first]
+
+
+def body_states(tree: KinematicTree, motion: Motion, joints: JointStates) -> BodyStates:
+    """States of all joint frames.
+
+    Twists and accelerations are sums over ancestors, taken with one product each by the 0/1 ancestor matrix.
+    """
+    rotation, position = poses(tree, joints.position)
+    axis = rotation[:, 2]
+    parents = [0, *tree.parents[1:]]
+
+    base_omega = motion.base_angular_velocity.T[:, None]
+    spin = axis * (joints.velocity * tree.revolute)
+    omega = base_omega + tree.ancestors @ spin
+    parent_omega = omega[:, parents]
+    own = torch.addcmul(cross(parent_omega, spin), axis, joints.acceleration * tree.revolute)
+    alpha = motion.base_angular_acceleration.T[:, None] + tree.ancestors @ own
+    step = position - position[:, parents]
+    carried = cross(alpha[:, parents], step) + cross(parent_omega, cross(parent_omega, step))
+    if any(tree.is_prismatic):
+        slide = axis * tree.prismatic
+        carried = carried + slide * joints.acceleration + 2.0 * cross(parent_omega, slide * joints.velocity)
+    force = motion.base_specific_force.T[:, None] + tree.ancestors @ carried
+    return BodyStates(rotation, position, omega, alpha, force)
+
+
+def link_states(tree: KinematicTree, states: BodyStates) -> BodyStates:
+    """States of the bodies' link frames, from those of their joint frames."""
+    rotation = torch.stack([rotate(states.rotation, tree.link_rotation[:, k]) for k in range(3)], dim=1)
+    if not tree.link_offset.any():
+        return BodyStates(rotation, *list(vars(states).values())[1:])
+    arm = rotate(states.rotation, tree.link_offset)
+    omega, alpha = states.angular_velocity, states.angular_acceleration
+    force = states.specific_force + cross(alpha, arm) + cross(omega, cross(omega, arm))
+    return BodyStates(rotation, states.position + arm, omega, alpha, force)

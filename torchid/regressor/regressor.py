@@ -1,0 +1,85 @@
+"""The regressor K(q, v, a) and frame Jacobians as modules for anybody's training loop."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchid import parameters
+from torchid.regressor.dynamics import all_wrench_columns, friction_columns, joint_directions, joint_row, joint_rows
+from torchid.regressor.kinematics import body_states, joint_states, link_states
+from torchid.regressor.motion import GRAVITY_WORLD, Motion, motion_from_state
+from torchid.regressor.reduction import full_layout
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+
+
+class Regressor(nn.Module):
+    """K(q, v, a) with `K phi = S^T tau + J_C^T lambda` (Mistry et al. 2009, eq. 5).
+
+    Differentiable; `.to(device, dtype)` moves it. Columns: 12 per body, bodies in `robot.body_names`' order,
+    parameters in `torchid.parameters`' order. Rows: base force, base moment (base frame, about the base origin), then
+    joints by `robot.joint_names`; a fixed base has joint rows only.
+    """
+
+    def __init__(self, robot: Robot, gravity: tuple[float, float, float] = GRAVITY_WORLD) -> None:
+        """Build the constants.
+
+        Args:
+            robot: the robot.
+            gravity: (3,), in the world (in the base frame if the base is fixed) [m/s^2].
+        """
+        super().__init__()
+        self.gravity = gravity
+        self.tree = KinematicTree(robot)
+        self._layout = full_layout(self.tree)
+        self._rows = joint_rows(self.tree, self._layout)
+
+    def forward(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """Regressor at generalized coordinates.
+
+        Args:
+            q: (B, n + 7), base position [m], orientation x y z w, joints [rad or m]; (B, n) for a fixed base.
+            v: (B, nv), base linear and angular velocity in the base frame, joints.
+            a: (B, nv), d/dt of `v`.
+
+        Returns:
+            (B, nv, 12 L), a strided view of a batch-last tensor: call `.contiguous()` where layout matters.
+
+        Raises:
+            ValueError: the shapes do not belong together.
+        """
+        return self.from_motion(motion_from_state(q, v, a, not self.tree.base_rows, self.gravity))
+
+    def from_motion(self, motion: Motion) -> Tensor:
+        """As `forward`, from a `Motion` (which knows no base position, heading or linear velocity)."""
+        tree, layout = self.tree, self._layout
+        joints = joint_states(tree, motion)
+        states = body_states(tree, motion, joints)
+        directions = joint_directions(tree, states)
+        wrenches = all_wrench_columns(link_states(tree, states), layout)
+        samples, bodies = wrenches.shape[-1], tree.bodies
+
+        def widen(columns: Tensor, bodies_before: int, bodies_after: int) -> Tensor:
+            """Room for two friction columns per body, and for the bodies this row does not move."""
+            per_body = columns.unflatten(-2, (-1, parameters.INERTIAL.stop))
+            return nn.functional.pad(per_body, (0, 0, 0, 2, bodies_before, bodies_after)).flatten(-3, -2)
+
+        pieces = [widen(wrenches[:6], 0, 0).flatten(0, 1)] if tree.base_rows else []
+        friction_at: list[int] = []
+        friction: list[Tensor] = []
+        width = parameters.PER_BODY * bodies
+        for index, row in enumerate(self._rows):
+            part = joint_row(row, tree, layout, directions, wrenches)
+            first, last = row.start // parameters.INERTIAL.stop, row.end // parameters.INERTIAL.stop
+            pieces.append(widen(part, first, bodies - last))
+            for body, coulomb, viscous in friction_columns(row, joints):
+                start = (tree.base_rows + index) * width + parameters.PER_BODY * body
+                friction_at += [start + parameters.COULOMB, start + parameters.VISCOUS]
+                friction += [coulomb, viscous]
+        if not pieces:
+            return wrenches.new_zeros(samples, 0, width)
+        flat = torch.cat(pieces)
+        if friction:
+            flat.index_copy_(0, torch.tensor(friction_at, device=flat.device), torch.stack(friction))
+        return flat.unflatten(0, (-1, width)).permute(2, 0, 1)

@@ -1,0 +1,165 @@
+"""The robot as the rest of torchid sees it: named bodies in a tree, independent joints, nominal parameters."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pytorch_kinematics as pk
+import torch
+
+from torchid import parameters
+from torchid.errors import MasslessBodyWarning, UnknownNameError, UrdfError
+from torchid.parameters import Array
+from torchid.robot.chain import JointGeometry, build_chain, joint_geometry, link_poses
+from torchid.robot.nominal import nominal_parameters
+from torchid.robot.tree import BodyJoint, build_tree
+from torchid.robot.urdf import read_urdf
+
+
+@dataclass(frozen=True)
+class Body:
+    """One rigid body: a URDF link, the links welded to it, and the joint that moves it (None for the base)."""
+
+    name: str
+    parent: int
+    joint: BodyJoint | None
+    links: tuple[str, ...]
+    massless: bool
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A tree of L bodies in the URDF's depth-first order, moved by n independent joints.
+
+    `nominal`, (L, 12), holds the URDF's parameters in the order of `torchid.parameters`. `links[name]` is the index of
+    the body that carries a URDF link and the link's pose in that body's link frame, (4, 4) [m].
+    """
+
+    path: Path
+    base_link: str
+    fixed_base: bool
+    bodies: tuple[Body, ...]
+    links: dict[str, tuple[int, Array]] = field(repr=False)
+    nominal: Array = field(repr=False)
+    chain: pk.Chain = field(repr=False)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """The n independent joints, depth first; a mimic joint is not one of them."""
+        return tuple(body.joint.name for body in self.bodies if body.joint is not None and body.joint.mimic is None)
+
+    @property
+    def n(self) -> int:
+        """Number of independent joints."""
+        return len(self.joint_names)
+
+    @property
+    def base_rows(self) -> int:
+        """Rows of the dynamics that belong to the base: 6, or 0 for a fixed base."""
+        return 0 if self.fixed_base else 6
+
+    @property
+    def nv(self) -> int:
+        """Number of generalized velocities."""
+        return self.n + self.base_rows
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        """Names of the L bodies: the link each joint moves; the base link for the base."""
+        return tuple(body.name for body in self.bodies)
+
+    @property
+    def massless(self) -> tuple[str, ...]:
+        """Bodies without mass or inertia: their inertial parameters stay out of the fit."""
+        return tuple(body.name for body in self.bodies if body.massless)
+
+    @cached_property
+    def geometry(self) -> JointGeometry:
+        """Joint frames and axes, one row per body."""
+        return joint_geometry(self.chain, self.body_names)
+
+    @cached_property
+    def joint_map(self) -> tuple[Array, Array]:
+        """`(M, c)`, (L - 1, n) and (L - 1,): positions of all joints from the independent ones, `M q + c`."""
+        matrix, constant = np.zeros((len(self.bodies) - 1, self.n)), np.zeros(len(self.bodies) - 1)
+        for row, body in enumerate(self.bodies[1:]):
+            joint = body.joint
+            if joint is not None and joint.mimic is not None:
+                matrix[row, self.joint_names.index(joint.mimic.master)] = joint.mimic.multiplier
+                constant[row] = joint.mimic.offset
+            elif joint is not None:
+                matrix[row, self.joint_names.index(joint.name)] = 1.0
+        return matrix, constant
+
+    def link_poses(self, joint_position: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Pose of every URDF link in the base link's frame, from pytorch-kinematics.
+
+        Args:
+            joint_position: (B, n) [rad or m], by `joint_names`.
+
+        Returns:
+            `T_base_link`, (B, 4, 4) [m], by link name.
+        """
+        matrix, constant = (torch.as_tensor(x, dtype=torch.float64) for x in self.joint_map)
+        in_depth_first_order = joint_position @ matrix.T + constant
+        order = {body.joint.name: i for i, body in enumerate(self.bodies[1:]) if body.joint is not None}
+        columns = [order[name] for name in self.chain.get_joint_parameter_names()]
+        return link_poses(self.chain, in_depth_first_order[:, columns])
+
+    def link(self, name: str, field: str = "link") -> tuple[int, Array]:
+        """Body index and pose in that body, (4, 4) [m], of a URDF link.
+
+        Raises:
+            UnknownNameError: the URDF has no such link.
+        """
+        if name not in self.links:
+            raise UnknownNameError(self.path, field, name, self.links)
+        return self.links[name]
+
+
+def load_robot(path: str | Path, base_link: str | None = None, fixed_base: bool = False) -> Robot:
+    """Read a URDF into a `Robot`.
+
+    Args:
+        path: the URDF file; meshes are never opened.
+        base_link: the link that becomes the floating (or bolted) base, by default the URDF's root.
+        fixed_base: True if the base does not move.
+
+    Raises:
+        UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass.
+
+    Warns:
+        MasslessBodyWarning: a body at the end of a limb has no inertia.
+        UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
+    """
+    path = Path(path)
+    links, joints = read_urdf(path)
+    tree = build_tree(path, links, joints, base_link)
+    nominal = nominal_parameters(path, tree, {link.name: link for link in links})
+    massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
+    if massless.all():
+        raise UrdfError(path, "<inertial>", "no link has mass", "at least one link with mass > 0")
+    bodies = tuple(
+        Body(
+            name,
+            parent=-1 if joint is None else joint.parent,
+            joint=joint,
+            links=tuple(link for link, (body, _) in tree.links.items() if body == index),
+            massless=bool(massless[index]),
+        )
+        for index, (name, joint) in enumerate(zip(tree.names, tree.joints, strict=True))
+    )
+    _warn_of_massless_ends(path, bodies)
+    return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, build_chain(tree))
+
+
+def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:
+    parents = {body.parent for body in bodies}
+    for index, body in enumerate(bodies):
+        if body.massless and index not in parents:
+            message = f"{path}: link '{body.name}': no inertia at the end of a limb; its inertia stays out of the fit"
+            warnings.warn(message, MasslessBodyWarning, stacklevel=3)

@@ -1,0 +1,188 @@
+"""From URDF links and joints to a tree of bodies: any root, fixed joints lumped, mimic joints resolved."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from yourdfpy.urdf import Joint, Link
+
+from torchid.errors import TorchidWarning, UnknownNameError, UrdfError
+from torchid.parameters import Array
+from torchid.robot.urdf import MOVING_TYPES
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """Position = multiplier * (position of the independent joint `master`) + offset [rad or m]."""
+
+    master: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class BodyJoint:
+    """The joint that moves a body.
+
+    `T_parent_joint`, (4, 4), is the pose of the joint frame at position 0 in the parent body's link frame; the joint
+    moves that frame about or along `axis`, (3,), of unit length in it. `T_joint_link`, (4, 4), is the pose of the
+    body's link frame in the moved joint frame: the identity unless the base link turned the joint around.
+    """
+
+    name: str
+    kind: str
+    parent: int
+    axis: Array
+    T_parent_joint: Array
+    T_joint_link: Array
+    mimic: Mimic | None
+    damping: float
+    friction: float
+
+
+@dataclass
+class BodyTree:
+    """Bodies in depth-first order; `links[name]` is the body that carries a URDF link and the link's pose in it."""
+
+    names: list[str]
+    joints: list[BodyJoint | None]
+    links: dict[str, tuple[int, Array]]
+
+
+def build_tree(path: Path, links: list[Link], joints: list[Joint], base_link: str | None) -> BodyTree:
+    """Depth-first tree of bodies from `base_link` (the URDF's root if None).
+
+    Raises:
+        UnknownNameError: `base_link` names no link.
+        UrdfError: the joints do not form one tree, or a mimic chain closes on itself.
+    """
+    root = _find_root(path, links, joints)
+    if base_link is None:
+        base_link = root
+    names = [link.name for link in links]
+    if base_link not in names:
+        raise UnknownNameError(path, "robot.base_link", base_link, names)
+    mimics = _resolve_mimics(path, joints)
+    neighbours: dict[str, list[tuple[Joint, bool]]] = {name: [] for name in names}
+    for joint in joints:  # a parent's own children come first, in the URDF's order
+        neighbours[joint.parent].append((joint, False))
+    for joint in joints:
+        neighbours[joint.child].append((joint, True))
+
+    tree = BodyTree([], [], {})
+    stack: list[tuple[str, Joint | None, bool]] = [(base_link, None, False)]
+    while stack:
+        name, joint, reverse = stack.pop()
+        if joint is None:
+            _start_body(tree, name, None)
+        elif joint.type in MOVING_TYPES and not _is_locked(joint, mimics):
+            _start_body(tree, name, _body_joint(tree, joint, reverse, mimics.get(joint.name)))
+        else:
+            parent = joint.child if reverse else joint.parent
+            body, T_body_parent = tree.links[parent]
+            tree.links[name] = (body, T_body_parent @ _locked_pose(joint, reverse, mimics))
+        ahead = [
+            (other.parent if turned else other.child, other, turned)
+            for other, turned in neighbours[name]
+            if other is not joint
+        ]
+        stack.extend(reversed(ahead))
+    return tree
+
+
+def _find_root(path: Path, links: list[Link], joints: list[Joint]) -> str:
+    parent: dict[str, str] = {}
+    for joint in joints:
+        if joint.child in parent:
+            found = f"child of joint '{joint.name}' and of another joint"
+            raise UrdfError(path, f"link '{joint.child}'", found, "one parent for each link: a tree without loops")
+        parent[joint.child] = joint.parent
+    roots = [link.name for link in links if link.name not in parent]
+    reached, queue = set(roots[:1]), list(roots[:1])
+    children: dict[str, list[str]] = {}
+    for child, above in parent.items():
+        children.setdefault(above, []).append(child)
+    while queue:
+        for child in children.get(queue.pop(), []):
+            reached.add(child)
+            queue.append(child)
+    if len(roots) > 1:
+        raise UrdfError(path, "tree", f"several root links: {', '.join(roots[:4])}", "one link that is no joint's child")
+    if len(reached) < len(links):
+        lost = next(link.name for link in links if link.name not in reached)
+        raise UrdfError(path, f"link '{lost}'", "part of a loop of joints", "a tree without loops")
+    return roots[0]
+
+
+def _resolve_mimics(path: Path, joints: list[Joint]) -> dict[str, Mimic]:
+    """Mimic relations of moving joints, chains of them folded onto the independent joint at their end."""
+    by_name = {joint.name: joint for joint in joints}
+    resolved = {}
+    for joint in joints:
+        if joint.mimic is None or joint.type not in MOVING_TYPES:
+            continue
+        multiplier, offset, master, seen = 1.0, 0.0, joint, {joint.name}
+        while master.mimic is not None and master.type in MOVING_TYPES:
+            offset += multiplier * master.mimic.offset
+            multiplier *= master.mimic.multiplier
+            master = by_name[master.mimic.joint]
+            if master.name in seen:
+                raise UrdfError(path, f"joint '{joint.name}', <mimic>", "a chain that closes on itself", "a free master")
+            seen.add(master.name)
+        if master.type not in MOVING_TYPES:
+            message = f"{path}: joint '{joint.name}': its mimic master '{master.name}' is fixed, so it is held still too"
+            warnings.warn(message, TorchidWarning, stacklevel=4)
+        resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
+    return resolved
+
+
+def _is_locked(joint: Joint, mimics: dict[str, Mimic]) -> bool:
+    return joint.name in mimics and not mimics[joint.name].master
+
+
+def _start_body(tree: BodyTree, name: str, joint: BodyJoint | None) -> None:
+    tree.links[name] = (len(tree.names), np.eye(4))
+    tree.names.append(name)
+    tree.joints.append(joint)
+
+
+def _origin(joint: Joint) -> Array:
+    return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
+
+
+def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None) -> BodyJoint:
+    """The joint as seen from the base: turned around, its frame sits at the child link and its axis flips."""
+    body, T_body_near = tree.links[joint.child if reverse else joint.parent]
+    axis = joint.axis / np.linalg.norm(joint.axis)
+    return BodyJoint(
+        name=joint.name,
+        kind="prismatic" if joint.type == "prismatic" else "revolute",
+        parent=body,
+        axis=-axis if reverse else axis,
+        T_parent_joint=T_body_near if reverse else T_body_near @ _origin(joint),
+        T_joint_link=np.linalg.inv(_origin(joint)) if reverse else np.eye(4),
+        mimic=mimic,
+        damping=(joint.dynamics.damping or 0.0) if joint.dynamics else 0.0,
+        friction=(joint.dynamics.friction or 0.0) if joint.dynamics else 0.0,
+    )
+
+
+def _locked_pose(joint: Joint, reverse: bool, mimics: dict[str, Mimic]) -> Array:
+    """Pose of the far link in the near one across a joint that does not move."""
+    T_parent_child = _origin(joint)
+    if joint.name in mimics:
+        T_parent_child = T_parent_child @ _motion(joint, mimics[joint.name].offset)
+    return np.linalg.inv(T_parent_child) if reverse else T_parent_child
+
+
+def _motion(joint: Joint, position: float) -> Array:
+    axis, T = joint.axis / np.linalg.norm(joint.axis), np.eye(4)
+    if joint.type == "prismatic":
+        T[:3, 3] = position * axis
+    else:
+        T[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
+    return T
