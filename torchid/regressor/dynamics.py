@@ -33,7 +33,7 @@ class JointRow:
 def joint_rows(tree: KinematicTree, layout: ColumnLayout) -> list[JointRow]:
     """One per independent joint."""
     rows = []
-    for column in tree.joint_map.T.tolist():
+    for column in tree.joint_map[1:].T.tolist():
         moved = [(joint + 1, ratio) for joint, ratio in enumerate(column) if ratio]
         start = min(layout.starts[body] for body, _ in moved)
         end = max(layout.starts[tree.subtree_end[body]] for body, _ in moved)

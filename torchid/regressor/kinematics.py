@@ -47,13 +47,8 @@ class JointStates:
 
 def joint_states(tree: KinematicTree, motion: Motion) -> JointStates:
     """All joints, mimic joints included, from the independent ones."""
-    matrix = tree.joint_map
-    moved = [
-        torch.nn.functional.pad(matrix @ x.T, (0, 0, 1, 0))
-        for x in (motion.joint_position, motion.joint_velocity, motion.joint_acceleration)
-    ]
-    constant = torch.nn.functional.pad(tree.joint_constant, (1, 0))[:, None]
-    return JointStates(moved[0] + constant, moved[1], moved[2])
+    position = tree.joint_map @ motion.joint_position.T + tree.joint_constant
+    return JointStates(position, tree.joint_map @ motion.joint_velocity.T, tree.joint_map @ motion.joint_acceleration.T)
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
@@ -68,20 +63,27 @@ def rotate(rotation: Tensor, x: Tensor) -> Tensor:
 
 def poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation (3, 3, L, B) and position (3, L, B) of all joint frames, for joint positions (L, B)."""
-    samples = position.shape[-1]
-    identity = torch.eye(3, dtype=position.dtype, device=position.device)[..., None, None]
-    rotations = [identity.expand(3, 3, 1, samples)]
-    positions = [position.new_zeros(3, 1, samples)]
-    for bodies, above in tree.levels:
-        parent_rotation = rotations[-1][:, :, above]
-        unmoved = torch.stack([rotate(parent_rotation, tree.rotation[:, k][:, bodies]) for k in range(3)], dim=1)
-        origin = positions[-1][:, above] + rotate(parent_rotation, tree.offset[:, bodies])
-        angle = position[bodies] * tree.revolute[bodies]
-        cosine, sine = torch.cos(angle), torch.sin(angle)
-        x, y, z = unmoved.unbind(1)
-        rotations.append(torch.stack([cosine * x + sine * y, cosine * y - sine * x, z], dim=1))
-        positions.append(torch.addcmul(origin, z, position[bodies] * tree.prismatic[bodies]))
-    return torch.cat(rotations, 2)[:, :, tree.depth_first], torch.cat(positions, 1)[:, tree.depth_first]
+    position = position.index_select(0, tree.by_depth)
+    angle = position * tree.revolute.index_select(0, tree.by_depth)
+    slide = position * tree.prismatic.index_select(0, tree.by_depth) if any(tree.is_prismatic) else None
+    cosine, sine = torch.cos(angle), torch.sin(angle)
+    identity = torch.eye(3, 4, dtype=position.dtype, device=position.device)[..., None, None]
+    above = identity.expand(3, 4, 1, position.shape[-1])
+    levels, start = [above], 1
+    for size in tree.level_sizes[1:]:
+        level = slice(start, start + size)
+        above = above.index_select(2, tree.place_above[level])
+        unmoved = rotate(above[:, :, None], tree.pose[:, None, :, level])
+        c, s = cosine[level], sine[level]
+        x, y, z, origin = unmoved.unbind(1)
+        origin = origin + above[:, 3]
+        if slide is not None:
+            origin = torch.addcmul(origin, z, slide[level])
+        above = torch.stack([torch.addcmul(c * x, s, y), torch.addcmul(c * y, s, x, value=-1), z, origin], dim=1)
+        levels.append(above)
+        start += size
+    pose = torch.cat(levels, 2).index_select(2, tree.depth_first)
+    return pose[:, :3], pose[:, 3]
 
 
 def body_states(tree: KinematicTree, motion: Motion, joints: JointStates) -> BodyStates:
@@ -91,16 +93,17 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointStates) -> Bod
     """
     rotation, position = poses(tree, joints.position)
     axis = rotation[:, 2]
-    parents = [0, *tree.parents[1:]]
 
-    base_omega = motion.base_angular_velocity.T[:, None]
+    def of_parent(x: Tensor) -> Tensor:
+        return x.index_select(1, tree.parent)
+
     spin = axis * (joints.velocity * tree.revolute)
-    omega = base_omega + tree.ancestors @ spin
-    parent_omega = omega[:, parents]
+    omega = motion.base_angular_velocity.T[:, None] + tree.ancestors @ spin
+    parent_omega = of_parent(omega)
     own = torch.addcmul(cross(parent_omega, spin), axis, joints.acceleration * tree.revolute)
     alpha = motion.base_angular_acceleration.T[:, None] + tree.ancestors @ own
-    step = position - position[:, parents]
-    carried = cross(alpha[:, parents], step) + cross(parent_omega, cross(parent_omega, step))
+    step = position - of_parent(position)
+    carried = cross(of_parent(alpha), step) + cross(parent_omega, cross(parent_omega, step))
     if any(tree.is_prismatic):
         slide = axis * tree.prismatic
         carried = carried + slide * joints.acceleration + 2.0 * cross(parent_omega, slide * joints.velocity)

@@ -58,28 +58,15 @@ class Regressor(nn.Module):
         states = body_states(tree, motion, joints)
         directions = joint_directions(tree, states)
         wrenches = all_wrench_columns(link_states(tree, states), layout)
-        samples, bodies = wrenches.shape[-1], tree.bodies
-
-        def widen(columns: Tensor, bodies_before: int, bodies_after: int) -> Tensor:
-            """Room for two friction columns per body, and for the bodies this row does not move."""
-            per_body = columns.unflatten(-2, (-1, parameters.INERTIAL.stop))
-            return nn.functional.pad(per_body, (0, 0, 0, 2, bodies_before, bodies_after)).flatten(-3, -2)
-
-        pieces = [widen(wrenches[:6], 0, 0).flatten(0, 1)] if tree.base_rows else []
-        friction_at: list[int] = []
-        friction: list[Tensor] = []
-        width = parameters.PER_BODY * bodies
-        for index, row in enumerate(self._rows):
+        K = wrenches.new_zeros(tree.base_rows + len(self._rows), tree.bodies, parameters.PER_BODY, wrenches.shape[-1])
+        inertial = K[:, :, parameters.INERTIAL]
+        width = parameters.INERTIAL.stop
+        if tree.base_rows:
+            inertial[: tree.base_rows] = wrenches.unflatten(1, (-1, width))
+        for index, row in enumerate(self._rows, start=tree.base_rows):
             part = joint_row(row, tree, layout, directions, wrenches)
-            first, last = row.start // parameters.INERTIAL.stop, row.end // parameters.INERTIAL.stop
-            pieces.append(widen(part, first, bodies - last))
+            inertial[index, row.start // width : row.end // width] = part.unflatten(0, (-1, width))
             for body, coulomb, viscous in friction_columns(row, joints):
-                start = (tree.base_rows + index) * width + parameters.PER_BODY * body
-                friction_at += [start + parameters.COULOMB, start + parameters.VISCOUS]
-                friction += [coulomb, viscous]
-        if not pieces:
-            return wrenches.new_zeros(samples, 0, width)
-        flat = torch.cat(pieces)
-        if friction:
-            flat.index_copy_(0, torch.tensor(friction_at, device=flat.device), torch.stack(friction))
-        return flat.unflatten(0, (-1, width)).permute(2, 0, 1)
+                K[index, body, parameters.COULOMB] = coulomb
+                K[index, body, parameters.VISCOUS] = viscous
+        return K.flatten(1, 2).permute(2, 0, 1)

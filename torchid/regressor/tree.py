@@ -19,73 +19,74 @@ class KinematicTree(nn.Module):
     """Constant tensors of a robot, batch-last: a trailing axis of length 1 broadcasts over samples.
 
     Attributes (buffers, so `.to()` moves and casts them):
-        rotation: (3, 3, L, 1), joint frame at position 0 in the parent's joint frame; `offset`: (3, L, 1) [m].
-        link_rotation, link_offset: the body's link frame in its joint frame.
+        pose: (3, 4, L, 1), rotation and offset [m] of every joint frame at position 0 in its parent's joint frame, bodies
+            sorted by depth (`by_depth`; `depth_first` sorts back).
+        link_rotation, (3, 3, L, 1), and link_offset, (3, L, 1): the body's link frame in its joint frame.
         revolute, prismatic: (L, 1) of 0 and 1.
+        parent: (L,), index of the parent body, 0 for the base.
         ancestors: (L, L), 1 where column j's joint moves body i.
-        joint_map, joint_constant: positions of all L - 1 joints from the n independent ones.
+        joint_map, joint_constant: positions of the base (0) and all L - 1 joints from the n independent ones.
     """
 
-    rotation: Tensor
-    offset: Tensor
+    pose: Tensor
+    by_depth: Tensor
+    depth_first: Tensor
     link_rotation: Tensor
     link_offset: Tensor
     revolute: Tensor
     prismatic: Tensor
+    parent: Tensor
     ancestors: Tensor
     joint_map: Tensor
     joint_constant: Tensor
+    place_above: Tensor
 
     def __init__(self, robot: Robot) -> None:
         super().__init__()
         geometry = robot.geometry
         self.parents = [body.parent for body in robot.bodies]
+        self.is_prismatic = [bool(p) for p in geometry.prismatic]
+        self.base_rows = robot.base_rows
         count = len(self.parents)
-        align = np.stack([_rotation_to_z(axis) for axis in geometry.axis])
-        align[0] = np.eye(3)
         joint_frame = np.tile(np.eye(4), (count, 1, 1))
-        joint_frame[:, :3, :3] = align
+        for body in range(1, count):
+            joint_frame[body, :3, :3] = _rotation_to_z(geometry.axis[body])
         in_parent = np.linalg.inv(joint_frame[self.parents]) @ geometry.T_parent_joint @ joint_frame
         in_parent[0] = np.eye(4)
         self.T_parent_joint: Array = in_parent
         self.T_joint_link: Array = np.linalg.inv(joint_frame) @ geometry.T_joint_link
-        self.is_prismatic = [bool(p) for p in geometry.prismatic]
 
         is_ancestor = np.eye(count)
+        depth = np.zeros(count, dtype=int)
         for body in range(1, count):
             is_ancestor[body] += is_ancestor[self.parents[body]]
-        is_ancestor[:, 0] = 0.0
-        moving = np.arange(count) > 0
-        for name, value in {
-            "rotation": in_parent[:, :3, :3].transpose(1, 2, 0)[..., None],
-            "offset": in_parent[:, :3, 3].T[..., None],
-            "link_rotation": self.T_joint_link[:, :3, :3].transpose(1, 2, 0)[..., None],
-            "link_offset": self.T_joint_link[:, :3, 3].T[..., None],
-            "revolute": (moving & ~geometry.prismatic)[:, None],
-            "prismatic": (moving & geometry.prismatic)[:, None],
-            "ancestors": is_ancestor,
-            "joint_map": robot.joint_map[0],
-            "joint_constant": robot.joint_map[1],
-        }.items():
-            self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=torch.float64), persistent=False)
-        self._order_levels()
-
-        self.base_rows = robot.base_rows
+            depth[body] = depth[self.parents[body]] + 1
         self.subtree_end = [body + int(is_ancestor[:, body].sum()) for body in range(count)]
-        self.subtree_end[0] = count
+        is_ancestor[:, 0] = 0.0
+        by_depth = np.argsort(depth, kind="stable")
+        place = np.argsort(by_depth)
+        self.level_sizes = np.bincount(depth).tolist()
 
-    def _order_levels(self) -> None:
-        """Bodies by depth; `levels` holds, per depth, the bodies and their parents' places one level up."""
-        depth = [0] * len(self.parents)
-        for body, parent in enumerate(self.parents[1:], start=1):
-            depth[body] = depth[parent] + 1
-        by_depth = [[b for b, d in enumerate(depth) if d == level] for level in range(max(depth) + 1)]
-        self.levels = [
-            (bodies, [above.index(self.parents[body]) for body in bodies])
-            for above, bodies in zip(by_depth, by_depth[1:], strict=False)
-        ]
-        order = [body for bodies in by_depth for body in bodies]
-        self.depth_first = [order.index(body) for body in range(len(order))]
+        moving = np.arange(count) > 0
+        matrix, constant = robot.joint_map
+        self._register("pose", in_parent[by_depth, :3].transpose(1, 2, 0)[..., None])
+        self._register("link_rotation", self.T_joint_link[:, :3, :3].transpose(1, 2, 0)[..., None])
+        self._register("link_offset", self.T_joint_link[:, :3, 3].T[..., None])
+        self._register("revolute", (moving & ~geometry.prismatic)[:, None])
+        self._register("prismatic", (moving & geometry.prismatic)[:, None])
+        self._register("ancestors", is_ancestor)
+        self._register("joint_map", np.vstack([np.zeros(robot.n), matrix]))
+        self._register("joint_constant", np.append(0.0, constant)[:, None])
+        parent = np.maximum(self.parents, 0)
+        level_start = np.repeat(np.cumsum([0, 0, *self.level_sizes[:-1]])[:-1], self.level_sizes)
+        self._register("parent", parent)
+        self._register("by_depth", by_depth)
+        self._register("depth_first", place)
+        self._register("place_above", place[parent[by_depth]] - level_start)
+
+    def _register(self, name: str, value: np.ndarray) -> None:
+        dtype = torch.int64 if value.dtype.kind == "i" else torch.float64
+        self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)
 
     @property
     def bodies(self) -> int:
