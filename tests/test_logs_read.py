@@ -1,0 +1,381 @@
+"""Log files: what is read comes back in canonical frames, what is wrong is named in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from torchid.errors import InputError, LogError, TorchidWarning, UnknownNameError
+from torchid.logs import Log, read_log, write_log
+from torchid.logs import container as container_module
+
+DATA = Path(__file__).parents[1].parent / "shared" / "data"
+N = 6
+SUFFIXES = (".npz", ".h5", ".hdf5")
+
+
+def file_fields() -> dict[str, Any]:
+    """A valid file of 6 samples, 2 joints and 2 contacts, every quantity different."""
+    rng = np.random.default_rng(5)
+    quat = Rotation.from_rotvec(np.outer(np.arange(N), [0.3, -0.2, 0.5])).as_quat()
+    return {
+        "time": 0.01 * np.arange(N),
+        "joint_names": np.array(["hip", "knee"]),
+        "joint_position": rng.standard_normal((N, 2)),
+        "joint_velocity": rng.standard_normal((N, 2)),
+        "joint_acceleration": rng.standard_normal((N, 2)),
+        "joint_torque": np.where(np.arange(N)[:, None] == 2, np.nan, rng.standard_normal((N, 2))),
+        "base_quat_xyzw": quat,
+        "base_position_world": rng.standard_normal((N, 3)),
+        "base_linear_velocity_world": rng.standard_normal((N, 3)),
+        "base_angular_velocity_base": rng.standard_normal((N, 3)),
+        "base_linear_acceleration_world": rng.standard_normal((N, 3)),
+        "base_angular_acceleration_base": rng.standard_normal((N, 3)),
+        "contact_names": np.array(["l_sole", "r_sole"]),
+        "contact_active": rng.random((N, 2)) > 0.5,
+        "contact_wrench_local": np.where(np.arange(6) > 2, np.nan, rng.standard_normal((N, 2, 6))),
+    }
+
+
+def save(path: Path, fields: dict[str, Any]) -> Path:
+    """Write raw arrays as they are, valid or not."""
+    if path.suffix == ".npz":
+        np.savez(path, **fields)
+        return path
+    with h5py.File(path, "w") as file:
+        for name, value in fields.items():
+            array = np.asarray(value)
+            file[name] = np.char.encode(array) if array.dtype.kind == "U" else array
+    return path
+
+
+def message_of(path: Path) -> str:
+    """The one line that reading `path` fails with."""
+    with pytest.raises(LogError) as caught:
+        read_log(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path) in message
+    assert "accepted: " in message
+    return message
+
+
+def changed(**changes: Any) -> dict[str, Any]:
+    """The valid file with some fields replaced, or left out where None."""
+    return {name: value for name, value in (file_fields() | changes).items() if value is not None}
+
+
+def edited(name: str, index: object, value: float) -> dict[str, Any]:
+    """A change that sets one element of a field."""
+    array = file_fields()[name].astype(float)
+    array[index] = value
+    return {name: array}
+
+
+def assert_same(one: Log, other: Log) -> None:
+    """Both logs hold the same fields and values."""
+    assert one.arrays().keys() == other.arrays().keys()
+    for name, array in one.arrays().items():
+        # renormalising a unit quaternion may change its last bit
+        np.testing.assert_allclose(array, other.arrays()[name], rtol=4e-16, atol=0, err_msg=name)
+    assert (one.joint_names, one.contact_names) == (other.joint_names, other.contact_names)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_written_log_reads_back_the_same(tmp_path: Path, suffix: str) -> None:
+    log = read_log(save(tmp_path / f"raw{suffix}", file_fields()))
+    write_log(log, tmp_path / f"again{suffix}")
+    again = read_log(tmp_path / f"again{suffix}")
+    assert_same(log, again)
+    assert again.source == str(tmp_path / f"again{suffix}")
+    assert len(again) == N
+    for name, value in file_fields().items():
+        if name not in ("joint_names", "contact_names", "base_quat_xyzw"):
+            np.testing.assert_array_equal(getattr(again, name), value)
+    assert sorted(os.listdir(tmp_path)) == sorted([f"raw{suffix}", f"again{suffix}"])
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_log_of_joint_positions_alone_reads_with_everything_else_absent(tmp_path: Path, suffix: str) -> None:
+    log = Log("x", np.array([3.0]), ("größe",), np.array([[0.1]]))
+    write_log(log, tmp_path / f"x{suffix}")
+    again = read_log(tmp_path / f"x{suffix}")
+    assert_same(log, again)
+    assert set(again.arrays()) == {"time", "joint_position"}
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_robot_without_joints_has_a_log(tmp_path: Path, suffix: str) -> None:
+    fields = {"time": np.arange(3), "joint_names": np.array([]), "joint_position": np.zeros((3, 0))}
+    assert read_log(save(tmp_path / f"x{suffix}", fields)).joint_names == ()
+    write_log(Log("x", np.arange(3.0), (), np.zeros((3, 0))), tmp_path / f"y{suffix}")
+    assert read_log(tmp_path / f"y{suffix}").joint_position.shape == (3, 0)
+
+
+def test_names_and_numbers_of_any_width_are_understood(tmp_path: Path) -> None:
+    fields = changed(
+        joint_names=np.array([b"hip", b"knee"]), contact_active=file_fields()["contact_active"].astype(np.int8)
+    )
+    fields["joint_position"] = fields["joint_position"].astype(">f4")
+    log = read_log(save(tmp_path / "x.npz", fields))
+    assert log.joint_names == ("hip", "knee")
+    assert log.joint_position.dtype == np.float64
+    np.testing.assert_array_equal(log.contact_active, file_fields()["contact_active"])
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        for name, value in file_fields().items():
+            file[name] = value.tolist() if value.dtype.kind == "U" else value  # variable-length strings
+    assert read_log(tmp_path / "x.h5").contact_names == ("l_sole", "r_sole")
+
+
+def test_both_quaternion_orders_are_one_rotation_without_sign_flips(tmp_path: Path) -> None:
+    quat = file_fields()["base_quat_xyzw"]
+    flipped = np.roll(quat, 1, axis=1) * np.array([1, -1, -1, 1, -1, 1.0])[:, None] * 1.0005
+    log = read_log(save(tmp_path / "x.npz", changed(base_quat_xyzw=None, base_quat_wxyz=flipped)))
+    assert log.base_quat_xyzw is not None
+    np.testing.assert_allclose(log.base_quat_xyzw * np.sign(quat[0] @ log.base_quat_xyzw[0]), quat, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("given_name", "canonical", "to_canonical"),
+    [
+        ("base_linear_velocity_base", "base_linear_velocity_world", 1),
+        ("base_linear_acceleration_base", "base_linear_acceleration_world", 1),
+        ("base_angular_velocity_world", "base_angular_velocity_base", -1),
+        ("base_angular_acceleration_world", "base_angular_acceleration_base", -1),
+    ],
+)
+def test_components_in_the_other_frame_are_rotated(
+    tmp_path: Path, given_name: str, canonical: str, to_canonical: int
+) -> None:
+    vector = np.random.default_rng(1).standard_normal((N, 3))
+    log = read_log(save(tmp_path / "x.npz", changed(**{canonical: None, given_name: vector})))
+    world_base = Rotation.from_quat(file_fields()["base_quat_xyzw"])
+    expected = world_base.apply(vector, inverse=to_canonical < 0)
+    np.testing.assert_allclose(getattr(log, canonical), expected, atol=1e-15)
+    without = changed(**{canonical: None, given_name: vector, "base_quat_xyzw": None})
+    assert given_name in message_of(save(tmp_path / "y.npz", without))
+
+
+BAD_FIELDS: list[tuple[dict[str, Any], str, str]] = [
+    ({"time": None}, "time", "missing"),
+    ({"joint_names": None}, "joint_names", "missing"),
+    ({"joint_position": None}, "joint_position", "missing"),
+    ({"joint_positon": np.zeros((N, 2))}, "joint_positon", "accepted: joint_position"),
+    ({"joint_position": np.zeros((N, 3))}, "joint_position", "shape (6, 3); accepted: shape (N, n) = (6, 2)"),
+    ({"joint_torque": np.zeros((N + 1, 2))}, "joint_torque", "shape (7, 2)"),
+    ({"time": np.zeros((N, 1))}, "time", "shape (6, 1); accepted: shape (N)"),
+    ({"time": np.float64(3.0)}, "time", "shape ()"),
+    ({"base_quat_xyzw": np.ones((N, 3))}, "base_quat_xyzw", "shape (6, 3); accepted: shape (N, 4) = (6, 4)"),
+    ({"contact_wrench_local": np.zeros((N, 2, 3))}, "contact_wrench_local", "(6, 2, 3)"),
+    ({"contact_active": np.ones((N, 3), bool)}, "contact_active", "(6, 3)"),
+    ({"joint_velocity": np.zeros((N, 2), complex)}, "joint_velocity", "complex128"),
+    ({"joint_velocity": np.full((N, 2), b"a")}, "joint_velocity", "values of type"),
+    ({"joint_torque": np.zeros((N, 2), bool)}, "joint_torque", "bool"),
+    ({"joint_names": np.array([1, 2])}, "joint_names", "int64"),
+    ({"joint_names": np.array([["hip", "knee"]])}, "joint_names", "shape (1, 2)"),
+    ({"joint_names": np.array(["hip", "hip"])}, "joint_names", "'hip' again at 1"),
+    ({"joint_names": np.array(["hip", ""])}, "joint_names", "empty name at 1"),
+    ({"joint_names": np.array([b"hip", b"\xff"])}, "joint_names", "UTF-8"),
+    ({"contact_names": np.array(["a", "a"])}, "contact_names", "'a' again at 1"),
+    ({"time": np.array([0.0, 1, 2, 2, 3, 4])}, "time", "2.0 at sample 3, after 2.0 at sample 2"),
+    ({"time": np.array([0.0, 1, 3, 2, 3, 4])}, "time", "2.0 at sample 3"),
+    (edited("time", 4, np.nan), "time", "nan at sample 4"),
+    (edited("time", 5, np.inf), "time", "inf at sample 5"),
+    (edited("base_quat_xyzw", 3, 0.0), "base_quat_xyzw", "norm 0 at sample 3"),
+    (edited("base_quat_xyzw", 3, np.nan), "base_quat_xyzw", "nan at sample 3"),
+    ({"base_quat_xyzw": 1.002 * file_fields()["base_quat_xyzw"]}, "base_quat_xyzw", "norm 1.002 at sample 0"),
+    (edited("joint_position", (2, 1), np.nan), "joint_position", "nan at sample 2, knee"),
+    (edited("joint_velocity", (2, 1), np.nan), "joint_velocity", "nan at sample 2, knee"),
+    (edited("base_position_world", (1, 2), np.nan), "base_position_world", "nan at sample 1, component 2"),
+    (edited("base_linear_velocity_world", 1, np.nan), "base_linear_velocity_world", "nan at sample 1"),
+    (edited("joint_torque", (1, 0), -np.inf), "joint_torque", "-inf at sample 1, hip"),
+    (edited("contact_wrench_local", (4, 1, 2), np.inf), "contact_wrench_local", "inf at sample 4, r_sole fz"),
+    ({"base_quat_wxyz": file_fields()["base_quat_xyzw"]}, "base_quat_wxyz", "together with base_quat_xyzw"),
+    ({"base_linear_velocity_base": np.zeros((N, 3))}, "base_linear_velocity_base", "given together with"),
+    ({"contact_wrench_world": np.zeros((N, 2, 6))}, "contact_wrench", "given together with"),
+    ({"contact_names": None}, "contact_active", "without contact_names"),
+    ({"contact_names": None, "contact_active": None}, "contact_wrench_local", "without contact_names"),
+    ({"contact_active": None}, "contact_wrench_local", "without contact_active"),
+    (edited("contact_active", (5, 0), 0.5), "contact_active", "0.5 at sample 5, l_sole"),
+    (edited("contact_active", (5, 0), np.nan), "contact_active", "nan at sample 5"),
+    ({"contact_active": np.full((N, 2), b"yes")}, "contact_active", "values of type"),
+]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+@pytest.mark.parametrize(("changes", "field", "found"), BAD_FIELDS)
+def test_every_unusable_field_is_named_in_one_line(
+    tmp_path: Path, suffix: str, changes: dict[str, Any], field: str, found: str
+) -> None:
+    message = message_of(save(tmp_path / f"bad{suffix}", changed(**changes)))
+    assert field in message
+    assert found in message
+
+
+def test_a_misspelt_field_is_an_unknown_name_to_those_who_catch_it(tmp_path: Path) -> None:
+    path = save(tmp_path / "x.npz", changed(base_quat=np.zeros((N, 4))))
+    with pytest.raises(UnknownNameError, match="base_quat_") as caught:
+        read_log(path)
+    assert caught.value.name == "base_quat"
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_a_log_without_samples_is_refused(tmp_path: Path, suffix: str) -> None:
+    fields = {"time": np.zeros(0), "joint_names": np.array(["a"]), "joint_position": np.zeros((0, 1))}
+    assert "no samples" in message_of(save(tmp_path / f"x{suffix}", fields))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_sensors_not_supported_yet_are_ignored_with_a_warning(tmp_path: Path, suffix: str) -> None:
+    fields = changed(ft_names=np.array(["wrist"]), imu_specific_force=np.zeros((N, 3)))
+    with pytest.warns(TorchidWarning, match=r"ft_names.*ignored") as caught:
+        log = read_log(save(tmp_path / f"x{suffix}", fields))
+    assert len(caught) == 1
+    assert Path(caught[0].filename) == Path(__file__)
+    assert len(log) == N
+
+
+def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
+    assert "no such file" in message_of(tmp_path / "absent.npz")
+    (tmp_path / "folder.npz").mkdir()
+    assert "a folder" in message_of(tmp_path / "folder.npz")
+    (tmp_path / "log.csv").write_text("time\n0\n")
+    assert "extension '.csv'; accepted: .npz, .h5, .hdf5" in message_of(tmp_path / "log.csv")
+    for suffix in SUFFIXES:
+        (tmp_path / f"text{suffix}").write_text("not a log")
+        assert "cannot be read" in message_of(tmp_path / f"text{suffix}")
+        (tmp_path / f"empty{suffix}").write_bytes(b"")
+        message_of(tmp_path / f"empty{suffix}")
+
+
+def test_pickled_objects_are_refused(tmp_path: Path) -> None:
+    objects = np.array([{}, 1], dtype=object)
+    np.savez(tmp_path / "x.npz", **changed(joint_names=objects))
+    assert "joint_names: cannot be read" in message_of(tmp_path / "x.npz")
+    ragged = h5py.vlen_dtype(np.float64)
+    with h5py.File(save(tmp_path / "x.h5", changed(time=None)), "a") as file:
+        file.create_dataset("time", (N,), dtype=ragged)
+    assert "time: values of type object" in message_of(tmp_path / "x.h5")
+
+
+def test_hdf5_groups_empty_datasets_and_dangling_links_are_refused(tmp_path: Path) -> None:
+    for name, item in (("link", h5py.SoftLink("/nowhere")), ("empty", h5py.Empty("f8")), ("group", None)):
+        path = save(tmp_path / f"{name}.h5", changed(joint_torque=None))
+        with h5py.File(path, "a") as file:
+            if item is None:
+                file.create_group("joint_torque")
+            else:
+                file["joint_torque"] = item
+        assert "joint_torque: cannot be read" in message_of(path)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_truncated_files_are_refused(tmp_path: Path, suffix: str) -> None:
+    whole = save(tmp_path / f"whole{suffix}", file_fields()).read_bytes()
+    path = tmp_path / f"cut{suffix}"
+    for share in (0.001, 0.1, 0.5, 0.9, 0.99):
+        path.write_bytes(whole[: int(share * len(whole))])
+        assert "cannot be read" in message_of(path)
+
+
+@pytest.mark.filterwarnings("ignore")  # of numpy's, on headers from before Python 3
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=4))
+def test_damaged_bytes_give_a_log_or_one_line(damage: list[tuple[int, int]]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = save(Path(folder) / "x.npz", file_fields())
+        content = bytearray(path.read_bytes())
+        for place, value in damage:
+            content[place % len(content)] = value
+        path.write_bytes(content)
+        try:
+            assert len(read_log(path)) == N
+        except LogError as error:
+            assert "\n" not in str(error)
+
+
+def test_absurd_declared_sizes_are_refused_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    huge = b"\x93NUMPY\x01\x00" + (118).to_bytes(2, "little")
+    huge += b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,), }".ljust(117) + b"\n"
+    with zipfile.ZipFile(save(tmp_path / "x.npz", changed(time=None)), "a") as archive:
+        archive.writestr("time.npy", huge)
+    assert "time: cannot be read" in message_of(tmp_path / "x.npz")
+    with h5py.File(save(tmp_path / "x.h5", changed(time=None)), "a") as file:
+        file.create_dataset("time", (10**12,), dtype="f8", chunks=(1024,))
+    assert "bytes in all" in message_of(tmp_path / "x.h5")
+    monkeypatch.setattr(container_module, "MAX_BYTES", 100)
+    assert "at most 100 bytes" in message_of(save(tmp_path / "y.npz", file_fields()))
+
+
+def test_a_name_given_twice_in_one_archive_is_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "x.npz", file_fields())
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("time.npy", archive.read("time.npy"))
+    assert "occurs twice" in message_of(path)
+
+
+def test_writing_fails_in_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = read_log(save(tmp_path / "x.npz", file_fields()))
+    with pytest.raises(InputError, match=r"extension '.mat'; accepted"):
+        write_log(log, tmp_path / "x.mat")
+    with pytest.raises(LogError, match="cannot be written"):
+        write_log(log, tmp_path / "nowhere" / "x.npz")
+    with pytest.raises(LogError, match="cannot be written"):
+        write_log(log, tmp_path / "x.npz" / "y.npz")
+    before = (tmp_path / "x.npz").read_bytes()
+
+    def interrupted(stream: Any, **_: Any) -> None:
+        stream.write(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_log(log, tmp_path / "x.npz")
+    assert (tmp_path / "x.npz").read_bytes() == before
+    assert os.listdir(tmp_path) == ["x.npz"]
+
+
+def test_logs_made_in_memory_are_checked_for_shape_and_type() -> None:
+    log = Log("x", np.arange(4.0), ("a",), np.zeros((4, 1)))
+    with pytest.raises(LogError, match=r"x: joint_torque: shape \(4, 2\)"):
+        dataclasses.replace(log, joint_torque=np.zeros((4, 2)))
+    with pytest.raises(LogError, match="joint_velocity: values of type float32; accepted: float64"):
+        dataclasses.replace(log, joint_velocity=np.zeros((4, 1), np.float32))
+    wrench = np.zeros((4, 1, 6))
+    with pytest.raises(LogError, match="given together with"):
+        dataclasses.replace(log, contact_names=("f",), contact_wrench_local=wrench, contact_wrench_world=wrench)
+
+
+def test_selecting_samples_takes_the_same_ones_of_every_field(tmp_path: Path) -> None:
+    log = read_log(save(tmp_path / "x.npz", file_fields()))
+    part = log.select(slice(1, 4))
+    assert len(part) == 3
+    for name, array in part.arrays().items():
+        np.testing.assert_array_equal(array, log.arrays()[name][1:4])
+        assert np.shares_memory(array, log.arrays()[name])
+    chosen = log.select(np.array([4, 0]))
+    np.testing.assert_array_equal(chosen.joint_position, log.joint_position[[4, 0]])
+    assert len(log.select(log.time > 0.025)) == 3
+
+
+def test_the_real_logs_read_and_weigh_what_they_should() -> None:
+    if not DATA.is_dir():
+        pytest.skip(f"no real logs at {DATA}")
+    static = read_log(DATA / "human_squats" / "static1.npz")
+    assert static.contact_wrench_world is not None
+    force = static.contact_wrench_world[:, :, :3].sum(axis=1).mean(axis=0)
+    assert np.linalg.norm(force) / 9.81 == pytest.approx(60.03, rel=2e-3)  # a person does not stand quite still
+    assert read_log(DATA / "kuka_lwr4" / "run1.npz").joint_torque is not None

@@ -1,0 +1,73 @@
+"""Batch least squares with a pull to the nominal parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from torchid.estimators.result import Estimate
+from torchid.parameters import Array
+from torchid.problem.linear import LinearProblem
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
+
+    With `ridge` 0 the deviation from the nominal parameters of least scaled norm among all minimizers.
+
+    Attributes:
+        ridge: weight of the pull to the nominal parameters against the mean square of the whitened residual.
+        rank_tolerance: a singular value of the scaled problem below this share of the largest counts as zero.
+    """
+
+    ridge: float = 0.0
+    rank_tolerance: float = 1e-10
+
+    def solve(self, problem: LinearProblem) -> Estimate:
+        """Fit the free parameters.
+
+        Standard errors propagate the sensor noise, scaled to the residual that was found, through the estimator; they
+        say nothing of the pull's bias. They are NaN where the data alone do not determine the parameter.
+        """
+        free, scale = problem.free, problem.scale[problem.free]
+        A = problem.A[:, free] * scale
+        b = problem.b - problem.A @ problem.nominal
+        pinv, values, rank = _pseudo_inverse(A, self.rank_tolerance)
+        resolution = np.einsum("ij,ji->i", pinv, A)
+        gain = pinv
+        if self.ridge > 0.0:
+            pull = np.sqrt(self.ridge * problem.rows)
+            stacked = np.vstack([A, pull * np.eye(A.shape[1])])
+            gain = _pseudo_inverse(stacked, 0.0)[0][:, : len(b)]
+        step = gain @ b
+
+        phi = problem.nominal.copy()
+        phi[free] += scale * step
+        cost = problem.cost(phi)
+        noise = cost / max(problem.rows - rank, 1)
+        identifiable = np.zeros(len(phi), dtype=bool)
+        identifiable[free] = resolution > 1.0 - 1e-6
+        standard_error = np.full(len(phi), np.nan)
+        standard_error[free] = np.sqrt(noise) * scale * np.linalg.norm(gain, axis=1)
+        standard_error[~identifiable] = np.nan
+        return Estimate(
+            phi=phi,
+            standard_error=standard_error,
+            identifiable=identifiable,
+            rank=rank,
+            condition_number=float(values[0] / values[rank - 1]) if rank else float("nan"),
+            cost=cost,
+            nominal_cost=problem.cost(problem.nominal),
+            rows=problem.rows,
+        )
+
+
+def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:
+    """Minimum-norm inverse, singular values and rank, from one call of `torch.linalg.lstsq`."""
+    identity = torch.eye(A.shape[0], dtype=torch.float64)
+    rcond = max(tolerance, np.finfo(float).eps * max(A.shape))
+    solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
+    return solved.solution.numpy(), solved.singular_values.numpy(), int(solved.rank)

@@ -1,0 +1,8 @@
+"""Logs: read and write the file format, filter, differentiate and resample."""
+
+from torchid.logs.log import Log
+from torchid.logs.preprocess import preprocess
+from torchid.logs.read import read_log
+from torchid.logs.write import write_log
+
+__all__ = ["Log", "preprocess", "read_log", "write_log"]

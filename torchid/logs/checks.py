@@ -1,0 +1,114 @@
+"""Checks of one field of a log: each returns the field in its canonical type or raises a one-line `LogError`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.errors import LogError
+from torchid.logs.fields import BoolArray, FloatArray, Shape
+
+#: How far a quaternion's norm may be from 1 before it is refused rather than renormalised.
+QUATERNION_TOLERANCE = 1e-3
+COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
+
+
+def check_shape(source: str, name: str, array: NDArray[Any], letters: Shape, sizes: Mapping[str, int]) -> None:
+    """Raise LogError unless `array` has the shape `letters`, whose known sizes are `sizes`."""
+    expected = [sizes.get(letter, letter) if isinstance(letter, str) else letter for letter in letters]
+    fits = array.ndim == len(expected) and all(
+        isinstance(want, str) or want == have for want, have in zip(expected, array.shape, strict=True)
+    )
+    if not fits:
+        named, sized = (f"({', '.join(map(str, shape))})" for shape in (letters, expected))
+        accepted = named if named == sized else f"{named} = {sized}"
+        raise LogError(source, name, f"shape {array.shape}", f"shape {accepted}")
+
+
+def as_real(source: str, name: str, array: NDArray[Any]) -> FloatArray:
+    """The array as float64 (itself where it is already), LogError unless it holds real numbers."""
+    if array.dtype.kind not in "fiu":
+        raise LogError(source, name, f"values of type {array.dtype}", "real numbers")
+    with np.errstate(over="ignore"):  # a longdouble too large becomes inf, which check_finite reports
+        return np.asarray(array, dtype=np.float64)
+
+
+def place(index: tuple[int, ...], labels: tuple[str, ...]) -> str:
+    """An element's place in words: its sample and, where it has any, its channel.
+
+    Args:
+        index: sample number, column, wrench component; as many as the field has axes.
+        labels: names of the columns, empty where they have none.
+    """
+    words = f"sample {index[0]}"
+    if len(index) > 1:
+        words += f", {labels[index[1]] if labels else f'component {index[1]}'}"
+    return words + (f" {COMPONENTS[index[2]]}" if len(index) > 2 else "")
+
+
+def check_finite(
+    source: str, name: str, values: FloatArray, *, allow_nan: bool = False, labels: tuple[str, ...] = ()
+) -> None:
+    """Raise LogError at the first infinite value, or at the first NaN unless `allow_nan`."""
+    bad = np.isinf(values) if allow_nan else ~np.isfinite(values)
+    if bad.any():
+        index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
+        accepted = "finite numbers, or NaN where nothing was measured" if allow_nan else "finite numbers"
+        raise LogError(source, name, f"{values[index]} at {place(index, labels)}", accepted)
+
+
+def check_time(source: str, time: FloatArray) -> None:
+    """Raise LogError unless `time` (N,) [s] has samples, is finite and increases strictly."""
+    if not len(time):
+        raise LogError(source, "time", "no samples", "at least one sample")
+    check_finite(source, "time", time)
+    still = time[1:] <= time[:-1]
+    if still.any():
+        i = int(np.argmax(still))
+        found = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
+        raise LogError(source, "time", found, "strictly increasing seconds")
+
+
+def unit_quaternion(source: str, name: str, quat: FloatArray) -> FloatArray:
+    """The quaternions (N, 4) with a norm of exactly one, LogError at the first whose norm is not one."""
+    check_finite(source, name, quat)
+    norm = np.linalg.norm(quat, axis=1)
+    bad = ~(np.abs(norm - 1.0) <= QUATERNION_TOLERANCE)
+    if bad.any():
+        i = int(np.argmax(bad))
+        found = f"norm {norm[i]:.6g} at sample {i}"
+        raise LogError(source, name, found, f"unit quaternions, to {QUATERNION_TOLERANCE:g}")
+    return np.asarray(quat / norm[:, None], dtype=np.float64)
+
+
+def as_names(source: str, name: str, array: NDArray[Any]) -> tuple[str, ...]:
+    """The names in a one-dimensional array of strings or UTF-8 bytes, LogError on anything else or a duplicate."""
+    check_shape(source, name, array, ("n" if name == "joint_names" else "C",), {})
+    if array.size and array.dtype.kind not in "US":
+        raise LogError(source, name, f"values of type {array.dtype}", "strings")
+    try:
+        names = tuple(item.decode() if isinstance(item, bytes) else str(item) for item in array.tolist())
+    except UnicodeDecodeError as error:
+        raise LogError(source, name, f"bytes that are no text ({error})", "UTF-8 strings") from error
+    seen: set[str] = set()
+    for i, item in enumerate(names):
+        if not item or item in seen:
+            found = f"'{item}' again at {i}" if item else f"an empty name at {i}"
+            raise LogError(source, name, found, "names that are all different")
+        seen.add(item)
+    return names
+
+
+def as_flags(source: str, name: str, array: NDArray[Any], labels: tuple[str, ...]) -> BoolArray:
+    """The array as booleans, LogError unless it holds booleans or the numbers 0 and 1."""
+    if array.dtype.kind == "b":
+        return np.asarray(array, dtype=np.bool_)
+    values = as_real(source, name, array)
+    bad = (values != 0.0) & (values != 1.0)
+    if bad.any():
+        index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
+        raise LogError(source, name, f"{values[index]:g} at {place(index, labels)}", "true and false, or 1 and 0")
+    return np.asarray(values, dtype=np.bool_)

@@ -1,0 +1,131 @@
+"""Filter, differentiate and resample a log, all channels alike."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from torchid.errors import InputError, LogError
+from torchid.logs.checks import check_finite
+from torchid.logs.fields import NAN_ALLOWED, FloatArray, labels_of
+from torchid.logs.log import Log
+from torchid.logs.measured import carry_measured
+from torchid.logs.plan import plan
+from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, sign_continuous
+from torchid.logs.timeline import Timeline
+
+#: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
+CHAINS = (
+    ("joint_position", "joint_velocity", "joint_acceleration"),
+    ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world"),
+    ("base_angular_velocity_base", "base_angular_acceleration_base"),
+)
+ANGULAR = CHAINS[2]
+#: A filtered quaternion whose norm falls below this turns faster than the filter lets pass.
+LEAST_NORM = 0.5
+
+
+def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float | None = None) -> Log:
+    """Fill in velocities and accelerations, after a zero-phase low-pass filter and before resampling if asked to.
+
+    Derivatives that the log gives are used. A missing one is that of the nearest quantity before it that the log
+    gives, by a quintic spline: joints from `joint_position`, the base's linear ones from `base_position_world`, its
+    angular ones from the quaternion's components (never through Euler angles). `base_linear_velocity_world` stays
+    None where the log gives neither it nor a position: nothing but the acceleration enters the equations of motion.
+
+    The filter is a Butterworth low-pass of order 4 run forward and backward (no lag, gain 1/2 at the cutoff) on every
+    channel, on a uniform grid: jittered time stamps are first interpolated to their median rate. Filtered logs lose
+    2/cutoff_hz seconds at each end; logs differentiated without a filter lose 2 samples at each end, where the
+    spline multiplies noise.
+
+    Where a log is filtered or resampled, `contact_active` is held from the previous sample, a wrench counts as 0
+    while its contact is inactive, and a torque or wrench channel that is NaN in some samples becomes NaN throughout.
+
+    Args:
+        log: the log.
+        cutoff_hz: cutoff [Hz] of the filter, below half the median sample rate; None for no filter.
+        sample_rate_hz: sample rate [Hz] of the result, at most ten times the median one; None for the log's own.
+
+    Returns:
+        The preprocessed log, sharing the memory of what did not change: `log` itself where nothing has to be done.
+
+    Raises:
+        InputError: `cutoff_hz` or `sample_rate_hz` does not suit the log.
+        LogError: the log has too few samples or too wide gaps, a value that is not finite, or an orientation but
+            nothing to take the base's linear acceleration from.
+
+    Warns:
+        TorchidWarning: a torque or wrench channel is NaN in some samples, or time stamps nearly coincide.
+    """
+    if log.base_quat_xyzw is not None and all(getattr(log, name) is None for name in CHAINS[1]):
+        accepted = (
+            "any of base_position_world, base_linear_velocity_{world,base}, base_linear_acceleration_{world,base}"
+        )
+        raise LogError(log.source, CHAINS[1][2], "missing, with nothing to derive it from", accepted)
+    differentiates = _differentiates(log)
+    if cutoff_hz is None and sample_rate_hz is None and not differentiates:
+        return log
+    timeline = plan(log.source, log.time, cutoff_hz, sample_rate_hz, differentiates)
+    fields: dict[str, Any] = {
+        "time": log.time[timeline.kept] if timeline.keeps_stamps else log.time[0] + timeline.at,
+    }
+    for chain in CHAINS:
+        fields |= _chain(log, chain, timeline)
+    if log.base_quat_xyzw is not None:
+        fields |= _orientation(log, sign_continuous(log.base_quat_xyzw), timeline)
+    for name in NAN_ALLOWED:
+        if getattr(log, name) is not None:
+            fields[name] = carry_measured(log, name, timeline)
+    if log.contact_active is not None:
+        fields["contact_active"] = timeline.hold(log.contact_active)
+    return dataclasses.replace(log, **fields)
+
+
+def _differentiates(log: Log) -> bool:
+    """Whether any velocity or acceleration that can be derived is missing."""
+    if log.base_quat_xyzw is not None and any(getattr(log, name) is None for name in ANGULAR):
+        return True
+    for chain in CHAINS:
+        given = [getattr(log, name) is not None for name in chain]
+        if any(before and not after for before, after in zip(given, given[1:], strict=False)):
+            return True
+    return False
+
+
+def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, FloatArray]:
+    """The quantities of a chain at the output's stamps: those given, and the derivatives that fill the gaps above."""
+    out: dict[str, FloatArray] = {}
+    for i, name in enumerate(chain):
+        values = getattr(log, name)
+        if values is None:
+            continue
+        check_finite(log.source, name, values, labels=labels_of(name, log.joint_names, log.contact_names))
+        missing = [name]
+        while i + len(missing) < len(chain) and getattr(log, chain[i + len(missing)]) is None:
+            missing.append(chain[i + len(missing)])
+        derivatives = timeline.evaluate(timeline.smooth(values), range(len(missing)))
+        out |= dict(zip(missing, derivatives, strict=True))
+    return out
+
+
+def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, FloatArray]:
+    """The orientation at the output's stamps, and the angular rates that the log does not give."""
+    check_finite(log.source, "base_quat_xyzw", quat)
+    smoothed = timeline.smooth(quat)
+    if log.base_angular_velocity_base is not None:
+        orders = [0]
+    else:
+        orders = [0, 1, 2] if log.base_angular_acceleration_base is None else [0, 1]
+    q, *rates = timeline.evaluate(smoothed, orders)
+    norm = np.linalg.norm(q, axis=1, keepdims=True)
+    if timeline.low_pass is not None and np.min(norm) < LEAST_NORM:
+        found = f"a cutoff that removes the base's rotation (norm of the filtered quaternion {np.min(norm):.2g})"
+        raise InputError(log.source, "preprocessing.cutoff_hz", found, "a cutoff above the rate of that rotation")
+    out = {"base_quat_xyzw": q / norm}
+    if rates:
+        out["base_angular_velocity_base"] = angular_velocity_base(q, rates[0])
+    if len(rates) > 1:
+        out["base_angular_acceleration_base"] = angular_acceleration_base(q, rates[0], rates[1])
+    return out

@@ -1,0 +1,56 @@
+"""Unit quaternions in the order xyzw that rotate the base frame to the world frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchid.logs.fields import FloatArray
+
+
+def sign_continuous(quat: FloatArray) -> FloatArray:
+    """The same rotations without sign flips between neighbours, (N, 4) in any order; itself where it has none.
+
+    q and -q are one rotation, but components that jump sign cannot be interpolated or filtered.
+    """
+    flips = np.einsum("ni,ni->n", quat[1:], quat[:-1]) < 0.0
+    if not flips.any():
+        return quat
+    sign = np.ones((len(quat), 1))
+    sign[1:, 0] = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
+    return quat * sign
+
+
+def rotate(quat_xyzw: FloatArray, vector_base: FloatArray) -> FloatArray:
+    """Components (N, 3) in the world of vectors (N, 3) given in the base frame, for unit quaternions (N, 4)."""
+    axis, w = quat_xyzw[:, :3], quat_xyzw[:, 3:]
+    turn = 2.0 * np.cross(axis, vector_base)
+    return vector_base + w * turn + np.cross(axis, turn)
+
+
+def rotate_back(quat_xyzw: FloatArray, vector_world: FloatArray) -> FloatArray:
+    """Components (N, 3) in the base frame of vectors (N, 3) given in the world, for unit quaternions (N, 4)."""
+    return rotate(quat_xyzw * np.array([-1.0, -1.0, -1.0, 1.0]), vector_world)
+
+
+def _divide(quat: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Vector (N, 3) and scalar (N, 1) part of quat^-1 other."""
+    v, w, v2, w2 = quat[:, :3], quat[:, 3:], other[:, :3], other[:, 3:]
+    square = np.sum(quat * quat, axis=1, keepdims=True)
+    return (w * v2 - w2 * v - np.cross(v, v2)) / square, (w * w2 + np.sum(v * v2, axis=1, keepdims=True)) / square
+
+
+def angular_velocity_base(quat: FloatArray, rate: FloatArray) -> FloatArray:
+    """Angular velocity (N, 3) [rad/s] in the base frame, 2 vec(q^-1 q'), of a path q(t) in the order xyzw.
+
+    q need not be a unit quaternion: its norm and the norm's rate only enter the scalar part of q^-1 q'.
+    """
+    return 2.0 * _divide(quat, rate)[0]
+
+
+def angular_acceleration_base(quat: FloatArray, rate: FloatArray, second: FloatArray) -> FloatArray:
+    """Angular acceleration (N, 3) [rad/s^2] in the base frame, 2 vec(q^-1 q'' - (q^-1 q')^2), of a path q(t).
+
+    It is the time derivative of `angular_velocity_base`, exact where q is no unit quaternion.
+    """
+    vector, scalar = _divide(quat, rate)
+    return 2.0 * (_divide(quat, second)[0] - 2.0 * scalar * vector)

@@ -1,0 +1,125 @@
+"""Read a log file, check everything in it and bring it to canonical frames and orders."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.errors import LogError, TorchidWarning, UnknownNameError
+from torchid.logs.checks import as_flags, as_names, as_real, check_finite, check_shape, check_time, unit_quaternion
+from torchid.logs.container import open_container, translated
+from torchid.logs.fields import (
+    EXCLUSIVE,
+    NAMES,
+    NAN_ALLOWED,
+    REQUIRED,
+    SHAPES,
+    UNSUPPORTED,
+    VARIANTS,
+    WRENCHES,
+    FloatArray,
+    is_quaternion,
+    labels_of,
+)
+from torchid.logs.log import Log
+from torchid.logs.quaternion import rotate, rotate_back, sign_continuous
+
+
+class UnknownFieldError(LogError, UnknownNameError):
+    """A field of a log file that the log format does not know; the message lists the nearest that it knows."""
+
+
+def read_log(path: str | os.PathLike[str]) -> Log:
+    """Read a log from a .npz (never pickled), .h5 or .hdf5 file.
+
+    Quaternions come back in the order xyzw, renormalised and without sign flips; linear velocity and acceleration of
+    the base in the world frame, angular ones in the base frame. An acceleration's components are only rotated: it is
+    the derivative of the world velocity whichever frame it is expressed in.
+
+    Raises:
+        LogError: one line that names the file, the field, what was found and what is accepted.
+    """
+    source = os.fspath(path)
+    with open_container(Path(path)) as container:
+        names = list(container.sizes())
+        _check_names(source, names)
+        _check_combination(source, names)
+        raw: dict[str, NDArray[Any]] = {}
+        for name in names:
+            if name not in UNSUPPORTED:
+                with translated(source, name, "a plain array of numbers, truth values or text"):
+                    raw[name] = container.load(name)
+    return _canonical(source, _checked(source, raw))
+
+
+def _check_names(source: str, names: Collection[str]) -> None:
+    """Raise LogError on unknown or missing fields, warn of those not supported yet."""
+    known = (*SHAPES, *VARIANTS)
+    for name in names:
+        if name not in known and name not in UNSUPPORTED:
+            raise UnknownFieldError(source, "field", name, known)
+    for name in REQUIRED:
+        if name not in names:
+            raise LogError(source, name, "missing", f"a log with {', '.join(REQUIRED)}")
+    ignored = [name for name in UNSUPPORTED if name in names]
+    if ignored:
+        message = f"{source}: {', '.join(ignored)}: not supported yet, ignored"
+        warnings.warn(message, TorchidWarning, stacklevel=3)
+
+
+def _check_combination(source: str, names: Collection[str]) -> None:
+    """Raise LogError on fields that say the same thing twice or that need a field that is missing."""
+    for one, other in EXCLUSIVE:
+        if one in names and other in names:
+            raise LogError(source, one, f"given together with {other}", "one of the two")
+    for name in ("contact_active", *WRENCHES):
+        for needed in ("contact_names", "contact_active"):
+            if name in names and needed not in names:
+                raise LogError(source, name, f"given without {needed}", f"{name} together with {needed}")
+    for name, canonical in VARIANTS.items():
+        if name in names and not is_quaternion(name) and not any(map(is_quaternion, names)):
+            accepted = f"with base_quat_wxyz or base_quat_xyzw, or as {canonical}"
+            raise LogError(source, name, "given without the base's orientation", accepted)
+
+
+def _checked(source: str, raw: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Every field of the file in its canonical type, each checked by itself and against the sizes N, n, C."""
+    names = {name: as_names(source, name, raw[name]) if name in raw else () for name in NAMES}
+    joint_names, contact_names = (names[name] for name in NAMES)
+    check_shape(source, "time", raw["time"], SHAPES["time"], {})
+    sizes = {"N": len(raw["time"]), "n": len(joint_names), "C": len(contact_names)}
+    time = as_real(source, "time", raw["time"])
+    check_time(source, time)
+    fields: dict[str, Any] = {**names, "time": time}
+    for name, array in raw.items():
+        if name in fields:
+            continue
+        check_shape(source, name, array, SHAPES[VARIANTS.get(name, name)], sizes)
+        labels = labels_of(name, joint_names, contact_names)
+        if name == "contact_active":
+            fields[name] = as_flags(source, name, array, labels)
+            continue
+        values = as_real(source, name, array)
+        check_finite(source, name, values, allow_nan=name in NAN_ALLOWED, labels=labels)
+        fields[name] = unit_quaternion(source, name, values) if is_quaternion(name) else values
+    return fields
+
+
+def _canonical(source: str, fields: dict[str, Any]) -> Log:
+    """The log with the file's variants brought to canonical order and frames."""
+    if "base_quat_wxyz" in fields:
+        fields["base_quat_xyzw"] = np.roll(fields.pop("base_quat_wxyz"), -1, axis=1)
+    if "base_quat_xyzw" in fields:
+        quat: FloatArray = sign_continuous(fields["base_quat_xyzw"])
+        fields["base_quat_xyzw"] = quat
+        for name, canonical in VARIANTS.items():
+            if name in fields:
+                turn = rotate if name.endswith("_base") else rotate_back
+                fields[canonical] = turn(quat, fields.pop(name))
+    return Log(source=source, **fields)

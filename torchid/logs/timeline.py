@@ -1,0 +1,80 @@
+"""How samples move from a log's time stamps to those of the preprocessed log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from torchid.logs.fields import BoolArray, FloatArray
+from torchid.logs.spline import spline_derivatives
+
+#: Steps that differ by less than this share of the median step count as uniform.
+JITTER = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class LowPass:
+    """A zero-phase filter: the second-order sections of one pass, and how many samples each end is extended by."""
+
+    sections: FloatArray
+    padding: int
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        """Filter every channel of uniformly sampled values (M, ...) forward and backward."""
+        flat = values.reshape(len(values), -1)
+        out = np.empty(flat.shape)
+        for column in range(flat.shape[1]):  # one by one: the filter makes several copies of what it is given
+            out[:, column] = signal.sosfiltfilt(self.sections, flat[:, column], padlen=self.padding)
+        return out.reshape(values.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Timeline:
+    """Three sets of time stamps [s], all counted from the log's first sample.
+
+    Attributes:
+        native: (N,) the log's own stamps.
+        grid: (M,) the stamps at which channels are filtered: `native`, or a uniform grid where that is jittered.
+        kept: the samples of `grid` that neither filter nor spline spoils.
+        output: (K,) stamps of the preprocessed log, None for those of `kept`.
+        low_pass: the filter, None without one.
+    """
+
+    native: FloatArray
+    grid: FloatArray
+    kept: slice
+    output: FloatArray | None
+    low_pass: LowPass | None
+
+    @property
+    def at(self) -> FloatArray:
+        """Stamps (K,) of the preprocessed log, counted from the log's first sample."""
+        return self.grid[self.kept] if self.output is None else self.output
+
+    @property
+    def keeps_stamps(self) -> bool:
+        """Whether the preprocessed log's stamps are the log's own, but for those dropped at the ends."""
+        return self.output is None and self.grid is self.native
+
+    def smooth(self, values: FloatArray) -> FloatArray:
+        """The channels (N, ...) on the grid, (M, ...), low-pass filtered; `values` itself where nothing changes."""
+        if self.grid is not self.native:
+            values = spline_derivatives(self.native, values, self.grid, (0,))[0]
+        return values if self.low_pass is None else self.low_pass(values)
+
+    def evaluate(self, smoothed: FloatArray, orders: Sequence[int]) -> list[FloatArray]:
+        """Derivatives (K, ...) of the given orders of channels on the grid (M, ...), at the output's stamps."""
+        if self.output is None and orders[0] == 0:
+            rest = spline_derivatives(self.grid, smoothed, self.at, orders[1:]) if len(orders) > 1 else []
+            return [smoothed[self.kept], *rest]
+        return spline_derivatives(self.grid, smoothed, self.at, orders)
+
+    def hold(self, flags: BoolArray) -> BoolArray:
+        """Flags (N, ...) at the output's stamps (K, ...): each is that of the last sample not after it."""
+        if self.keeps_stamps:
+            return flags[self.kept]
+        late = self.at + JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
+        return flags[np.searchsorted(self.native, late, side="right") - 1]

@@ -1,0 +1,43 @@
+"""The linear problem that estimators see: a few hundred rows that stand for the whole log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchid.parameters import Array
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """min over phi of ||A phi - b||^2 + residual, rows whitened to unit noise, near a nominal phi.
+
+    Attributes:
+        A: (R, P) with R at most the number of independent columns; b: (R,).
+        residual: what no phi can explain, the squared norm left of the right-hand side.
+        rows: number of scalar equations that went in.
+        nominal: (P,), the prior parameters.
+        scale: (P,), > 0, the size a deviation of each parameter is measured in.
+        free: (P,) bool, parameters to fit; the others stay nominal.
+    """
+
+    A: Array
+    b: Array
+    residual: float
+    rows: int
+    nominal: Array
+    scale: Array
+    free: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check that the shapes belong together."""
+        rows, columns = self.A.shape
+        shapes = (self.b.shape, self.nominal.shape, self.scale.shape, self.free.shape)
+        if shapes != ((rows,), (columns,), (columns,), (columns,)):
+            raise ValueError(f"b, nominal, scale, free: found shapes {shapes}; accepted: {rows} rows, {columns} columns")
+
+    def cost(self, phi: Array) -> float:
+        """Sum of squared whitened residuals over all rows at parameters `phi`, (P,)."""
+        misfit = self.A @ phi - self.b
+        return float(misfit @ misfit + self.residual)

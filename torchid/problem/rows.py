@@ -1,0 +1,279 @@
+"""Whitened, projected rows of the linear problem, one contact state at a time.
+
+In a contact state the projection mixes only the base and the joints between the base and a touching body. Every other
+measured joint keeps its own row, which is zero outside its subtree. Both kinds go to the factor as blocks with just
+the columns they can touch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchid import parameters
+from torchid.parameters import Array
+from torchid.problem.samples import Samples, measured_components
+from torchid.problem.workspace import Workspace
+from torchid.regressor.dynamics import all_wrench_columns, friction_columns, joint_directions, joint_row, joint_rows
+from torchid.regressor.jacobian import body_jacobian, wrench_map
+from torchid.regressor.kinematics import BodyStates, JointStates, body_states, joint_states
+from torchid.regressor.reduction import reduced_layout, reduction_matrix
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+from torchid.sensing.nullspace import null_space
+from torchid.sensing.projection import whitened
+from torchid.sensing.sensors import SensorSet
+
+State = tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class ContactBody:
+    """A body with active contacts.
+
+    `unmeasured`, (k_x, 6): orthonormal rows that span the unmeasured wrench directions, `measured`, (k_m, 6): one row
+    per measured component, both as wrenches at the body's joint frame, in its axes.
+    `components`: contact and component of each measured row; `std`: (k_m,) their noise.
+    """
+
+    body: int
+    unmeasured: Tensor
+    measured: Tensor
+    components: tuple[tuple[int, int], ...]
+    std: Tensor
+
+
+@dataclass(frozen=True)
+class StatePlan:
+    """What is constant in a contact state: bodies in contact; joints mixed by the projection; joints left alone."""
+
+    contact_bodies: tuple[ContactBody, ...]
+    mixed_joints: tuple[int, ...]
+    lone_joints: tuple[int, ...]
+    support: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ChunkTerms:
+    """Dynamics of a chunk of samples: everything that rows and predictions are made of."""
+
+    joints: JointStates
+    states: BodyStates
+    directions: Tensor
+    wrenches: Tensor
+    rotation_world_base: Tensor | None
+
+
+class RowBuilder(nn.Module):
+    """Rows of `L^-1 V_x^T [K_reduced | f]`, where L L^T is the covariance of the projected sensor noise.
+
+    Columns: those of `reduced_layout`, then two friction columns for each of the L - 1 joints.
+    """
+
+    def __init__(self, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> None:
+        """Fix robot, contacts and sensors."""
+        super().__init__()
+        self.tree = KinematicTree(robot)
+        self.contacts = tuple(contacts)
+        self.sensors = sensors
+        self.layout = reduced_layout(self.tree)
+        self.joint_rows = joint_rows(self.tree, self.layout)
+        self._measured = measured_components(self.contacts, sensors)
+        self._frames = [self._frame(robot, contact) for contact in self.contacts]
+        self._plans: dict[State, StatePlan] = {}
+
+    def _frame(self, robot: Robot, contact: Contact) -> tuple[int, Array]:
+        body, T_link_frame = robot.link(contact.frame)
+        return body, self.tree.T_joint_link[body] @ T_link_frame
+
+    @property
+    def device(self) -> torch.device:
+        """Where the rows are computed."""
+        return self.tree.ancestors.device
+
+    @property
+    def columns(self) -> int:
+        """Number of columns, without the right-hand side."""
+        return self.layout.count + 2 * (self.tree.bodies - 1)
+
+    def column_map(self) -> Array:
+        """`(columns, 12 L)`: the rows' columns from all parameters, `K = K_columns @ column_map()`."""
+        matrix = np.zeros((self.columns, self.tree.bodies, parameters.PER_BODY))
+        inertial = reduction_matrix(self.tree).reshape(self.layout.count, self.tree.bodies, -1)
+        matrix[: self.layout.count, :, parameters.INERTIAL] = inertial
+        for body in range(1, self.tree.bodies):
+            matrix[self._friction_column(body), body, parameters.COULOMB] = 1.0
+            matrix[self._friction_column(body) + 1, body, parameters.VISCOUS] = 1.0
+        return matrix.reshape(self.columns, -1)
+
+    def plan(self, state: State) -> StatePlan:
+        """The plan of a contact state, made once."""
+        if state not in self._plans:
+            self._plans[state] = self._make_plan(state)
+        return self._plans[state]
+
+    def terms(self, samples: Samples) -> ChunkTerms:
+        """Dynamics of some samples."""
+        motion = samples.motion()
+        joints = joint_states(self.tree, motion)
+        states = body_states(self.tree, motion, joints)
+        directions = joint_directions(self.tree, states)
+        wrenches = all_wrench_columns(states, self.layout)
+        return ChunkTerms(joints, states, directions, wrenches, samples.rotation_world_base)
+
+    def rows(
+        self, samples: Samples, state: State, workspace: Workspace | None = None
+    ) -> Iterator[tuple[tuple[int, ...], Tensor]]:
+        """Blocks of rows for samples that share a contact state; no gradient flows through reused buffers.
+
+        Yields:
+            (columns, rows): rows are (M, len(columns) + 1), the right-hand side last.
+        """
+        plan, terms = self.plan(state), self.terms(samples)
+        if self.tree.base_rows or plan.mixed_joints:
+            yield plan.support, self._mixed_rows(samples, plan, terms, workspace or Workspace())
+        for joint in plan.lone_joints:
+            row = self.joint_rows[joint]
+            torque = self._torque(samples)[:, joint]
+            friction = friction_columns(row, terms.joints)
+            inertial = joint_row(row, self.tree, self.layout, terms.directions, terms.wrenches)
+            extra = [x for _, coulomb, viscous in friction for x in (coulomb, viscous)]
+            block = torch.cat([inertial, torch.stack([*extra, torque])]) / self.sensors.noise.joint_torque
+            yield (*range(row.start, row.end), *self._friction_support(joint)), block.T
+
+    def bases(self, samples: Samples, state: State) -> Iterator[Tensor]:
+        """Orthonormal V_x on the base and the mixed joints, (B', base rows + mixed joints, r), grouped by rank."""
+        plan, terms = self.plan(state), self.terms(samples)
+        unmeasured, _ = self._contact_jacobians(plan, terms, len(samples))
+        for _, V in null_space(unmeasured):
+            yield V
+
+    def _make_plan(self, state: State) -> StatePlan:
+        touching: dict[int, list[int]] = {}
+        for contact, active in enumerate(state):
+            if active:
+                touching.setdefault(self._frames[contact][0], []).append(contact)
+        moving = {joint for body in touching for joint in self._joints_above(body)}
+        measured = np.flatnonzero(self.sensors.torque).tolist()
+        mixed = tuple(joint for joint in measured if joint in moving)
+        inertial = range(self.layout.count)
+        if not self.tree.base_rows:
+            used = [self.joint_rows[joint] for joint in mixed]
+            inertial = range(min((r.start for r in used), default=0), max((r.end for r in used), default=0))
+        friction = sorted({column for joint in mixed for column in self._friction_support(joint)})
+        return StatePlan(
+            tuple(self._contact_body(body, members) for body, members in touching.items()),
+            mixed,
+            tuple(joint for joint in measured if joint not in moving),
+            (*inertial, *friction),
+        )
+
+    def _contact_body(self, body: int, contacts: list[int]) -> ContactBody:
+        unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []
+        for contact in contacts:
+            at_body = wrench_map(self._frames[contact][1]).T
+            for k in self.contacts[contact].components:
+                if self._measured[contact, k]:
+                    measured.append(at_body[k][None])
+                    components.append((contact, k))
+                else:
+                    unmeasured.append(at_body[k][None])
+        stacked = np.concatenate(unmeasured)
+        _, values, Vh = np.linalg.svd(stacked, full_matrices=False)
+        span = Vh[values > 1e-9 * max(values, default=0.0)]
+        std = self.sensors.noise.wrench[[k for _, k in components]]
+        span_, measured_, std_ = (
+            torch.tensor(x, dtype=torch.float64, device=self.device) for x in (span, np.concatenate(measured), std)
+        )
+        return ContactBody(body, span_, measured_, tuple(components), std_)
+
+    def _mixed_rows(self, samples: Samples, plan: StatePlan, terms: ChunkTerms, workspace: Workspace) -> Tensor:
+        unmeasured, measured = self._contact_jacobians(plan, terms, len(samples))
+        X = self._mixed_dynamics(samples, plan, terms, workspace)
+        wrench = self._measured_wrench(samples, plan, terms)
+        X[:, :, -1] += (measured.mT @ wrench[..., None])[..., 0]
+        noise = self.sensors.noise
+        base = np.broadcast_to(noise.base, 6)[: self.tree.base_rows]
+        variance = np.append(base, np.full(len(plan.mixed_joints), noise.joint_torque)) ** 2
+        std = torch.cat([body.std for body in plan.contact_bodies]) if plan.contact_bodies else X.new_zeros(0)
+        pieces = []
+        for index, V in null_space(unmeasured):
+            W = whitened(V, measured[index], X.new_tensor(variance), std**2)
+            pieces.append((W.mT @ X[index]).flatten(0, 1))
+        return pieces[0] if len(pieces) == 1 else torch.cat(pieces)
+
+    def _mixed_dynamics(self, samples: Samples, plan: StatePlan, terms: ChunkTerms, workspace: Workspace) -> Tensor:
+        """Rows [K | S^T tau] of the base and the mixed joints, (B, base rows + mixed joints, columns + 1)."""
+        base_rows = self.tree.base_rows
+        place = {column: i for i, column in enumerate(plan.support)}
+        rows, columns = base_rows + len(plan.mixed_joints), len(plan.support) + 1
+        X = workspace.zeros("by column", plan.support, terms.wrenches, rows, columns, len(samples))
+        if base_rows:
+            X[:base_rows, : self.layout.count] = terms.wrenches
+        for i, joint in enumerate(plan.mixed_joints, start=base_rows):
+            row = self.joint_rows[joint]
+            start = place[row.start]
+            part = joint_row(row, self.tree, self.layout, terms.directions, terms.wrenches)
+            X[i, start : start + row.end - row.start] = part
+            for body, coulomb, viscous in friction_columns(row, terms.joints):
+                X[i, place[self._friction_column(body)]] = coulomb
+                X[i, place[self._friction_column(body) + 1]] = viscous
+            X[i, -1] = self._torque(samples)[:, joint]
+        by_sample = workspace.zeros("by sample", None, X, len(samples), rows * columns)
+        return by_sample.copy_(X.flatten(0, 1).T).view(len(samples), rows, columns)
+
+    def _contact_jacobians(self, plan: StatePlan, terms: ChunkTerms, samples: int) -> tuple[Tensor, Tensor]:
+        """Unmeasured and measured contact rows on the base and the mixed joints, (B, k, base rows + mixed joints)."""
+        width = self.tree.base_rows + len(plan.mixed_joints)
+        unmeasured, measured = [], []
+        for contact in plan.contact_bodies:
+            J = body_jacobian(self.tree, terms.states, terms.directions, contact.body, list(plan.mixed_joints))
+            unmeasured.append(torch.tensordot(contact.unmeasured, J, dims=1))
+            measured.append(torch.tensordot(contact.measured, J, dims=1))
+        empty = terms.wrenches.new_zeros(samples, 0, width)
+        return tuple(torch.cat(x).permute(2, 0, 1) if x else empty for x in (unmeasured, measured))  # type: ignore[return-value]
+
+    def _measured_wrench(self, samples: Samples, plan: StatePlan, terms: ChunkTerms) -> Tensor:
+        """Measured wrench components along the frames' axes, (B, k_m)."""
+        columns = []
+        local: dict[int, Tensor] = {}
+        for contact_body in plan.contact_bodies:
+            for contact, k in contact_body.components:
+                if contact not in local:
+                    local[contact] = self.local_wrench(samples, contact, terms)
+                columns.append(local[contact][:, k])
+        return torch.stack(columns, dim=1) if columns else samples.time.new_zeros(len(samples), 0)
+
+    def local_wrench(self, samples: Samples, contact: int, terms: ChunkTerms) -> Tensor:
+        """Recorded wrench of a contact along its frame's axes, (B, 6)."""
+        if samples.wrench is None:
+            return samples.time.new_full((len(samples), 6), torch.nan)
+        wrench = samples.wrench[:, contact]
+        if not samples.wrench_in_world:
+            return wrench
+        body, T_joint_frame = self._frames[contact]
+        R_joint_frame = wrench.new_tensor(T_joint_frame[:3, :3])
+        rotation = terms.states.rotation[:, :, body].permute(2, 0, 1) @ R_joint_frame
+        if terms.rotation_world_base is not None:
+            rotation = terms.rotation_world_base @ rotation
+        return (rotation.mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
+
+    def _torque(self, samples: Samples) -> Tensor:
+        if samples.torque is None:
+            return torch.full_like(samples.joint_position, torch.nan)
+        return samples.torque
+
+    def _joints_above(self, body: int) -> list[int]:
+        path = set(self.tree.path(body))
+        return [j for j, row in enumerate(self.joint_rows) if any(moved in path for moved, _ in row.moved)]
+
+    def _friction_column(self, body: int) -> int:
+        return self.layout.count + 2 * (body - 1)
+
+    def _friction_support(self, joint: int) -> list[int]:
+        return [self._friction_column(body) + k for body, _ in self.joint_rows[joint].moved for k in (0, 1)]

@@ -1,0 +1,56 @@
+"""Triangular factors: all that is kept of any number of rows."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class TriangularFactor:
+    """R with `R^T R = X^T X` for all rows X added so far, right-hand side as the last column.
+
+    Rows that are zero outside a few columns are kept in a block of their own with just these columns. Memory is of the
+    order of the columns squared, whatever the number of rows, and Householder factorizations keep the full accuracy of
+    the rows (a Gram matrix would square the condition number). Factors of parts of the data merge into the factor of
+    all of it.
+    """
+
+    def __init__(self, columns: int) -> None:
+        """Start empty, for `columns` columns and one right-hand side."""
+        self.columns = columns
+        self.rows = 0
+        self._blocks: dict[tuple[int, ...], Tensor] = {}
+
+    def add(self, support: tuple[int, ...], rows: Tensor) -> None:
+        """Add rows (M, len(support) + 1) that are zero but in the columns `support`; right-hand side last."""
+        self.rows += rows.shape[0]
+        self._absorb(support, rows)
+
+    def merge(self, other: TriangularFactor) -> None:
+        """Add everything that another factor has seen.
+
+        Raises:
+            ValueError: the factors differ in columns.
+        """
+        if other.columns != self.columns:
+            raise ValueError(f"merge: found a factor of {other.columns} columns; accepted: {self.columns} columns")
+        self.rows += other.rows
+        for support, block in other._blocks.items():
+            self._absorb(support, block)
+
+    def triangle(self) -> Tensor:
+        """Upper triangular R, (columns + 1, columns + 1), float64 on the CPU."""
+        total = torch.zeros(self.columns + 1, self.columns + 1, dtype=torch.float64)
+        scattered = [total]
+        for support, block in self._blocks.items():
+            wide = torch.zeros(block.shape[0], self.columns + 1, dtype=torch.float64)
+            wide[:, [*support, self.columns]] = block.to("cpu", torch.float64)
+            scattered.append(wide)
+        return torch.linalg.qr(torch.cat(scattered), mode="r").R
+
+    def _absorb(self, support: tuple[int, ...], rows: Tensor) -> None:
+        kept = self._blocks.get(support)
+        stacked = rows if kept is None else torch.cat([kept, rows])
+        if stacked.shape[0] > stacked.shape[1]:
+            stacked = torch.linalg.qr(stacked, mode="r").R
+        self._blocks[support] = stacked

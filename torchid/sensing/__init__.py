@@ -1,0 +1,17 @@
+"""Contacts, sensor sets, and the projection that removes unmeasured forces."""
+
+from torchid.sensing.contacts import COMPONENTS, Contact, check_contacts
+from torchid.sensing.projection import ProjectedGroup, Projection
+from torchid.sensing.sensors import SensorNoise, SensorSet, chosen_sensors, named_sensors
+
+__all__ = [
+    "COMPONENTS",
+    "Contact",
+    "ProjectedGroup",
+    "Projection",
+    "SensorNoise",
+    "SensorSet",
+    "check_contacts",
+    "chosen_sensors",
+    "named_sensors",
+]

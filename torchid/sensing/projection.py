@@ -1,0 +1,145 @@
+"""Projection with V_x, a basis of the null space of the unmeasured forces (Mistry et al. 2009, eq. 7 to 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torchid.sensing.nullspace import null_space
+
+BASE_RANK_TOLERANCE = 1e-6
+"""A singular value of S_b V_x below this counts as a lost direction of the base (V_x is orthonormal: at most 1)."""
+
+
+@dataclass(frozen=True)
+class ProjectedGroup:
+    """Samples that share a contact state and a rank.
+
+    `index`, (B',), into the batch; `active`, (k,) bool, rows of J_C in contact; `V`, (B', nv, r); `K`, (B', r, P);
+    `f`, (B', r); `base_rank`, (B',), rank(S_b V_x). `V` is whitened, no longer orthonormal, if a noise was given.
+    """
+
+    index: Tensor
+    active: Tensor
+    V: Tensor
+    K: Tensor
+    f: Tensor
+    base_rank: Tensor
+
+
+def whitened(V: Tensor, J_m: Tensor, row_variance: Tensor, wrench_variance: Tensor) -> Tensor:
+    """Basis V L^-T under which the projected sensor noise is white; `L L^T` is its covariance under V.
+
+    Args:
+        V: (B, m, r).
+        J_m: (B, k_m, m), rows of the contact Jacobian whose wrench component is measured.
+        row_variance: (m,), noise variance of the generalized force itself (torque sensors, floor of the base rows).
+        wrench_variance: (k_m,), noise variance of each measured wrench component.
+    """
+    direct = V * row_variance.sqrt()[:, None]
+    through_contacts = (J_m @ V) * wrench_variance.sqrt()[:, None]
+    covariance = direct.mT @ direct + through_contacts.mT @ through_contacts
+    L = torch.linalg.cholesky(covariance)
+    return torch.linalg.solve_triangular(L, V.mT, upper=False).mT
+
+
+def base_singular_values(V: Tensor) -> Tensor:
+    """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, nv, r) orthonormal."""
+    values = torch.linalg.svdvals(V[:, :6])
+    return nn.functional.pad(values, (0, 6 - values.shape[1]))
+
+
+class Projection(nn.Module):
+    """V_x, V_x^T K and V_x^T f for one sensor set.
+
+    The unmeasured forces enter through `A_x = [S_x; J_x]`: rows of unit vectors for unmeasured joint torques, rows of
+    the contact Jacobian for unmeasured wrench components of active contacts. `V_x` spans its null space; whatever is
+    unmeasured has no place in `V_x^T K phi = V_x^T A_m^T [tau_m; lambda_m]`.
+    """
+
+    def __init__(
+        self,
+        torque_measured: Sequence[bool] | Tensor,
+        wrench_measured: Sequence[bool] | Tensor,
+        base_rows: int = 6,
+        torque_noise: float | Tensor | None = None,
+        wrench_noise: float | Tensor | None = None,
+        base_noise: float | Tensor | None = None,
+    ) -> None:
+        """Fix the masks.
+
+        Args:
+            torque_measured: (n,) bool.
+            wrench_measured: (k,) bool, by the rows of J_C.
+            base_rows: 6, or 0 for a fixed base.
+            torque_noise: standard deviation [N m], scalar or (n,). With all three given, rows are whitened.
+            wrench_noise: standard deviation [N or N m], scalar or (k,).
+            base_noise: floor of the base rows [N or N m], scalar or (6,).
+
+        Raises:
+            ValueError: some but not all noises given.
+        """
+        super().__init__()
+        noises = (torque_noise, wrench_noise, base_noise)
+        if any(x is None for x in noises) and any(x is not None for x in noises):
+            raise ValueError("torque_noise, wrench_noise, base_noise: found some; accepted: all three or none")
+        torque = torch.as_tensor(torque_measured, dtype=torch.bool)
+        self.base_rows = base_rows
+        self.register_buffer("torque_measured", torque, persistent=False)
+        self.register_buffer("wrench_measured", torch.as_tensor(wrench_measured, dtype=torch.bool), persistent=False)
+        self.register_buffer("kept", torch.cat([torch.ones(base_rows, dtype=torch.bool), torque]), persistent=False)
+        self._whiten = torque_noise is not None
+        if self._whiten:
+            torque_std, wrench_std, base_std = (torch.as_tensor(x, dtype=torch.float64) for x in noises)
+            rows = torch.cat([base_std.expand(base_rows), torque_std.expand(len(torque))])
+            self.register_buffer("row_variance", rows**2, persistent=False)
+            self.register_buffer("wrench_variance", wrench_std.expand(len(self.get_buffer("wrench_measured"))) ** 2, False)
+
+    def forward(
+        self, J_C: Tensor, active: Tensor, K: Tensor, torque: Tensor, wrench: Tensor
+    ) -> list[ProjectedGroup]:
+        """Project a batch.
+
+        Args:
+            J_C: (B, k, nv), contact Jacobian with the rows of all contacts, active or not.
+            active: (B, k) bool, rows whose contact touches the ground. The wrench of others is zero, whatever was read.
+            K: (B, nv, P), or any other matrix with the rows of the dynamics.
+            torque: (B, n), read only where measured [N m].
+            wrench: (B, k), by the rows of J_C, read only where measured and active [N, N m].
+
+        Returns:
+            One group per contact state and rank, every sample in exactly one.
+        """
+        groups: list[ProjectedGroup] = []
+        states, which = torch.unique(active, dim=0, return_inverse=True)
+        for number, state in enumerate(states):
+            index = torch.nonzero(which == number)[:, 0]
+            groups += self._state(index, state, J_C[index], K[index], torque[index], wrench[index])
+        return groups
+
+    def _state(
+        self, index: Tensor, state: Tensor, J: Tensor, K: Tensor, torque: Tensor, wrench: Tensor
+    ) -> list[ProjectedGroup]:
+        kept, measured = self.get_buffer("kept"), self.get_buffer("wrench_measured") & state
+        J_m = J[:, measured]
+        f = torch.zeros_like(K[:, :, 0])
+        f[:, self.base_rows :] = torch.where(self.get_buffer("torque_measured"), torque, torch.zeros_like(torque))
+        f = f + (J_m.mT @ wrench[:, measured, None])[..., 0]
+        groups = []
+        for rows, basis in null_space(J[:, state & ~self.get_buffer("wrench_measured")][:, :, kept]):
+            V = basis.new_zeros(basis.shape[0], len(kept), basis.shape[2])
+            V[:, kept] = basis
+            if self.base_rows:
+                base_rank = (base_singular_values(V) > BASE_RANK_TOLERANCE).sum(1)
+            else:
+                base_rank = index.new_zeros(V.shape[0])
+            if self._whiten:
+                variance, wrench_variance = self.get_buffer("row_variance"), self.get_buffer("wrench_variance")
+                V = whitened(V, J_m[rows].detach(), variance.to(V), wrench_variance[measured].to(V))
+            groups.append(
+                ProjectedGroup(index[rows], state, V, V.mT @ K[rows], (V.mT @ f[rows, :, None])[..., 0], base_rank)
+            )
+        return groups

@@ -1,0 +1,113 @@
+"""A sensor set: a mask over joint torques and contact-wrench components, with the noise of each.
+
+Full sensing, contacts only and joints only are three masks; nothing downstream knows their names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from torchid.errors import SensorError, UnknownNameError
+from torchid.parameters import Array
+from torchid.sensing.contacts import COMPONENTS, Contact
+
+NAMED_SETS = ("full", "contacts", "joints")
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviations of the sensors, and the least that a base row is ever trusted to.
+
+    `base_force` and `base_moment` stand for what no force sensor sees (differentiated motion, soft contacts): without
+    them a base row in flight, where no sensor contributes noise, would count as exact. By default one contact sensor's
+    noise.
+    """
+
+    joint_torque: float = 0.5
+    contact_force: float = 2.0
+    contact_moment: float = 0.2
+    base_force: float | None = None
+    base_moment: float | None = None
+
+    @property
+    def base(self) -> Array:
+        """Floor of the six base rows, (6,) [N, N m]."""
+        force = self.contact_force if self.base_force is None else self.base_force
+        moment = self.contact_moment if self.base_moment is None else self.base_moment
+        return np.array([force] * 3 + [moment] * 3)
+
+    @property
+    def wrench(self) -> Array:
+        """Of the six wrench components, (6,) [N, N m]."""
+        return np.array([self.contact_force] * 3 + [self.contact_moment] * 3)
+
+
+@dataclass(frozen=True)
+class SensorSet:
+    """Which forces are measured.
+
+    `torque`, (n,) bool, by the robot's joints; `wrench`, (C, 6) bool, by contacts and `COMPONENTS`.
+    """
+
+    torque: np.ndarray
+    wrench: np.ndarray
+    noise: SensorNoise = field(default_factory=SensorNoise)
+
+
+def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = None) -> SensorSet:
+    """One of the three sets that have a name: "full", "contacts" or "joints".
+
+    Raises:
+        SensorError: another name.
+    """
+    if name not in NAMED_SETS:
+        raise SensorError("sensors", "name", f"'{name}'", f"{', '.join(NAMED_SETS)}, or a mapping of sensors")
+    torque, wrench = name in ("full", "joints"), name in ("full", "contacts")
+    return SensorSet(np.full(n, torque), np.full((contacts, 6), wrench), noise or SensorNoise())
+
+
+def chosen_sensors(
+    joint_names: Sequence[str],
+    contacts: Sequence[Contact],
+    joint_torques: Iterable[str],
+    contact_wrenches: Mapping[str, Iterable[str]],
+    noise: SensorNoise | None = None,
+    source: object = "sensors",
+) -> SensorSet:
+    """A set chosen by name.
+
+    Args:
+        joint_names: the robot's independent joints.
+        contacts: the contacts in use.
+        joint_torques: joints whose torque is measured.
+        contact_wrenches: measured components ("fx" ... "mz") by contact frame.
+        noise: of the sensors.
+        source: named in errors.
+
+    Raises:
+        UnknownNameError: a joint, contact or component that does not exist.
+        SensorError: a component that its contact cannot exert.
+    """
+    torque = np.zeros(len(joint_names), dtype=bool)
+    for name in joint_torques:
+        if name not in joint_names:
+            raise UnknownNameError(source, "sensors.joint_torques", name, joint_names)
+        torque[list(joint_names).index(name)] = True
+    frames = [contact.frame for contact in contacts]
+    wrench = np.zeros((len(frames), 6), dtype=bool)
+    for frame, names in contact_wrenches.items():
+        if frame not in frames:
+            raise UnknownNameError(source, "sensors.contact_wrenches", frame, frames)
+        contact = contacts[frames.index(frame)]
+        for name in names:
+            field_name = f"sensors.contact_wrenches.{frame}"
+            if name not in COMPONENTS:
+                raise UnknownNameError(source, field_name, name, contact.component_names)
+            if name not in contact.component_names:
+                found = f"'{name}', which a {contact.kind} contact cannot exert"
+                raise SensorError(source, field_name, found, ", ".join(contact.component_names))
+            wrench[frames.index(frame), COMPONENTS.index(name)] = True
+    return SensorSet(torque, wrench, noise or SensorNoise())
