@@ -19,7 +19,7 @@ from torchid.problem.triangular import TriangularFactor
 from torchid.problem.workspace import Workspace
 from torchid.robot import Robot
 
-CHUNK = 1024
+CHUNK = 2048
 """Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
 
 Progress = Callable[[int], None]

@@ -68,6 +68,20 @@ class ChunkTerms:
     wrenches: Tensor
     rotation_world_base: Tensor | None
 
+    def select(self, index: Tensor) -> ChunkTerms:
+        """The terms of some samples."""
+
+        def pick(x: Tensor) -> Tensor:
+            return x.index_select(-1, index)
+
+        return ChunkTerms(
+            JointStates(*map(pick, vars(self.joints).values())),
+            BodyStates(*map(pick, vars(self.states).values())),
+            pick(self.directions),
+            pick(self.wrenches),
+            None if self.rotation_world_base is None else self.rotation_world_base[index],
+        )
+
 
 class RowBuilder(nn.Module):
     """Rows of `L^-1 V_x^T [K_reduced | f]`, where L L^T is the covariance of the projected sensor noise.
@@ -117,13 +131,16 @@ class RowBuilder(nn.Module):
             self._plans[state] = self._make_plan(state)
         return self._plans[state]
 
-    def terms(self, samples: Samples) -> ChunkTerms:
-        """Dynamics of some samples."""
+    def terms(self, samples: Samples, workspace: Workspace | None = None) -> ChunkTerms:
+        """Dynamics of some samples; with a workspace, valid until the next call with the same."""
         motion = samples.motion()
         joints = joint_states(self.tree, motion)
         states = body_states(self.tree, motion, joints)
         directions = joint_directions(self.tree, states)
-        wrenches = all_wrench_columns(states, self.layout)
+        out = None
+        if workspace is not None:
+            out = workspace.zeros("wrenches", None, states.position, 6, self.layout.count, len(samples))
+        wrenches = all_wrench_columns(states, self.layout, out)
         return ChunkTerms(joints, states, directions, wrenches, samples.rotation_world_base)
 
     def rows(
@@ -134,9 +151,10 @@ class RowBuilder(nn.Module):
         Yields:
             (columns, rows): rows are (M, len(columns) + 1), the right-hand side last.
         """
-        plan, terms = self.plan(state), self.terms(samples)
+        workspace = workspace or Workspace()
+        plan, terms = self.plan(state), self.terms(samples, workspace)
         if self.tree.base_rows or plan.mixed_joints:
-            yield plan.support, self._mixed_rows(samples, plan, terms, workspace or Workspace())
+            yield plan.support, self._mixed_rows(samples, plan, terms, workspace)
         for joint in plan.lone_joints:
             row = self.joint_rows[joint]
             torque = self._torque(samples)[:, joint]
@@ -194,49 +212,79 @@ class RowBuilder(nn.Module):
 
     def _mixed_rows(self, samples: Samples, plan: StatePlan, terms: ChunkTerms, workspace: Workspace) -> Tensor:
         unmeasured, measured = self._contact_jacobians(plan, terms, len(samples))
-        X = self._mixed_dynamics(samples, plan, terms, workspace)
         wrench = self._measured_wrench(samples, plan, terms)
-        X[:, :, -1] += (measured.mT @ wrench[..., None])[..., 0]
+        torque = self._torque(samples)[:, list(plan.mixed_joints)]
+        f = torch.nn.functional.pad(torque, (self.tree.base_rows, 0)) + (measured.mT @ wrench[..., None])[..., 0]
         noise = self.sensors.noise
-        base = np.broadcast_to(noise.base, 6)[: self.tree.base_rows]
-        variance = np.append(base, np.full(len(plan.mixed_joints), noise.joint_torque)) ** 2
-        std = torch.cat([body.std for body in plan.contact_bodies]) if plan.contact_bodies else X.new_zeros(0)
+        row_noise = [*noise.base[: self.tree.base_rows], *[noise.joint_torque] * len(plan.mixed_joints)]
+        variance = f.new_tensor(row_noise) ** 2
+        std = torch.cat([body.std for body in plan.contact_bodies]) if plan.contact_bodies else f.new_zeros(0)
         pieces = []
         for index, V in null_space(unmeasured):
-            W = whitened(V, measured[index], X.new_tensor(variance), std**2)
-            pieces.append((W.mT @ X[index]).flatten(0, 1))
+            W = whitened(V, measured[index], variance, std**2)
+            part = terms if isinstance(index, slice) else terms.select(index)
+            pieces.append(self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, plan, part, workspace))
         return pieces[0] if len(pieces) == 1 else torch.cat(pieces)
 
-    def _mixed_dynamics(self, samples: Samples, plan: StatePlan, terms: ChunkTerms, workspace: Workspace) -> Tensor:
-        """Rows [K | S^T tau] of the base and the mixed joints, (B, base rows + mixed joints, columns + 1)."""
-        base_rows = self.tree.base_rows
+    def _projected(self, W: Tensor, f: Tensor, plan: StatePlan, terms: ChunkTerms, workspace: Workspace) -> Tensor:
+        """Rows W^T [K | f], (r B, columns + 1), for a basis W, (base rows + mixed joints, r, B), and f, (..., B).
+
+        A wrench on body i does work on the base and on the joints above it only, so that body i's columns of W^T K are
+        A_i^T times its wrench columns, with A_i the sum of W's rows along i's path, each carried by its screw axis. No
+        joint row is ever formed. Columns are contiguous, as the factorization wants them.
+        """
+        rows, samples = W.shape[1:]
+        X = workspace.zeros("projected", None, W, len(plan.support) + 1, rows, samples)
+        carried = W[: self.tree.base_rows] if self.tree.base_rows else W.new_zeros(6, rows, samples)
+        by_body: dict[int, Tensor] = {0: carried}
+        mixed = {moved: (joint, ratio) for joint in plan.mixed_joints for moved, ratio in self.joint_rows[joint].moved}
+        first = plan.support[0] if plan.support else 0
         place = {column: i for i, column in enumerate(plan.support)}
-        rows, columns = base_rows + len(plan.mixed_joints), len(plan.support) + 1
-        X = workspace.zeros("by column", plan.support, terms.wrenches, rows, columns, len(samples))
-        if base_rows:
-            X[:base_rows, : self.layout.count] = terms.wrenches
-        for i, joint in enumerate(plan.mixed_joints, start=base_rows):
-            row = self.joint_rows[joint]
-            start = place[row.start]
-            part = joint_row(row, self.tree, self.layout, terms.directions, terms.wrenches)
-            X[i, start : start + row.end - row.start] = part
-            for body, coulomb, viscous in friction_columns(row, terms.joints):
-                X[i, place[self._friction_column(body)]] = coulomb
-                X[i, place[self._friction_column(body) + 1]] = viscous
-            X[i, -1] = self._torque(samples)[:, joint]
-        by_sample = workspace.zeros("by sample", None, X, len(samples), rows * columns)
-        return by_sample.copy_(X.flatten(0, 1).T).view(len(samples), rows, columns)
+        for body in range(self.tree.bodies):
+            if body:
+                carried = by_body[self.tree.parents[body]]
+                if body in mixed:
+                    joint, ratio = mixed[body]
+                    own = W[self.tree.base_rows + plan.mixed_joints.index(joint)] * ratio
+                    carried = torch.addcmul(carried, terms.directions[:, body, None], own)
+                    velocity = terms.joints.velocity[body]
+                    start = place[self._friction_column(body)]
+                    torch.mul(own, torch.sign(velocity), out=X[start])
+                    torch.mul(own, velocity, out=X[start + 1])
+                by_body[body] = carried
+            start, end = self.layout.starts[body] - first, self.layout.starts[body + 1] - first
+            if start >= 0 and end <= len(plan.support):
+                pulling = sum(column < parameters.INERTIA.start for column in self.layout.kept[body])
+                self._carry(terms.wrenches[:, start + first : end + first], carried, pulling, X[start:end])
+        torch.sum(W * f[:, None], dim=0, out=X[-1])
+        return X.flatten(1).T
+
+    @staticmethod
+    def _carry(wrenches: Tensor, carried: Tensor, pulling: int, out: Tensor) -> None:
+        """Write A^T w for wrench columns (6, c, B) into (c, r, B); only the first `pulling` columns have a force."""
+        torch.mul(wrenches[3][:, None], carried[3], out=out)
+        for k in (4, 5):
+            out.addcmul_(wrenches[k][:, None], carried[k])
+        for k in (0, 1, 2):
+            out[:pulling].addcmul_(wrenches[k, :pulling, None], carried[k])
 
     def _contact_jacobians(self, plan: StatePlan, terms: ChunkTerms, samples: int) -> tuple[Tensor, Tensor]:
         """Unmeasured and measured contact rows on the base and the mixed joints, (B, k, base rows + mixed joints)."""
         width = self.tree.base_rows + len(plan.mixed_joints)
-        unmeasured, measured = [], []
+        sizes = [sum(len(rows) for rows in kind) for kind in zip(*((b.unmeasured, b.measured) for b in plan.contact_bodies), strict=True)]
+        unmeasured, measured = (terms.wrenches.new_zeros(k, width, samples) for k in sizes or (0, 0))
+        above, below = 0, 0
         for contact in plan.contact_bodies:
-            J = body_jacobian(self.tree, terms.states, terms.directions, contact.body, list(plan.mixed_joints))
-            unmeasured.append(torch.tensordot(contact.unmeasured, J, dims=1))
-            measured.append(torch.tensordot(contact.measured, J, dims=1))
-        empty = terms.wrenches.new_zeros(samples, 0, width)
-        return tuple(torch.cat(x).permute(2, 0, 1) if x else empty for x in (unmeasured, measured))  # type: ignore[return-value]
+            moving = set(self._joints_above(contact.body))
+            places = [i for i, joint in enumerate(plan.mixed_joints) if joint in moving]
+            joints = [plan.mixed_joints[i] for i in places]
+            J = body_jacobian(self.tree, terms.states, terms.directions, contact.body, joints)
+            columns = [*range(self.tree.base_rows), *(self.tree.base_rows + i for i in places)]
+            for rows, target, start in ((contact.unmeasured, unmeasured, above), (contact.measured, measured, below)):
+                if len(rows):
+                    target[start : start + len(rows), columns] = torch.tensordot(rows, J, dims=1)
+            above, below = above + len(contact.unmeasured), below + len(contact.measured)
+        return unmeasured.permute(2, 0, 1), measured.permute(2, 0, 1)
 
     def _measured_wrench(self, samples: Samples, plan: StatePlan, terms: ChunkTerms) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""

@@ -20,6 +20,7 @@ class TriangularFactor:
         self.columns = columns
         self.rows = 0
         self._blocks: dict[tuple[int, ...], Tensor] = {}
+        self._scratch: Tensor | None = None
 
     def add(self, support: tuple[int, ...], rows: Tensor) -> None:
         """Add rows (M, len(support) + 1) that are zero but in the columns `support`; right-hand side last."""
@@ -50,7 +51,16 @@ class TriangularFactor:
 
     def _absorb(self, support: tuple[int, ...], rows: Tensor) -> None:
         kept = self._blocks.get(support)
-        stacked = rows if kept is None else torch.cat([kept, rows])
-        if stacked.shape[0] > stacked.shape[1]:
-            stacked = torch.linalg.qr(stacked, mode="r").R
-        self._blocks[support] = stacked
+        above, width = (0 if kept is None else kept.shape[0]), rows.shape[1]
+        count = above + rows.shape[0]
+        if count < width:
+            self._blocks[support] = rows.clone() if kept is None else torch.cat([kept, rows])
+            return
+        if self._scratch is None or self._scratch.numel() < count * width:
+            self._scratch = rows.new_empty(count * width)
+        stacked = self._scratch[: count * width].view(width, count)  # columns contiguous: LAPACK works in place
+        if kept is not None:
+            stacked[:, :above] = kept.T
+        stacked[:, above:] = rows.T
+        torch.geqrf(stacked.T, out=(stacked.T, rows.new_empty(width)))
+        self._blocks[support] = stacked[:, :width].T.triu()

@@ -38,15 +38,14 @@ def _first_moment_wrenches(omega: Tensor, alpha: Tensor, force: Tensor) -> tuple
     return forces, moments
 
 
-def wrench_columns(states: BodyStates, columns: tuple[int, ...]) -> Tensor:
-    """Wrenches of some inertial parameters for all given bodies.
+def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) -> None:
+    """Write the wrenches of some inertial parameters of all given bodies.
 
     Args:
         states: of the frames the parameters are expressed in, k of them.
         columns: places in the order of `torchid.parameters`, ascending, below 10.
-
-    Returns:
-        (6, k, len(columns), B): force [N], then moment about the base origin [N m], per unit of the parameter.
+        out: (6, k, len(columns), B), zero in the force rows of inertia columns; receives force [N], then moment about
+            the base origin [N m], per unit of the parameter.
 
     Source: the Newton-Euler equations of a body about its frame's origin, sorted by parameter.
     """
@@ -54,26 +53,22 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...]) -> Tensor:
     omega, alpha, force = (
         rotate(inverse, x) for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
     )
-    kept_axes = [c - parameters.FIRST_MOMENT.start for c in columns if c in (1, 2, 3)]
-    pushes, twists = _first_moment_wrenches(omega, alpha, force)
-    by_axes = _inertia_moments(omega, alpha)
-    spins = [by_axes[parameters.INERTIA_AXES[c - parameters.INERTIA.start]] for c in columns if c >= 4]
-
-    forces, moments = [], []
-    if parameters.MASS in columns:
-        forces.append(states.specific_force[:, :, None])
-        moments.append(torch.zeros_like(forces[0]))
-    if kept_axes:
-        forces.append(_to_base(states.rotation, [pushes[k] for k in kept_axes]))
-        moments.append(_to_base(states.rotation, [twists[k] for k in kept_axes]))
-    if spins:
-        moments.append(_to_base(states.rotation, spins))
-    pulling = torch.cat(forces, 2)
-    moment = torch.cat(moments, 2)
-    lever = cross(states.position[:, :, None], pulling)
-    moment = torch.cat([moment[:, :, : pulling.shape[2]] + lever, moment[:, :, pulling.shape[2] :]], 2)
-    force_rows = torch.nn.functional.pad(pulling, (0, 0, 0, len(spins)))
-    return torch.cat([force_rows, moment])
+    spinning = [column for column in columns if column >= parameters.INERTIA.start]
+    pulling = len(columns) - len(spinning)
+    if pulling:
+        axes = [column - parameters.FIRST_MOMENT.start for column in columns[:pulling] if column != parameters.MASS]
+        pushes, twists = _first_moment_wrenches(omega, alpha, force)
+        forces = _to_base(states.rotation, [pushes[k] for k in axes])
+        moments = _to_base(states.rotation, [twists[k] for k in axes])
+        if parameters.MASS in columns:
+            forces = torch.cat([states.specific_force[:, :, None], forces], 2)
+            moments = torch.nn.functional.pad(moments, (0, 0, 1, 0))
+        out[:3, :, :pulling] = forces
+        out[3:, :, :pulling] = moments + cross(states.position[:, :, None], forces)
+    if spinning:
+        by_axes = _inertia_moments(omega, alpha)
+        spins = [by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in spinning]
+        out[3:, :, pulling:] = _to_base(states.rotation, spins)
 
 
 def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:

@@ -7,6 +7,7 @@ of columns because bodies are in depth-first order.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -48,23 +49,22 @@ def joint_directions(tree: KinematicTree, states: BodyStates) -> Tensor:
     return torch.cat([linear, axis * tree.revolute])
 
 
-def all_wrench_columns(states: BodyStates, layout: ColumnLayout) -> Tensor:
-    """Wrench columns (6, columns, B) of all bodies; bodies that keep the same columns are computed together."""
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for body, kept in enumerate(layout.kept):
+def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | None = None) -> Tensor:
+    """Wrench columns (6, columns, B) of all bodies.
+
+    Args:
+        states: of the frames that `layout`'s parameters are expressed in.
+        layout: which columns to compute.
+        out: a buffer of the result's shape to write to, as it was left by an earlier call with the same layout.
+    """
+    if out is None:
+        out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
+    for kept, run in groupby(range(len(layout.kept)), key=lambda body: layout.kept[body]):
+        bodies = list(run)
         if kept:
-            groups.setdefault(kept, []).append(body)
-    pieces = [wrench_columns(states.select(bodies), kept).flatten(1, 2) for kept, bodies in groups.items()]
-    wrenches = pieces[0] if len(pieces) == 1 else torch.cat(pieces, 1)
-    computed = [body for bodies in groups.values() for body in bodies]
-    if computed == sorted(computed):
-        return wrenches
-    place = {}
-    for body in computed:
-        start = sum(len(layout.kept[other]) for other in computed[: computed.index(body)])
-        place[body] = range(start, start + len(layout.kept[body]))
-    order = [column for body in sorted(computed) for column in place[body]]
-    return wrenches[:, order]
+            columns = out[:, layout.starts[bodies[0]] : layout.starts[bodies[-1] + 1]]
+            wrench_columns(states.run(bodies[0], bodies[-1] + 1), kept, columns.unflatten(1, (-1, len(kept))))
+    return out
 
 
 def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, directions: Tensor, wrenches: Tensor) -> Tensor:

@@ -26,14 +26,9 @@ class BodyStates:
     angular_acceleration: Tensor
     specific_force: Tensor
 
-    def select(self, bodies: list[int]) -> BodyStates:
-        """The states of some bodies; a view where they are consecutive."""
-        first, last = bodies[0], bodies[-1]
-        if bodies == list(range(first, last + 1)):
-            pick = slice(first, last + 1)
-            return BodyStates(*(x[..., pick, :] for x in vars(self).values()))
-        index = torch.tensor(bodies, device=self.rotation.device)
-        return BodyStates(*(x.index_select(-2, index) for x in vars(self).values()))
+    def run(self, start: int, end: int) -> BodyStates:
+        """The states of consecutive bodies, a view."""
+        return BodyStates(*(x[..., start:end, :] for x in vars(self).values()))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,222 @@
+"""Time the regressor and the whole pipeline against a per-sample pipeline of Pinocchio and NumPy, in one run.
+
+    python scripts/benchmark.py [--samples 32768] [--repeats 5]
+
+Needs the packages pin and example-robot-data (extra `[oracle]`). Both pipelines start from the arrays of a log and end
+with parameters, `joints` sensors: torques measured, contact forces not, two thirds of the samples on all feet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from torchid.errors import TorchidWarning
+from torchid.estimators import LeastSquares
+from torchid.problem import RowBuilder, Samples, compress, linear_problem
+from torchid.problem.rows import ChunkTerms
+from torchid.regressor import Regressor
+from torchid.robot import Robot, load_robot
+from torchid.sensing import Contact, SensorNoise, named_sensors
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot with the feet it stands on."""
+
+    name: str
+    urdf: str
+    feet: tuple[str, ...]
+    kind: str
+
+
+CASES = (
+    Case("Solo12", "solo_description/robots/solo12.urdf", ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), "point"),
+    Case("Alexander legs", "alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf", ("LEFT_FOOT", "RIGHT_FOOT"), "flat"),
+    Case("G1", "g1_description/urdf/g1_29dof_rev_1_0.urdf", ("left_ankle_roll_link", "right_ankle_roll_link"), "flat"),
+)
+
+
+def robots_folder() -> Path:
+    """Where the package example-robot-data keeps its URDFs."""
+    for folder in Path(pin.__file__).resolve().parents:
+        found = folder / "share" / "example-robot-data" / "robots"
+        if found.is_dir():
+            return found
+    raise SystemExit("benchmark: the package example-robot-data is missing; pip install 'torchid[oracle]'")
+
+
+def random_samples(robot: Robot, contacts: int, count: int) -> Samples:
+    """Unrelated random states: the cost does not depend on the motion."""
+    rng = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=rng, dtype=torch.float64)
+
+    active = torch.ones(count, contacts, dtype=torch.bool)
+    active[2 * count // 3 :, 0] = False
+    base = {
+        "base_quat_xyzw": torch.nn.functional.normalize(normal(count, 4)),
+        "base_angular_velocity_base": normal(count, 3),
+        "base_angular_acceleration_base": normal(count, 3),
+        "base_linear_acceleration_world": normal(count, 3),
+    }
+    joints = [normal(count, robot.n) for _ in range(4)]
+    time_stamps = torch.arange(count, dtype=torch.float64)
+    return Samples("random", time_stamps, *joints[:3], base, joints[3], None, False, active)
+
+
+class PerSample:
+    """The usual way: one sample at a time through Pinocchio's regressor and NumPy's decompositions."""
+
+    def __init__(self, urdf: Path, robot: Robot, case: Case) -> None:
+        """Load the model and look up joints and feet."""
+        self.model = pin.buildModelFromUrdf(str(urdf), pin.JointModelFreeFlyer())
+        self.data = self.model.createData()
+        joints = [self.model.joints[self.model.getJointId(name)] for name in robot.joint_names]
+        self.q_place = np.array([joint.idx_q for joint in joints])
+        self.v_place = np.array([joint.idx_v for joint in joints])
+        self.feet = [self.model.getFrameId(foot, pin.FrameType.BODY) for foot in case.feet]
+        self.rows = 3 if case.kind == "point" else 6
+        noise = SensorNoise()
+        self.variance = np.append(noise.base, np.full(robot.n, noise.joint_torque)) ** 2
+
+    def states(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Pinocchio's q, v, a and the torques in its order."""
+        count, model = len(samples), self.model
+        q, v, a, f = (np.zeros((count, size)) for size in (model.nq, model.nv, model.nv, model.nv))
+        q[:, 3:7] = samples.base["base_quat_xyzw"]
+        q[:, self.q_place] = samples.joint_position
+        v[:, 3:6] = samples.base["base_angular_velocity_base"]
+        v[:, self.v_place] = samples.joint_velocity
+        rotation = samples.rotation_world_base
+        assert rotation is not None
+        a[:, :3] = (rotation.mT @ samples.base["base_linear_acceleration_world"][..., None])[..., 0]
+        a[:, 3:6] = samples.base["base_angular_acceleration_base"]
+        a[:, self.v_place] = samples.joint_acceleration
+        f[:, self.v_place] = samples.torque
+        return q, v, a, f
+
+    def projected(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, f: np.ndarray, active: np.ndarray) -> tuple:
+        """V^T [K, friction] and V^T f of one sample, whitened; the same rows, up to a rotation, as torchid's."""
+        K = pin.computeJointTorqueRegressor(self.model, self.data, q, v, a)
+        feet = [foot for foot, touches in zip(self.feet, active, strict=True) if touches]
+        J = np.vstack([pin.computeFrameJacobian(self.model, self.data, q, foot, pin.LOCAL)[: self.rows] for foot in feet])
+        _, singular, Vh = np.linalg.svd(J)
+        V = Vh[(singular > 1e-9 * singular[0]).sum() :]
+        L = np.linalg.cholesky((V * self.variance) @ V.T)
+        V = np.linalg.solve(L, V)
+        friction = np.hstack([V[:, 6:] * np.sign(v[6:]), V[:, 6:] * v[6:]])
+        return np.hstack([V @ K, friction]), V @ f
+
+    def residual(self, samples: Samples, phi: np.ndarray) -> float:
+        """Root mean square of the whitened residual at parameters in `by_stack`'s order."""
+        q, v, a, f = self.states(samples)
+        blocks = [self.projected(*x) for x in zip(q, v, a, f, samples.active.numpy(), strict=True)]
+        return float(np.sqrt(np.mean(np.concatenate([Y @ phi - y for Y, y in blocks]) ** 2)))
+
+    def by_stack(self, samples: Samples) -> np.ndarray:
+        """All rows stacked, one `numpy.linalg.lstsq`."""
+        q, v, a, f = self.states(samples)
+        blocks = [self.projected(*x) for x in zip(q, v, a, f, samples.active.numpy(), strict=True)]
+        return np.linalg.lstsq(np.vstack([b[0] for b in blocks]), np.concatenate([b[1] for b in blocks]), rcond=None)[0]
+
+    def by_gram(self, samples: Samples) -> np.ndarray:
+        """Normal equations summed sample by sample (half of the digits)."""
+        q, v, a, f = self.states(samples)
+        columns = 10 * (self.model.njoints - 1) + 2 * (self.model.nv - 6)
+        gram, right = np.zeros((columns, columns)), np.zeros(columns)
+        for x in zip(q, v, a, f, samples.active.numpy(), strict=True):
+            Y, y = self.projected(*x)
+            gram += Y.T @ Y
+            right += Y.T @ y
+        return np.linalg.lstsq(gram, right, rcond=None)[0]
+
+    def regressors(self, samples: Samples) -> None:
+        """Only the regressor, called from Python."""
+        q, v, a, _ = self.states(samples)
+        for x in zip(q, v, a, strict=True):
+            pin.computeJointTorqueRegressor(self.model, self.data, *x)
+
+
+def microseconds(work: Callable[[], object], samples: int) -> float:
+    """Wall time per sample of one call."""
+    start = time.perf_counter()
+    work()
+    return (time.perf_counter() - start) / samples * 1e6
+
+
+def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
+    """Medians of microseconds per sample; all contestants take turns, so that a busy machine slows them alike."""
+    urdf = robots_folder() / case.urdf
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        robot = load_robot(urdf)
+    contacts = [Contact(foot, case.kind) for foot in case.feet]
+    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts)))
+    samples, old, regressor = random_samples(robot, len(contacts), count), PerSample(urdf, robot, case), Regressor(robot)
+    few = samples[torch.arange(0, count, 16)]
+
+    def pipeline() -> None:
+        LeastSquares().solve(linear_problem(compress([samples], builder), builder, robot))
+
+    def in_chunks(work: Callable[[Samples], object]) -> Callable[[], None]:
+        def run() -> None:
+            with torch.inference_mode():
+                for start in range(0, count, 1024):
+                    work(samples[start : start + 1024])
+
+        return run
+
+    def reduced(part: Samples) -> ChunkTerms:
+        return builder.terms(part)
+
+    contestants: dict[str, tuple[Callable[[], object], int]] = {
+        "K, Pinocchio": (lambda: old.regressors(few), len(few)),
+        "K, torchid, 12 L columns": (in_chunks(lambda part: regressor.from_motion(part.motion())), count),
+        "wrench columns, torchid": (in_chunks(reduced), count),
+        "per sample, lstsq": (lambda: old.by_stack(few), len(few)),
+        "per sample, Gram": (lambda: old.by_gram(few), len(few)),
+        "torchid": (pipeline, count),
+    }
+    times: dict[str, list[float]] = {name: [] for name in contestants}
+    for name, (work, _) in contestants.items():
+        work()
+    for _ in range(repeats):
+        for name, (work, size) in contestants.items():
+            times[name].append(microseconds(work, size))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def main() -> None:
+    """Measure all robots and print one table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--samples", type=int, default=32768)
+    parser.add_argument("--repeats", type=int, default=5)
+    arguments = parser.parse_args()
+    table = Table(title=f"Median microseconds per sample, {torch.get_num_threads()} threads, float64")
+    results = {case.name: measure(case, arguments.samples, arguments.repeats) for case in CASES}
+    table.add_column("")
+    for case in CASES:
+        table.add_column(case.name, justify="right")
+    for name in next(iter(results.values())):
+        table.add_row(name, *(f"{results[case.name][name]:.1f}" for case in CASES))
+    for name in ("per sample, lstsq", "per sample, Gram"):
+        ratios = [results[case.name][name] / results[case.name]["torchid"] for case in CASES]
+        table.add_row(f"{name} / torchid", *(f"{ratio:.1f}" for ratio in ratios))
+    Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    main()
