@@ -68,7 +68,7 @@ def compress(
         if threads > 1:
             torch.set_num_threads(1)
         factor, workspace = TriangularFactor(builder.columns), Workspace()
-        with torch.inference_mode():
+        with torch.no_grad():
             for samples, state, index in part:
                 piece = samples[index].to(device)
                 for support, rows in builder.rows(piece, state, workspace):

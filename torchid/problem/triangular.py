@@ -49,6 +49,7 @@ class TriangularFactor:
             scattered.append(wide)
         return torch.linalg.qr(torch.cat(scattered), mode="r").R
 
+    @torch.no_grad()
     def _absorb(self, support: tuple[int, ...], rows: Tensor) -> None:
         kept = self._blocks.get(support)
         above, width = (0 if kept is None else kept.shape[0]), rows.shape[1]
