@@ -53,17 +53,11 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
 
     Raises:
         InputError: `cutoff_hz` or `sample_rate_hz` does not suit the log.
-        LogError: the log has too few samples or too wide gaps, a value that is not finite, or an orientation but
-            nothing to take the base's linear acceleration from.
+        LogError: the log has too few samples or too wide gaps, or a value that is not finite.
 
     Warns:
         TorchidWarning: a torque or wrench channel is NaN in some samples, or time stamps nearly coincide.
     """
-    if log.base_quat_xyzw is not None and all(getattr(log, name) is None for name in CHAINS[1]):
-        accepted = (
-            "any of base_position_world, base_linear_velocity_{world,base}, base_linear_acceleration_{world,base}"
-        )
-        raise LogError(log.source, CHAINS[1][2], "missing, with nothing to derive it from", accepted)
     differentiates = _differentiates(log)
     if cutoff_hz is None and sample_rate_hz is None and not differentiates:
         return log

@@ -98,7 +98,7 @@ class RowBuilder(nn.Module):
         self.layout = reduced_layout(self.tree)
         self.joint_rows = joint_rows(self.tree, self.layout)
         self._measured = measured_components(self.contacts, sensors)
-        self._frames = [self._frame(robot, contact) for contact in self.contacts]
+        self.frames = [self._frame(robot, contact) for contact in self.contacts]
         self._plans: dict[State, StatePlan] = {}
 
     def _frame(self, robot: Robot, contact: Contact) -> tuple[int, Array]:
@@ -164,18 +164,17 @@ class RowBuilder(nn.Module):
             block = torch.cat([inertial, torch.stack([*extra, torque])]) / self.sensors.noise.joint_torque
             yield (*range(row.start, row.end), *self._friction_support(joint)), block.T
 
-    def bases(self, samples: Samples, state: State) -> Iterator[Tensor]:
-        """Orthonormal V_x on the base and the mixed joints, (B', base rows + mixed joints, r), grouped by rank."""
+    def bases(self, samples: Samples, state: State) -> Iterator[tuple[Tensor | slice, Tensor]]:
+        """Orthonormal V_x, (B', base rows + mixed joints, r), with the samples it belongs to, grouped by rank."""
         plan, terms = self.plan(state), self.terms(samples)
         unmeasured, _ = self._contact_jacobians(plan, terms, len(samples))
-        for _, V in null_space(unmeasured):
-            yield V
+        yield from null_space(unmeasured)
 
     def _make_plan(self, state: State) -> StatePlan:
         touching: dict[int, list[int]] = {}
         for contact, active in enumerate(state):
             if active:
-                touching.setdefault(self._frames[contact][0], []).append(contact)
+                touching.setdefault(self.frames[contact][0], []).append(contact)
         moving = {joint for body in touching for joint in self._joints_above(body)}
         measured = np.flatnonzero(self.sensors.torque).tolist()
         mixed = tuple(joint for joint in measured if joint in moving)
@@ -194,7 +193,7 @@ class RowBuilder(nn.Module):
     def _contact_body(self, body: int, contacts: list[int]) -> ContactBody:
         unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []
         for contact in contacts:
-            at_body = wrench_map(self._frames[contact][1]).T
+            at_body = wrench_map(self.frames[contact][1]).T
             for k in self.contacts[contact].components:
                 if self._measured[contact, k]:
                     measured.append(at_body[k][None])
@@ -304,7 +303,7 @@ class RowBuilder(nn.Module):
         wrench = samples.wrench[:, contact]
         if not samples.wrench_in_world:
             return wrench
-        body, T_joint_frame = self._frames[contact]
+        body, T_joint_frame = self.frames[contact]
         R_joint_frame = wrench.new_tensor(T_joint_frame[:3, :3])
         rotation = terms.states.rotation[:, :, body].permute(2, 0, 1) @ R_joint_frame
         if terms.rotation_world_base is not None:

@@ -23,6 +23,12 @@ _MOTION_FIELDS = (
     "base_linear_acceleration_world",
 )
 
+_ACCEPTED = {
+    "base_quat_xyzw": "base_quat_wxyz or base_quat_xyzw",
+    "base_linear_acceleration_world": "base_position_world, base_linear_velocity_{world,base} or "
+    "base_linear_acceleration_{world,base}",
+}
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -118,7 +124,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
     base = {name: torch.from_numpy(x) for name in _MOTION_FIELDS if (x := getattr(log, name)) is not None}
     if not robot.fixed_base and len(base) < len(_MOTION_FIELDS):
         missing = next(name for name in _MOTION_FIELDS if name not in base)
-        accepted = "base_quat_wxyz or base_quat_xyzw" if "quat" in missing else f"{missing}, or preprocess() the log"
+        accepted = _ACCEPTED.get(missing, f"{missing}, or a log passed through preprocess()")
         raise LogError(log.source, missing, "missing, though the base floats", accepted)
     if robot.fixed_base:
         base = {name: x for name, x in base.items() if name == "base_quat_xyzw"}  # how the base is mounted

@@ -1,0 +1,93 @@
+"""Command line: parse, call, print."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+
+from torchid.errors import BaseLostError, InputError, TorchidWarning
+
+_IDENTIFY = "fit the parameters of an experiment file and write a run folder"
+_EVALUATE = "predict the forces of further logs with the parameters of a run"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
+    options = _parser().parse_args(arguments)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", TorchidWarning)
+        warnings.showwarning = _show_warning
+        try:
+            options.command(options)
+        except (InputError, BaseLostError) as error:
+            print(f"torchid: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("torchid: interrupted; nothing was written", file=sys.stderr)
+            return 1
+        except Exception as error:  # a bug or a full disk: still no wall of text unless asked for
+            if options.debug:
+                traceback.print_exc()
+            print(f"torchid: {type(error).__name__}: {error} (--debug shows where)", file=sys.stderr)
+            return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="torchid", description="Identify a robot's inertia and friction from logs.")
+    parser.add_argument("--version", action="version", version=f"torchid {version('torchid')}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
+    identify.add_argument("file", help="experiment file (YAML)")
+    identify.add_argument("overrides", nargs="*", help="key.subkey=value, for example estimator.ridge=0.01")
+    identify.set_defaults(command=_identify)
+    evaluate = commands.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
+    evaluate.add_argument("run", help="run folder")
+    evaluate.add_argument("--log", action="append", required=True, metavar="FILE", help="log to evaluate; may be repeated")
+    evaluate.set_defaults(command=_evaluate)
+    for command in (identify, evaluate):
+        command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
+    return parser
+
+
+def _identify(options: argparse.Namespace) -> None:
+    from rich.console import Console
+
+    from torchid.config import load_config
+    from torchid.report.tables import error_table, state_table
+    from torchid.run import identify
+
+    run = identify(load_config(options.file, options.overrides), options.file)
+    console, estimate, robot = Console(), run.estimate, run.experiment.robot
+    console.print(state_table([asdict(state) for state in run.states]))
+    console.print(error_table(run.metrics))
+    mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
+    print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
+    print(f"condition     {estimate.condition_number:.3g}")
+    print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
+    print(f"total mass    {mass:.3f} kg (URDF: {robot.nominal[:, 0].sum():.3f} kg)")
+    if robot.massless:
+        print(f"left out      massless: {', '.join(robot.massless)}")
+    timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
+    print(f"time          {run.samples} samples: {timed}")
+    print(f"written to    {run.experiment.config.output}")
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from rich.console import Console
+
+    from torchid.report.tables import error_table
+    from torchid.run import evaluate
+
+    metrics, output = evaluate(options.run, options.log)
+    Console().print(error_table(metrics))
+    print(f"written to    {output}")
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
+    print(f"torchid: {category.__name__}: {message}", file=sys.stderr)

@@ -1,0 +1,99 @@
+"""Measured and predicted generalized forces, sample by sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid.parameters import Array
+from torchid.problem.compress import by_state
+from torchid.problem.rows import ChunkTerms, RowBuilder, State
+from torchid.problem.samples import Samples
+from torchid.regressor.kinematics import cross, rotate
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Generalized forces of some samples, rows as in K: base force, base moment, joints.
+
+    `measured`, (B, nv): S^T tau + J_C^T lambda, NaN where a force that enters was not measured. `torque`, (B, nv): the
+    part S^T tau. `predicted`, (M, B, nv): K phi for M parameter vectors.
+    """
+
+    measured: Tensor
+    torque: Tensor
+    predicted: Tensor
+
+
+def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Tensor:
+    """K phi, (nv, B), for parameters in the builder's columns, (columns,).
+
+    Bodies' wrenches, summed over subtrees, work along screw axes: the rows of K are never formed.
+    """
+    tree, layout = builder.tree, builder.layout
+    by_body = phi.new_zeros(tree.bodies, layout.count)
+    for body, start in enumerate(layout.starts[:-1]):
+        end = layout.starts[body + 1]
+        by_body[body, start:end] = phi[start:end]
+    wrench = by_body @ terms.wrenches  # (6, L, B)
+    below = tree.ancestors.T @ wrench
+    torque = (terms.directions * below).sum(0)
+    coulomb, viscous = phi[layout.count :].unflatten(0, (-1, 2)).unbind(1)
+    velocity = terms.joints.velocity[1:]
+    torque[1:] += coulomb[:, None] * torch.sign(velocity) + viscous[:, None] * velocity
+    joints = tree.joint_map.T @ torque
+    return torch.cat([wrench.sum(1), joints]) if tree.base_rows else joints
+
+
+def contact_forces(builder: RowBuilder, samples: Samples, state: State, terms: ChunkTerms) -> Tensor:
+    """J_C^T lambda, (nv, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
+    tree = builder.tree
+    total = samples.time.new_zeros(tree.base_rows + tree.joint_map.shape[1], len(samples))
+    for contact, active in enumerate(state):
+        if not active:
+            continue
+        body, T_joint_frame = builder.frames[contact]
+        local = builder.local_wrench(samples, contact, terms)
+        possible = list(builder.contacts[contact].components)
+        wrench = torch.zeros_like(local)
+        wrench[:, possible] = local[:, possible]
+        R = terms.states.rotation[:, :, body]
+        turn = torch.stack([rotate(R, R.new_tensor(T_joint_frame[:3, k, None])) for k in range(3)], dim=1)
+        point = terms.states.position[:, body] + rotate(R, R.new_tensor(T_joint_frame[:3, 3, None]))
+        force, moment = rotate(turn, wrench.T[:3]), rotate(turn, wrench.T[3:])
+        at_base = torch.cat([force, moment + cross(point, force)])
+        if tree.base_rows:
+            total[:6] += at_base
+        path = tree.path(body)
+        torque = (terms.directions[:, path] * at_base[:, None]).sum(0)
+        ratios = tree.joint_map[path]  # (path, n)
+        for step, joint in torch.nonzero(ratios).tolist():
+            total[tree.base_rows + joint] += ratios[step, joint] * torque[step]
+    return total
+
+
+def forces(builder: RowBuilder, samples: Samples, state: State, phi: Tensor) -> Forces:
+    """Measured and predicted forces of samples that share a contact state; `phi` is (M, columns)."""
+    terms = builder.terms(samples)
+    base_rows = builder.tree.base_rows
+    given = samples.torque if samples.torque is not None else torch.full_like(samples.joint_position, torch.nan)
+    torque = torch.nn.functional.pad(given, (base_rows, 0))
+    measured = torque + contact_forces(builder, samples, state, terms).T
+    return Forces(measured, torque, torch.stack([predicted_forces(builder, terms, p).T for p in phi]))
+
+
+def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
+    """Measured (N, nv) and predicted (M, N, nv) forces of a whole log in its own order, parameters (M, 12 L)."""
+    columns = torch.from_numpy(phi @ builder.column_map().T).to(builder.device)
+    nv = builder.tree.base_rows + len(builder.joint_rows)
+    measured, predicted = np.empty((len(samples), nv)), np.empty((len(phi), len(samples), nv))
+    with torch.no_grad():
+        for state, index in by_state(samples):
+            found = forces(builder, samples[index].to(builder.device), state, columns)
+            where = index if isinstance(index, slice) else index.numpy()
+            measured[where] = found.measured.cpu().numpy()
+            predicted[:, where] = found.predicted.cpu().numpy()
+    return measured, predicted

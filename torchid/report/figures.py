@@ -1,0 +1,109 @@
+"""Figures of a run (the only module that imports matplotlib)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from torchid import parameters
+from torchid.parameters import Array
+from torchid.report.metrics import GROUPS, Metrics
+
+matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False,
+                            "axes.spines.right": False, "legend.frameon": False})  # fmt: skip
+
+_MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
+_BASE_ROWS = ("base force x", "base force y", "base force z", "base moment x", "base moment y", "base moment z")
+_GROUP_LABELS = {
+    "joint_torque": "joint torque",
+    "base_force": "base force",
+    "base_moment": "base moment",
+    "nullspace": "projected force",
+}
+
+
+@dataclass(frozen=True)
+class ForceSeries:
+    """Forces of one log for plotting: `measured` (N, nv), `nominal` and `identified` (N, nv), NaN where unknown."""
+
+    source: str
+    time: Array
+    measured: Array
+    nominal: Array
+    identified: Array
+
+
+def force_figure(series: ForceSeries, joint_names: Sequence[str], base_rows: int, most: int = 6) -> Figure:
+    """Measured and predicted forces over time: base force z, base moment x, then the joints with most torque."""
+    rows = _rows_to_show(series, base_rows, most)
+    figure = Figure(figsize=(9.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
+    axes = figure.subplots(max(len(rows), 1), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, row in zip(axes, rows, strict=False):
+        axis.plot(series.time, series.measured[:, row], color=_MEASURED, linewidth=1.6, label="measured")
+        axis.plot(series.time, series.nominal[:, row], color=_NOMINAL, linewidth=1.0, label="predicted, URDF")
+        axis.plot(series.time, series.identified[:, row], color=_IDENTIFIED, linewidth=1.0, label="predicted, identified")
+        force = row < base_rows and row < 3
+        name = _BASE_ROWS[row] if row < base_rows else joint_names[row - base_rows]
+        axis.set_title(name, loc="left", fontsize=9)
+        axis.set_ylabel("[N]" if force else "[N m]")
+    if rows:
+        axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+    axes[-1].set_xlabel("time [s]")
+    figure.suptitle(f"Generalized forces, {series.source}", x=0.01, ha="left")
+    return figure
+
+
+def _rows_to_show(series: ForceSeries, base_rows: int, most: int) -> list[int]:
+    known = np.isfinite(series.measured).any(axis=0)
+    base = [row for row in ((2, 3) if base_rows else ()) if known[row]]
+    size = np.nan_to_num(np.nanstd(np.where(known, series.measured, 0.0), axis=0))
+    joints = sorted((row for row in range(base_rows, len(known)) if known[row]), key=lambda row: -size[row])
+    return base + sorted(joints[: most - len(base)])
+
+
+def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
+    """Relative error by group of rows, URDF against identified, one panel per set of logs."""
+    figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
+    axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
+    for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
+        groups = [group for group in GROUPS if nominal.relative[group] is not None]
+        place = np.arange(len(groups))
+        for shift, metrics, color, label in ((-0.2, nominal, _NOMINAL, "URDF"), (0.2, identified, _IDENTIFIED, "identified")):
+            heights = [100.0 * (metrics.relative[group] or 0.0) for group in groups]
+            bars = axis.bar(place + shift, heights, 0.38, color=color, label=label)
+            axis.bar_label(bars, fmt="%.3g", fontsize=8)
+        axis.set_xticks(place, [_GROUP_LABELS[group].replace(" ", "\n") for group in groups])
+        axis.set_title(name, loc="left")
+    axes[0].set_ylabel("rms of error / rms of measured [%]")
+    axes[-1].legend(loc="upper right")
+    return figure
+
+
+def parameter_figure(body_names: Sequence[str], nominal: Array, identified: Array, standard_error: Array) -> Figure:
+    """Mass, distance of the centre of mass and trace of inertia of every body, with standard errors of the mass."""
+    place = np.arange(len(body_names))
+    figure = Figure(figsize=(9.0, 0.24 * len(body_names) + 1.4), layout="constrained")
+    axes = figure.subplots(1, 3, sharey=True)
+    mass = parameters.MASS
+    error = np.nan_to_num(standard_error[:, mass])
+    for axis, quantity, unit in zip(axes, _QUANTITIES, ("kg", "kg m", "kg m²"), strict=True):
+        before, after = (_QUANTITIES[quantity](phi) for phi in (nominal, identified))
+        axis.barh(place - 0.2, before, 0.38, color=_NOMINAL, label="URDF")
+        axis.barh(place + 0.2, after, 0.38, color=_IDENTIFIED, label="identified", xerr=error if unit == "kg" else None,
+                  error_kw={"elinewidth": 0.8})  # fmt: skip
+        axis.set_xlabel(f"{quantity} [{unit}]")
+    axes[0].set_yticks(place, body_names, fontsize=7)
+    axes[0].invert_yaxis()
+    axes[-1].legend(loc="lower right")
+    return figure
+
+
+_QUANTITIES = {
+    "mass": lambda phi: phi[:, parameters.MASS],
+    "first moment, length": lambda phi: np.linalg.norm(phi[:, parameters.FIRST_MOMENT], axis=1),
+    "inertia about origin, trace": lambda phi: np.trace(parameters.inertia_matrix(phi), axis1=1, axis2=2),
+}

@@ -1,0 +1,137 @@
+"""Errors of predicted forces, gathered over any number of samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from torchid.parameters import Array
+from torchid.problem.compress import by_state
+from torchid.problem.predict import forces
+from torchid.problem.rows import RowBuilder, State
+from torchid.problem.samples import Samples
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+from torchid.sensing.sensors import named_sensors
+
+GROUPS = ("joint_torque", "base_force", "base_moment", "nullspace")
+"""Groups of rows that errors are given for; units [N m], [N], [N m], [N m]."""
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
+
+    `rms` and `relative` by group; `by_joint_rms` and `by_joint_relative` by joint. Relative means rms of the error over
+    rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
+    the measured.
+    """
+
+    rms: dict[str, float | None]
+    relative: dict[str, float | None]
+    by_joint_rms: dict[str, float | None]
+    by_joint_relative: dict[str, float | None]
+
+    def as_dict(self) -> dict[str, object]:
+        """As `metrics.json` has it."""
+        out: dict[str, object] = {}
+        for suffix, groups, joints in (
+            ("rms", self.rms, self.by_joint_rms),
+            ("rms_relative", self.relative, self.by_joint_relative),
+        ):
+            for group in GROUPS:
+                out[f"{group}_{suffix}"] = groups[group]
+                if group == "joint_torque":
+                    out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
+        return out
+
+
+class _Squares:
+    """Sums of squares by row, over the samples where the row is known."""
+
+    def __init__(self, rows: int) -> None:
+        self.sum, self.count = np.zeros(rows), np.zeros(rows)
+
+    def add(self, x: torch.Tensor) -> None:
+        values = x.cpu().numpy()
+        known = np.isfinite(values)
+        self.sum += np.square(np.where(known, values, 0.0)).sum(0)
+        self.count += known.sum(0)
+
+    def rms(self, rows: slice = slice(None)) -> Array:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.sqrt(self.sum[rows] / self.count[rows])
+
+    def pooled(self, rows: slice) -> float:
+        count = self.count[rows].sum()
+        return float(np.sqrt(self.sum[rows].sum() / count)) if count else np.nan
+
+
+class Evaluation:
+    """Evaluates several parameter vectors at once, in one pass over the logs."""
+
+    def __init__(self, robot: Robot, contacts: Sequence[Contact], device: str = "cpu") -> None:
+        """Fix robot and contacts; sensors do not matter, whatever a log has is used."""
+        self.robot = robot
+        self.builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts))).to(device)
+
+    def metrics(
+        self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
+    ) -> list[Metrics]:
+        """One `Metrics` per row of `phi`, (M, 12 L), over all samples of the logs together."""
+        builder, robot = self.builder, self.robot
+        columns = torch.from_numpy(phi @ builder.column_map().T).to(builder.device)
+        measured, hidden = _Squares(robot.nv), _Squares(1)
+        errors = [(_Squares(robot.nv), _Squares(1)) for _ in phi]
+        with torch.no_grad():
+            for samples in logs:
+                for state, index in by_state(samples):
+                    piece = samples[index].to(builder.device)
+                    found = forces(builder, piece, state, columns)
+                    measured.add(found.measured)
+                    self._project(piece, state, found.torque, hidden)
+                    for (rows, projected), prediction in zip(errors, found.predicted, strict=True):
+                        rows.add(prediction - found.measured)
+                        self._project(piece, state, prediction - found.torque, projected)
+                    if progress is not None:
+                        progress(len(piece))
+        return [self._summary(rows, projected, measured, hidden) for rows, projected in errors]
+
+    def _project(self, samples: Samples, state: State, rows: torch.Tensor, squares: _Squares) -> None:
+        """Add V_x^T rows, V_x the contacts' null space; joints away from contacts pass unchanged."""
+        plan, base = self.builder.plan(state), self.robot.base_rows
+        mixed = [*range(base), *(base + joint for joint in plan.mixed_joints)]
+        lone = [base + joint for joint in plan.lone_joints]
+        for index, V in self.builder.bases(samples, state):
+            inside = (V.mT @ rows[index][:, mixed, None])[..., 0]
+            squares.add(torch.cat([inside, rows[index][:, lone]], dim=1).flatten()[:, None])
+
+    def _summary(self, errors: _Squares, projected: _Squares, measured: _Squares, hidden: _Squares) -> Metrics:
+        base = self.robot.base_rows
+        rms: dict[str, float] = {}
+        size: dict[str, float] = {}
+        for squares, inside, out in ((errors, projected, rms), (measured, hidden, size)):
+            joints = squares.rms(slice(base, None))
+            out["joint_torque"] = float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan
+            out["base_force"] = squares.pooled(slice(0, 3)) if base else np.nan
+            out["base_moment"] = squares.pooled(slice(3, 6)) if base else np.nan
+            out["nullspace"] = inside.pooled(slice(None))
+        by_joint, joint_size = errors.rms(slice(base, None)), measured.rms(slice(base, None))
+        names = self.robot.joint_names
+        return Metrics(
+            {group: _figure(rms[group]) for group in GROUPS},
+            {group: _ratio(rms[group], size[group]) for group in GROUPS},
+            {name: _figure(x) for name, x in zip(names, by_joint, strict=True)},
+            {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
+        )
+
+
+def _figure(x: float) -> float | None:
+    return float(x) if np.isfinite(x) else None
+
+
+def _ratio(x: float, y: float) -> float | None:
+    return float(x / y) if np.isfinite(x) and y > 0.0 else None

@@ -1,0 +1,61 @@
+"""`parameters.json`: nominal and identified parameters of every body."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchid.errors import InputError
+from torchid.estimators import Estimate
+from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
+from torchid.robot import Robot
+
+
+def parameters_document(robot: Robot, estimate: Estimate) -> dict[str, Any]:
+    """What `parameters.json` holds; a standard error that the data do not give is null."""
+
+    def named(values: Array) -> dict[str, Any]:
+        return {name: _plain(x) for name, x in zip(PARAMETERS, values, strict=True)}
+
+    columns = (estimate.phi, estimate.standard_error, estimate.identifiable)
+    per_body = [x.reshape(-1, PER_BODY) for x in columns]
+    return {
+        "units": dict(zip(PARAMETERS, UNITS, strict=True)),
+        "frame": "each body's link frame, inertia about its origin",
+        "massless": list(robot.massless),
+        "bodies": [
+            {
+                "name": name,
+                "nominal": named(robot.nominal[body]),
+                "identified": named(per_body[0][body]),
+                "standard_error": named(per_body[1][body]),
+                "identifiable": named(per_body[2][body]),
+            }
+            for body, name in enumerate(robot.body_names)
+        ],
+    }
+
+
+def read_parameters(path: Path, robot: Robot) -> Array:
+    """Identified parameters, (L, 12), of a `parameters.json` that belongs to the robot.
+
+    Raises:
+        InputError: the file cannot be read or holds other bodies.
+    """
+    try:
+        bodies = json.loads(path.read_text())["bodies"]
+        found = {body["name"]: [float(body["identified"][name]) for name in PARAMETERS] for body in bodies}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(path, "file", f"not readable as parameters ({error})", "a run's parameters.json") from error
+    if tuple(found) != robot.body_names:
+        raise InputError(path, "bodies", f"other bodies than those of {robot.path}", "parameters of the same robot")
+    return np.array([found[name] for name in robot.body_names])
+
+
+def _plain(x: Any) -> float | bool | None:
+    if isinstance(x, np.bool_):
+        return bool(x)
+    return float(x) if np.isfinite(x) else None

@@ -1,0 +1,53 @@
+"""Tables for the terminal, readable in 100 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rich.table import Table
+
+from torchid.report.metrics import GROUPS, Metrics
+
+_ROWS = {
+    "joint_torque": "joint torque [N m], mean over joints",
+    "base_force": "base force [N]",
+    "base_moment": "base moment [N m]",
+    "nullspace": "projected force [N m]",
+}
+
+
+def error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
+    """Errors of predicted forces, nominal against identified, for each named set of logs."""
+    table = Table(title="Error of predicted forces: rms and share of the measured rms", title_justify="left")
+    table.add_column("")
+    for name in columns:
+        table.add_column(f"{name}\nURDF", justify="right")
+        table.add_column(f"{name}\nidentified", justify="right")
+    for group in GROUPS:
+        cells = [_cell(m, group) for pair in columns.values() for m in pair]
+        table.add_row(_ROWS[group], *cells)
+    return table
+
+
+def _cell(metrics: Metrics, group: str) -> str:
+    rms, relative = metrics.rms[group], metrics.relative[group]
+    if rms is None:
+        return "not measured"
+    return f"{rms:.4g}" + ("" if relative is None else f"  {100 * relative:.3g} %")
+
+
+def state_table(states: Sequence[Mapping[str, object]]) -> Table:
+    """Contact states with sample counts, rows per sample, and what is left of the base."""
+    table = Table(title="Contact states", title_justify="left")
+    for heading in ("in contact", "samples", "rows per sample", "rank(S_b V_x)", "smallest singular value"):
+        table.add_column(heading, justify="left" if heading == "in contact" else "right")
+    for state in states:
+        rank, smallest = state["base_rank"], state["base_singular_value"]
+        table.add_row(
+            str(state["name"]),
+            str(state["samples"]),
+            str(state["rows"]),
+            "fixed base" if rank is None else f"{rank} of 6",
+            "" if smallest is None else f"{smallest:.2g}",
+        )
+    return table

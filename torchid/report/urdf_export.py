@@ -1,0 +1,67 @@
+"""`identified.urdf`: the robot's URDF with the identified inertia and friction, everything else as it was."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from lxml import etree
+
+from torchid import parameters
+from torchid.errors import TorchidWarning
+from torchid.parameters import Array
+from torchid.robot import Robot
+from torchid.robot.urdf import parse_xml
+
+
+def identified_urdf(robot: Robot, phi: Array) -> bytes:
+    """The URDF with parameters `phi`, (L, 12).
+
+    A body's whole inertia goes to the link that names it; links welded to it keep none. Relative mesh paths stay as
+    they were written.
+
+    Warns:
+        TorchidWarning: bodies that no distribution of positive mass can have, which simulators refuse.
+    """
+    tree = parse_xml(robot.path)
+    links = {link.get("name"): link for link in tree.getroot().findall("link")}
+    joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
+    impossible = []
+    for body, values in zip(robot.bodies, phi, strict=True):
+        for name in body.links:
+            for inertial in links[name].findall("inertial"):
+                links[name].remove(inertial)
+        if body.joint is not None:
+            _set_friction(joints[body.joint.name], values)
+        if not values[parameters.INERTIAL].any():
+            continue
+        if values[parameters.MASS] <= 0.0 or parameters.consistency_margin(values) < 0.0:
+            impossible.append(body.name)
+        if values[parameters.MASS] != 0.0:
+            links[body.name].insert(0, _inertial(values))
+    if impossible:
+        message = f"identified.urdf: no distribution of positive mass has the parameters of {', '.join(impossible)}"
+        warnings.warn(f"{message}; simulators will refuse or misread them", TorchidWarning, stacklevel=2)
+    etree.indent(tree)
+    return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+
+
+def _inertial(values: Array) -> etree._Element:
+    mass, com, inertia = parameters.mass_com_inertia(values)
+    element = etree.Element("inertial")
+    etree.SubElement(element, "origin", xyz=" ".join(repr(float(x)) for x in com), rpy="0 0 0")
+    etree.SubElement(element, "mass", value=repr(mass))
+    numbers = {"i" + "xyz"[row] + "xyz"[column]: repr(float(inertia[row, column])) for row, column in parameters.INERTIA_AXES}
+    etree.SubElement(element, "inertia", numbers)
+    return element
+
+
+def _set_friction(joint: etree._Element, values: Array) -> None:
+    coulomb, viscous = values[parameters.FRICTION]
+    dynamics = joint.find("dynamics")
+    if dynamics is None:
+        if not np.any(values[parameters.FRICTION]):
+            return
+        dynamics = etree.SubElement(joint, "dynamics")
+    dynamics.set("friction", repr(float(coulomb)))
+    dynamics.set("damping", repr(float(viscous)))

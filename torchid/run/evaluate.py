@@ -1,0 +1,60 @@
+"""`torchid evaluate`: the parameters of a finished run on logs it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from torchid.config import load_config
+from torchid.errors import ConfigError
+from torchid.report.figures import error_figure
+from torchid.report.metrics import Evaluation, Metrics
+from torchid.report.parameters_json import read_parameters
+from torchid.run.experiment import set_up
+from torchid.run.folder import new_folder
+from torchid.run.identify import forces_of, write_json
+from torchid.run.progress import progress_bars
+
+
+def evaluate(run: str | Path, logs: Sequence[str | Path]) -> tuple[dict[str, tuple[Metrics, Metrics]], Path]:
+    """Evaluate nominal and identified parameters; results go to `RUN/evaluation/<name of the first log>`.
+
+    Args:
+        run: folder that `identify` wrote.
+        logs: log files, preprocessed as the run's own were.
+
+    Returns:
+        Nominal and identified metrics by log name, and the folder they were written to.
+
+    Raises:
+        InputError: the folder is no run, or a log does not fit its robot.
+    """
+    folder = Path(run)
+    if not (folder / "config.yaml").is_file():
+        raise ConfigError(folder, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
+    config = load_config(folder / "config.yaml")
+    with progress_bars() as bars:
+        experiment = set_up(config, folder / "config.yaml")
+        robot = experiment.robot
+        phi = read_parameters(folder / "parameters.json", robot)
+        candidates = np.stack([robot.nominal.flatten(), phi.flatten()])
+        reading = bars.add_task("reading logs", total=len(logs))
+        samples = experiment.read([Path(log) for log in logs], False, lambda _: bars.advance(reading))
+        evaluation = Evaluation(robot, experiment.contacts, config.device)
+        evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
+        metrics = {}
+        for log in samples:
+            nominal, identified = evaluation.metrics([log], candidates, lambda n: bars.advance(evaluating, n))
+            metrics[Path(log.source).stem] = (nominal, identified)
+        output = folder / "evaluation" / Path(logs[0]).stem
+        document = {
+            name: {"identified": after.as_dict(), "nominal": before.as_dict()} for name, (before, after) in metrics.items()
+        }
+        with new_folder(output, overwrite=True) as new:
+            (new / "config.yaml").write_text((folder / "config.yaml").read_text())
+            write_json(new / "metrics.json", document)
+            forces_of(evaluation, samples[0], candidates, robot).savefig(new / "forces.png", dpi=130)
+            error_figure(metrics).savefig(new / "errors.png", dpi=130)
+    return metrics, output
