@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from torchid.errors import TorchidWarning
 from torchid.logs import Log
+from torchid.robot import Robot, load_robot
+
+Array = NDArray[np.float64]
 
 PINOCCHIO_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Ixx, Ixy, Iyy, Ixz, Iyz, Izz: written out here on purpose
 
@@ -26,131 +33,256 @@ def robots_folder() -> Path:
 
 ROBOTS = robots_folder()
 SOLO12 = ROBOTS / "solo_description/robots/solo12.urdf"
+SOLO8 = ROBOTS / "solo_description/robots/solo.urdf"
 G1 = ROBOTS / "g1_description/urdf/g1_29dof_rev_1_0.urdf"
 ANYMAL = ROBOTS / "anymal_c_simple_description/urdf/anymal.urdf"
 TALOS = ROBOTS / "talos_data/robots/talos_reduced.urdf"
+PANDA = ROBOTS / "panda_description/urdf/panda.urdf"
+BAXTER = ROBOTS / "baxter_description/urdf/baxter.urdf"
+TIAGO = ROBOTS / "tiago_description/robots/tiago_no_hand.urdf"
+UR5 = ROBOTS / "ur_description/urdf/ur5_robot.urdf"
+DRONE = ROBOTS / "hector_description/robots/quadrotor_base.urdf"
 
 
-@dataclass(frozen=True)
+def load(urdf: Path, base_link: str | None = None, fixed_base: bool = False) -> Robot:
+    """A robot whose known warnings (see test_robot_urdf.py) are not the matter of the test."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        return load_robot(urdf, base_link, fixed_base)
+
+
+def joint_map(urdf: Path, joint_names: Sequence[str]) -> dict[str, tuple[Array, float]]:
+    """Position of every moving joint as `row @ q + offset`, read from the XML; chains of mimic joints are followed."""
+    root = ElementTree.parse(urdf).getroot()
+    joints = {str(joint.get("name")): joint for joint in root.findall("joint") if joint.get("type") != "fixed"}
+
+    def follow(name: str) -> tuple[Array, float]:
+        mimic = joints[name].find("mimic")
+        if mimic is None:
+            return np.eye(len(joint_names))[list(joint_names).index(name)], 0.0
+        row, offset = follow(str(mimic.get("joint")))
+        ratio = float(mimic.get("multiplier", 1.0))
+        return ratio * row, ratio * offset + float(mimic.get("offset", 0.0))
+
+    return {name: follow(name) for name in joints}
+
+
 class Oracle:
-    """A Pinocchio model addressed by the names of independent joints, in the order a test chooses."""
+    """A Pinocchio model, with friction, addressed by the independent joints in the order a test chooses.
 
-    model: pin.Model
-    joint_names: tuple[str, ...]
+    Pinocchio knows every moving joint as independent; `expand` (its nv, our nv) ties the mimic joints to their masters,
+    and forces follow by virtual work. `friction` (moving joints, 2), zero at first, is in Pinocchio's joint order.
+    """
+
+    def __init__(self, urdf: Path, joint_names: Sequence[str], fixed_base: bool = False) -> None:
+        root = () if fixed_base else (pin.JointModelFreeFlyer(),)
+        self.model = pin.buildModelFromUrdf(str(urdf), *root)
+        self.data = self.model.createData()
+        self.base = 0 if fixed_base else 6
+        self.joint_names = tuple(joint_names)
+        self.moving = [str(name) for name in self.model.names][1 if fixed_base else 2 :]
+        by_name = joint_map(urdf, joint_names)
+        self.ratios = np.array([by_name[name][0] for name in self.moving]).reshape(len(self.moving), len(joint_names))
+        self.offsets = np.array([by_name[name][1] for name in self.moving])
+        self.friction = np.zeros((len(self.moving), 2))
+        self.expand = np.zeros((self.model.nv, self.base + len(self.joint_names)))
+        self.expand[: self.base, : self.base] = np.eye(self.base)
+        self.expand[[self._joint(name).idx_v for name in self.moving], self.base :] = self.ratios
 
     @classmethod
-    def load(cls, urdf: Path, joint_names: Sequence[str], fixed_base: bool = False) -> Oracle:
-        root = () if fixed_base else (pin.JointModelFreeFlyer(),)
-        return cls(pin.buildModelFromUrdf(str(urdf), *root, mimic=True), tuple(joint_names))
+    def of(cls, robot: Robot) -> Oracle:
+        """Of the URDF a robot was read from, with the robot's joint order."""
+        return cls(robot.path, robot.joint_names, robot.fixed_base)
 
-    @property
-    def base(self) -> int:
-        return 6 if self.model.njoints > 1 and self.model.joints[1].shortname() == "JointModelFreeFlyer" else 0
-
-    def _joint(self, name: str) -> pin.JointModel:
+    def _joint(self, name: str) -> Any:
         return self.model.joints[self.model.getJointId(name)]
 
-    def coordinates(self, q: np.ndarray) -> np.ndarray:
-        """Pinocchio's q from (7 + n) or (n) coordinates."""
+    def coordinates(self, q: Array) -> Array:
+        """Pinocchio's q from (7 + n) or (n) coordinates, one sample."""
         full = pin.neutral(self.model)
         extra = 7 if self.base else 0
         full[:extra] = q[:extra]
-        for name, value in zip(self.joint_names, q[extra:], strict=True):
+        for name, value in zip(self.moving, self.ratios @ q[extra:] + self.offsets, strict=True):
             joint = self._joint(name)
             full[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else (np.cos(value), np.sin(value))
         return full
 
-    @property
-    def order(self) -> np.ndarray:
-        """Places of our generalized velocities among Pinocchio's."""
-        return np.array([*range(self.base), *(self._joint(name).idx_v for name in self.joint_names)], dtype=int)
+    def _state(self, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
+        return self.coordinates(q), self.expand @ v, self.expand @ a
 
-    def velocities(self, v: np.ndarray) -> np.ndarray:
-        full = np.zeros(self.model.nv)
-        full[self.order] = v
-        return full
+    def frictionless_forces(self, q: Array, v: Array, a: Array) -> Array:
+        """Inverse dynamics, (B, nv), of states (B, ...)."""
+        rows = [pin.rnea(self.model, self.data, *self._state(*state)) for state in zip(q, v, a, strict=True)]
+        return np.array(rows) @ self.expand
 
-    def forces(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Inverse dynamics in our order, one sample."""
-        data = self.model.createData()
-        state = self.coordinates(q), self.velocities(v), self.velocities(a)
-        return pin.rnea(self.model, data, *state)[self.order]
+    def friction_torques(self, v: Array) -> Array:
+        """Torque that friction takes from the actuators, (B, n)."""
+        velocity = v[:, self.base :] @ self.ratios.T
+        return (self.friction[:, 0] * np.sign(velocity) + self.friction[:, 1] * velocity) @ self.ratios
 
-    def jacobian(self, q: np.ndarray, frame: str) -> np.ndarray:
-        """Frame Jacobian in the frame's own axes, in our order, one sample."""
-        data = self.model.createData()
+    def forces(self, q: Array, v: Array, a: Array) -> Array:
+        """Inverse dynamics with friction, (B, nv), of states (B, ...)."""
+        needed = self.frictionless_forces(q, v, a)
+        needed[:, self.base :] += self.friction_torques(v)
+        return needed
+
+    def regressor(self, robot: Robot, q: Array, v: Array, a: Array) -> Array:
+        """Columns (B, nv, L, 10) of the ten inertial numbers by the robot's bodies, in this project's order."""
+        out = np.zeros((len(q), self.expand.shape[1], len(robot.bodies), 10))
+        places = self._places(robot)
+        for sample, state in enumerate(zip(q, v, a, strict=True)):
+            columns = pin.computeJointTorqueRegressor(self.model, self.data, *self._state(*state))
+            by_body = (self.expand.T @ columns).reshape(self.expand.shape[1], -1, 10)
+            for body, place in places:
+                out[sample, :, body, PINOCCHIO_ORDER] = by_body[:, place - 1].T
+        return out
+
+    def _places(self, robot: Robot) -> list[tuple[int, int]]:
+        """Pairs of our body and Pinocchio's; the bolted base has none."""
+        return [
+            (index, 1 if body.joint is None else self.model.getJointId(body.joint.name))
+            for index, body in enumerate(robot.bodies)
+            if body.joint is not None or self.base
+        ]
+
+    def inertial_parameters(self, robot: Robot) -> Array:
+        """Ten inertial numbers of every body, (L, 10); of a bolted base, zero."""
+        phi = np.zeros((len(robot.bodies), 10))
+        for body, place in self._places(robot):
+            phi[body, PINOCCHIO_ORDER] = self.model.inertias[place].toDynamicParameters()
+        return phi
+
+    def jacobian(self, q: Array, frame: str) -> Array:
+        """Frame Jacobians in the frame's own axes, (B, 6, nv)."""
         index = self.model.getFrameId(frame, pin.FrameType.BODY)
-        return pin.computeFrameJacobian(self.model, data, self.coordinates(q), index, pin.LOCAL)[:, self.order]
+        state = [self.coordinates(sample) for sample in q]
+        rows = [pin.computeFrameJacobian(self.model, self.data, full, index, pin.LOCAL) for full in state]
+        return np.array(rows) @ self.expand
+
+    def pose(self, q: Array, frame: str) -> tuple[Array, Array]:
+        """World rotations (B, 3, 3) and positions (B, 3) of a frame."""
+        index = self.model.getFrameId(frame, pin.FrameType.BODY)
+        rotations, positions = [], []
+        for sample in q:
+            pin.framesForwardKinematics(self.model, self.data, self.coordinates(sample))
+            rotations.append(self.data.oMf[index].rotation.copy())
+            positions.append(self.data.oMf[index].translation.copy())
+        return np.array(rotations), np.array(positions)
+
+    def power(self, q: Array, v: Array, a: Array) -> Array:
+        """Rate of change of kinetic plus potential energy, (B,) [W], without looking at any force.
+
+        d/dt (v^T M v / 2) along a motion is v^T M a + v^T dM/dt v / 2; the last term and the potential's come from
+        differences of 1e-5 s in time, along the geodesic through q.
+        """
+        step, rates = 1e-5, []
+        for state in zip(q, v, a, strict=True):
+            full, velocity, acceleration = self._state(*state)
+            energies = []
+            for dt in (-2.0 * step, -step, step, 2.0 * step):
+                at = pin.integrate(self.model, full, dt * velocity + 0.5 * dt * dt * acceleration)
+                energies.append(pin.computeMechanicalEnergy(self.model, self.data, at, velocity + dt * acceleration))
+            rates.append((energies[0] - 8.0 * energies[1] + 8.0 * energies[2] - energies[3]) / (12.0 * step))
+        return np.array(rates)
 
     def perturb(self, rng: np.random.Generator, share: float) -> None:
-        """Multiply mass, centre of mass and inertia of every body by random factors; consistency is kept."""
+        """Change mass, centre of mass and inertia of every body by up to `share`, turn the inertia, add friction.
+
+        Positive masses and principal inertias that obey the triangle inequality stay so.
+        """
         for index in range(self.model.njoints):
             inertia = self.model.inertias[index]
             if inertia.mass > 0.0:
-                m, c, i = 1.0 + share * rng.uniform(-1.0, 1.0, 3)
-                self.model.inertias[index] = pin.Inertia(m * inertia.mass, c * inertia.lever, i * m * inertia.inertia)
+                m, i = 1.0 + share * rng.uniform(-1.0, 1.0, 2)
+                lever = inertia.lever * (1.0 + share * rng.uniform(-1.0, 1.0, 3))
+                turn = Rotation.from_rotvec(share * rng.uniform(-1.0, 1.0, 3)).as_matrix()
+                self.model.inertias[index] = pin.Inertia(
+                    m * inertia.mass, lever, i * m * turn @ inertia.inertia @ turn.T
+                )
+        self.friction = rng.uniform(0.2, 1.5, self.friction.shape)
 
 
-def random_states(rng: np.random.Generator, n: int, samples: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unrelated random states (q, v, a) of a floating base: turned any way round, moving and accelerating."""
+def random_states(
+    rng: np.random.Generator, n: int, samples: int, fixed_base: bool = False
+) -> tuple[Array, Array, Array]:
+    """Unrelated random states (q, v, a): the base turned any way round, everything moving and accelerating."""
+    joints = rng.uniform(-1.5, 1.5, (samples, n))
+    nv = n + (0 if fixed_base else 6)
+    v, a = rng.normal(size=(samples, nv)), 3.0 * rng.normal(size=(samples, nv))
+    if fixed_base:
+        return joints, v, a
     quat = Rotation.random(samples, random_state=rng).as_quat()
-    q = np.hstack([rng.normal(size=(samples, 3)), quat, rng.uniform(-1.5, 1.5, (samples, n))])
-    return q, rng.normal(size=(samples, n + 6)), 3.0 * rng.normal(size=(samples, n + 6))
+    return np.hstack([rng.normal(size=(samples, 3)), quat, joints]), v, a
+
+
+def _forces_of_contacts(
+    oracle: Oracle, q: Array, needed: Array, contacts: Sequence[tuple[str, int]], active: NDArray[np.bool_],
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Torques (B, n) and wrenches (B, C, 6) that close the dynamics, with random internal forces.
+
+    A bolted base carries what it must, so that its contacts push at random.
+    """
+    base = oracle.base
+    J = np.zeros((len(q), len(contacts), 6, needed.shape[1]))
+    for k, (frame, _) in enumerate(contacts):
+        J[:, k] = oracle.jacobian(q, frame)
+    torque = np.zeros((len(q), needed.shape[1] - base))
+    wrench = 100.0 * rng.normal(size=(len(q), len(contacts), 6))  # noise where a contact is inactive
+    for i in range(len(q)):
+        rows = [(k, component) for k, (_, size) in enumerate(contacts) if active[i, k] for component in range(size)]
+        J_C = np.array([J[i, k, component] for k, component in rows]).reshape(-1, needed.shape[1])
+        force = 20.0 * rng.normal(size=len(rows))
+        if base:
+            inverse = np.linalg.pinv(J_C[:, :6].T)
+            force += inverse @ (needed[i, :6] - J_C[:, :6].T @ force)
+        torque[i] = needed[i, base:] - J_C[:, base:].T @ force
+        for (k, component), value in zip(rows, force, strict=True):
+            wrench[i, k, component] = value
+    return torque, wrench
 
 
 def make_log(
     oracle: Oracle,
-    friction: np.ndarray,
     contacts: Sequence[tuple[str, int]],
     states: Sequence[Sequence[bool]],
     samples: int,
     rng: np.random.Generator,
     source: str = "synthetic.npz",
 ) -> Log:
-    """A log whose forces close the dynamics exactly.
+    """A log of unrelated random states whose forces close the dynamics exactly.
 
     Args:
         oracle: the true robot.
-        friction: (n, 2), true Coulomb and viscous friction.
         contacts: frames with the number of components, 3 or 6, they can exert.
         states: contact states to cycle through; each must be able to carry any base wrench.
         samples: number of samples.
         rng: draws states and internal forces.
         source: name of the log.
     """
-    n = len(oracle.joint_names)
-    q, v, a = random_states(rng, n, samples)
-    active = np.array([states[i % len(states)] for i in range(samples)], dtype=bool)
-    torque, wrench = np.zeros((samples, n)), rng.normal(size=(samples, len(contacts), 6)) * 100.0
-    for i in range(samples):
-        needed = oracle.forces(q[i], v[i], a[i])
-        needed[6:] += friction[:, 0] * np.sign(v[i, 6:]) + friction[:, 1] * v[i, 6:]
-        used = [k for k in range(len(contacts)) if active[i, k]]
-        J = np.vstack([oracle.jacobian(q[i], contacts[k][0])[: contacts[k][1]] for k in used])
-        force = np.linalg.lstsq(J[:, :6].T, needed[:6], rcond=None)[0]
-        null = np.linalg.svd(J[:, :6].T)[2][6:]
-        force += 20.0 * null.T @ rng.normal(size=len(null))
-        torque[i] = needed[6:] - J[:, 6:].T @ force
-        start = 0
-        for k in used:
-            size = contacts[k][1]
-            wrench[i, k, :size] = force[start : start + size]
-            start += size
-    rotation = Rotation.from_quat(q[:, 3:7])
-    acceleration = a[:, :3] + np.cross(v[:, 3:6], v[:, :3])
+    q, v, a = random_states(rng, len(oracle.joint_names), samples, fixed_base=not oracle.base)
+    active = np.array([states[i % len(states)] for i in range(samples)], dtype=bool).reshape(samples, len(contacts))
+    torque, wrench = _forces_of_contacts(oracle, q, oracle.forces(q, v, a), contacts, active, rng)
+    extra = 7 if oracle.base else 0
+    base: dict[str, Any] = {}
+    if oracle.base:
+        rotation = Rotation.from_quat(q[:, 3:7])
+        base = {
+            "base_quat_xyzw": q[:, 3:7],
+            "base_linear_acceleration_world": rotation.apply(a[:, :3] + np.cross(v[:, 3:6], v[:, :3])),
+            "base_angular_velocity_base": v[:, 3:6],
+            "base_angular_acceleration_base": a[:, 3:6],
+        }
     return Log(
         source=source,
         time=np.arange(samples) * 0.01,
         joint_names=oracle.joint_names,
-        joint_position=q[:, 7:],
-        joint_velocity=v[:, 6:],
-        joint_acceleration=a[:, 6:],
+        joint_position=q[:, extra:],
+        joint_velocity=v[:, oracle.base :],
+        joint_acceleration=a[:, oracle.base :],
         joint_torque=torque,
-        base_quat_xyzw=q[:, 3:7],
-        base_linear_acceleration_world=rotation.apply(acceleration),
-        base_angular_velocity_base=v[:, 3:6],
-        base_angular_acceleration_base=a[:, 3:6],
         contact_names=tuple(name for name, _ in contacts),
         contact_active=active,
         contact_wrench_local=wrench,
+        **base,
     )

@@ -48,7 +48,9 @@ def _parser() -> argparse.ArgumentParser:
     identify.set_defaults(command=_identify)
     evaluate = commands.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
     evaluate.add_argument("run", help="run folder")
-    evaluate.add_argument("--log", action="append", required=True, metavar="FILE", help="log to evaluate; may be repeated")
+    evaluate.add_argument(
+        "--log", action="append", required=True, metavar="FILE", help="log to evaluate; may be repeated"
+    )
     evaluate.set_defaults(command=_evaluate)
     for command in (identify, evaluate):
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
@@ -56,16 +58,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    from rich.console import Console
-
     from torchid.config import load_config
-    from torchid.report.tables import error_table, state_table
+    from torchid.report.tables import error_table, print_tables, state_table
     from torchid.run import identify
 
     run = identify(load_config(options.file, options.overrides), options.file)
-    console, estimate, robot = Console(), run.estimate, run.experiment.robot
-    console.print(state_table([asdict(state) for state in run.states]))
-    console.print(error_table(run.metrics))
+    estimate, robot = run.estimate, run.experiment.robot
+    print_tables(state_table([asdict(state) for state in run.states]), error_table(run.metrics))
     mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
@@ -79,15 +78,13 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    from rich.console import Console
-
-    from torchid.report.tables import error_table
+    from torchid.report.tables import error_table, print_tables
     from torchid.run import evaluate
 
     metrics, output = evaluate(options.run, options.log)
-    Console().print(error_table(metrics))
+    print_tables(error_table(metrics))
     print(f"written to    {output}")
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
+def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     print(f"torchid: {category.__name__}: {message}", file=sys.stderr)

@@ -65,7 +65,6 @@ class UnphysicalInertiaWarning(TorchidWarning):
     """A link's or body's inertia belongs to no distribution of positive mass."""
 
 
-
 class BaseLostWarning(TorchidWarning):
     """As BaseLostError, for those who asked to go on."""
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torchid.errors import InputError, LogError
+from torchid.errors import InputError
 from torchid.logs.checks import check_finite
 from torchid.logs.fields import NAN_ALLOWED, FloatArray, labels_of
 from torchid.logs.log import Log

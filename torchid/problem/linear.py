@@ -35,7 +35,9 @@ class LinearProblem:
         rows, columns = self.A.shape
         shapes = (self.b.shape, self.nominal.shape, self.scale.shape, self.free.shape)
         if shapes != ((rows,), (columns,), (columns,), (columns,)):
-            raise ValueError(f"b, nominal, scale, free: found shapes {shapes}; accepted: {rows} rows, {columns} columns")
+            raise ValueError(
+                f"b, nominal, scale, free: found shapes {shapes}; accepted: {rows} rows, {columns} columns"
+            )
 
     def cost(self, phi: Array) -> float:
         """Sum of squared whitened residuals over all rows at parameters `phi`, (P,)."""

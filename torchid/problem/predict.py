@@ -12,6 +12,7 @@ from torchid.parameters import Array
 from torchid.problem.compress import by_state
 from torchid.problem.rows import ChunkTerms, RowBuilder, State
 from torchid.problem.samples import Samples
+from torchid.problem.threads import one_thread
 from torchid.regressor.kinematics import cross, rotate
 
 
@@ -90,7 +91,7 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
     columns = torch.from_numpy(phi @ builder.column_map().T).to(builder.device)
     nv = builder.tree.base_rows + len(builder.joint_rows)
     measured, predicted = np.empty((len(samples), nv)), np.empty((len(phi), len(samples), nv))
-    with torch.no_grad():
+    with torch.no_grad(), one_thread():
         for state, index in by_state(samples):
             found = forces(builder, samples[index].to(builder.device), state, columns)
             where = index if isinstance(index, slice) else index.numpy()

@@ -16,6 +16,7 @@ from torchid.robot import Robot
 from torchid.sensing.contacts import COMPONENTS, Contact
 from torchid.sensing.sensors import SensorSet
 
+_JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
 _MOTION_FIELDS = (
     "base_quat_xyzw",
     "base_angular_velocity_base",
@@ -80,9 +81,19 @@ class Samples:
             return None if x is None else x.to(device)
 
         moved = {name: x.to(device) for name, x in self.base.items()}
-        joints = (x.to(device) for x in (self.joint_position, self.joint_velocity, self.joint_acceleration))
-        time, active = self.time.to(device), self.active.to(device)
-        return Samples(self.source, time, *joints, moved, move(self.torque), move(self.wrench), self.wrench_in_world, active)
+        position, velocity = self.joint_position.to(device), self.joint_velocity.to(device)
+        return Samples(
+            self.source,
+            self.time.to(device),
+            position,
+            velocity,
+            self.joint_acceleration.to(device),
+            moved,
+            move(self.torque),
+            move(self.wrench),
+            self.wrench_in_world,
+            self.active.to(device),
+        )
 
     @property
     def rotation_world_base(self) -> Tensor | None:
@@ -118,9 +129,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
         LogError: a joint, contact, motion or force that is missing.
     """
     order = _joint_order(log, robot)
-    for name in ("joint_velocity", "joint_acceleration"):
-        if getattr(log, name) is None:
-            raise LogError(log.source, name, "missing", "the field, or a log passed through preprocess()")
+    position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
     base = {name: torch.from_numpy(x) for name in _MOTION_FIELDS if (x := getattr(log, name)) is not None}
     if not robot.fixed_base and len(base) < len(_MOTION_FIELDS):
         missing = next(name for name in _MOTION_FIELDS if name not in base)
@@ -133,11 +142,9 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
     samples = Samples(
         log.source,
         torch.from_numpy(log.time),
-        *(
-            torch.from_numpy(_columns(x, order))
-            for x in (log.joint_position, log.joint_velocity, log.joint_acceleration)
-            if x is not None
-        ),
+        position,
+        velocity,
+        acceleration,
         base,
         None if log.joint_torque is None else torch.from_numpy(_columns(log.joint_torque, order)),
         None if wrench is None else torch.from_numpy(_columns(wrench, chosen)),
@@ -147,6 +154,13 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
     if required is not None:
         _check_forces(samples, robot, contacts, required)
     return samples
+
+
+def _joints(log: Log, name: str, order: list[int]) -> Tensor:
+    values = getattr(log, name)
+    if values is None:
+        raise LogError(log.source, name, "missing", "the field, or a log passed through preprocess()")
+    return torch.from_numpy(_columns(values, order))
 
 
 def _columns(x: np.ndarray, order: list[int]) -> np.ndarray:
@@ -160,7 +174,9 @@ def _joint_order(log: Log, robot: Robot) -> list[int]:
             raise UnknownNameError(log.source, "joint_names", name, robot.joint_names)
     for name in robot.joint_names:
         if name not in log.joint_names:
-            raise LogError(log.source, "joint_names", f"joint '{name}' of {robot.path.name} missing", "every moving joint")
+            raise LogError(
+                log.source, "joint_names", f"joint '{name}' of {robot.path.name} missing", "every moving joint"
+            )
     return [log.joint_names.index(name) for name in robot.joint_names]
 
 
@@ -190,7 +206,9 @@ def _check_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], r
         if bad.any():
             sample, joint = torch.nonzero(bad)[0].tolist()
             found = f"not a finite number at sample {sample} ({int(bad[:, joint].sum())} in all)"
-            raise LogError(samples.source, f"joint_torque '{robot.joint_names[joint]}'", found, "a value: it is a sensor")
+            raise LogError(
+                samples.source, f"joint_torque '{robot.joint_names[joint]}'", found, "a value: it is a sensor"
+            )
     needed = read_components(contacts, required, samples.wrench_in_world)
     if needed.any() and samples.active.any():
         if samples.wrench is None:
@@ -199,7 +217,9 @@ def _check_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], r
         if bad.any():
             sample, contact, k = torch.nonzero(bad)[0].tolist()
             found = f"{COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
-            raise LogError(samples.source, f"contact_wrench '{contacts[contact].frame}'", found, "a value: it is a sensor")
+            raise LogError(
+                samples.source, f"contact_wrench '{contacts[contact].frame}'", found, "a value: it is a sensor"
+            )
 
 
 def read_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:

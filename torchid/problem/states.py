@@ -12,6 +12,7 @@ from torchid.errors import BaseLostError, BaseLostWarning
 from torchid.problem.compress import by_state
 from torchid.problem.rows import RowBuilder, State
 from torchid.problem.samples import Samples
+from torchid.problem.threads import one_thread
 from torchid.sensing.projection import BASE_RANK_TOLERANCE, base_singular_values
 
 _CHECKED = 64  # samples per chunk and state: rank is a generic property, a few postures settle it
@@ -21,8 +22,8 @@ _CHECKED = 64  # samples per chunk and state: rank is a generic property, a few 
 class StateReport:
     """A contact state in the logs.
 
-    `name`: frames in contact, joined by "+". `rows`: equations per sample. `base_rank`: rank(S_b V_x), the best over the
-    samples checked, None for a fixed base. `base_singular_value`: median of its smallest singular value; near 0, base
+    `name`: frames in contact, joined by "+". `rows`: equations per sample. `base_rank`: rank(S_b V_x), the best over
+    the samples checked, None for a fixed base. `base_singular_value`: median of its smallest singular value; near 0, base
     accelerations are all but lost.
     """
 
@@ -33,6 +34,8 @@ class StateReport:
     base_singular_value: float | None
 
 
+@one_thread()
+@torch.no_grad()
 def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateReport]:
     """One report per contact state, most frequent first."""
     counts: dict[State, int] = {}

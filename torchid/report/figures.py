@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -13,8 +14,15 @@ from torchid import parameters
 from torchid.parameters import Array
 from torchid.report.metrics import GROUPS, Metrics
 
-matplotlib.rcParams.update({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.spines.top": False,
-                            "axes.spines.right": False, "legend.frameon": False})  # fmt: skip
+_STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.alpha": 0.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+}
 
 _MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
 _BASE_ROWS = ("base force x", "base force y", "base force z", "base moment x", "base moment y", "base moment z")
@@ -37,15 +45,18 @@ class ForceSeries:
     identified: Array
 
 
+@matplotlib.rc_context(_STYLE)
 def force_figure(series: ForceSeries, joint_names: Sequence[str], base_rows: int, most: int = 6) -> Figure:
-    """Measured and predicted forces over time: base force z, base moment x, then the joints with most torque."""
+    """Measured and predicted forces over time: the largest base force and moment, then the joints with most torque."""
     rows = _rows_to_show(series, base_rows, most)
     figure = Figure(figsize=(9.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 1, sharex=True, squeeze=False)[:, 0]
     for axis, row in zip(axes, rows, strict=False):
         axis.plot(series.time, series.measured[:, row], color=_MEASURED, linewidth=1.6, label="measured")
         axis.plot(series.time, series.nominal[:, row], color=_NOMINAL, linewidth=1.0, label="predicted, URDF")
-        axis.plot(series.time, series.identified[:, row], color=_IDENTIFIED, linewidth=1.0, label="predicted, identified")
+        axis.plot(
+            series.time, series.identified[:, row], color=_IDENTIFIED, linewidth=1.0, label="predicted, identified"
+        )
         force = row < base_rows and row < 3
         name = _BASE_ROWS[row] if row < base_rows else joint_names[row - base_rows]
         axis.set_title(name, loc="left", fontsize=9)
@@ -58,13 +69,15 @@ def force_figure(series: ForceSeries, joint_names: Sequence[str], base_rows: int
 
 
 def _rows_to_show(series: ForceSeries, base_rows: int, most: int) -> list[int]:
-    known = np.isfinite(series.measured).any(axis=0)
-    base = [row for row in ((2, 3) if base_rows else ()) if known[row]]
-    size = np.nan_to_num(np.nanstd(np.where(known, series.measured, 0.0), axis=0))
-    joints = sorted((row for row in range(base_rows, len(known)) if known[row]), key=lambda row: -size[row])
+    size = np.sqrt(np.nanmean(np.square(np.nan_to_num(series.measured)), axis=0))
+    size[~np.isfinite(series.measured).any(axis=0)] = -1.0
+    base = [max(rows, key=lambda row: size[row]) for rows in (range(3), range(3, 6))] if base_rows else []
+    base = [row for row in base if size[row] >= 0.0]
+    joints = sorted((row for row in range(base_rows, len(size)) if size[row] >= 0.0), key=lambda row: -size[row])
     return base + sorted(joints[: most - len(base)])
 
 
+@matplotlib.rc_context(_STYLE)
 def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
     """Relative error by group of rows, URDF against identified, one panel per set of logs."""
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
@@ -72,33 +85,40 @@ def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in GROUPS if nominal.relative[group] is not None]
         place = np.arange(len(groups))
-        for shift, metrics, color, label in ((-0.2, nominal, _NOMINAL, "URDF"), (0.2, identified, _IDENTIFIED, "identified")):
+        for shift, metrics, color, label in (
+            (-0.2, nominal, _NOMINAL, "URDF"),
+            (0.2, identified, _IDENTIFIED, "identified"),
+        ):
             heights = [100.0 * (metrics.relative[group] or 0.0) for group in groups]
             bars = axis.bar(place + shift, heights, 0.38, color=color, label=label)
             axis.bar_label(bars, fmt="%.3g", fontsize=8)
         axis.set_xticks(place, [_GROUP_LABELS[group].replace(" ", "\n") for group in groups])
         axis.set_title(name, loc="left")
     axes[0].set_ylabel("rms of error / rms of measured [%]")
-    axes[-1].legend(loc="upper right")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     return figure
 
 
+@matplotlib.rc_context(_STYLE)
 def parameter_figure(body_names: Sequence[str], nominal: Array, identified: Array, standard_error: Array) -> Figure:
-    """Mass, distance of the centre of mass and trace of inertia of every body, with standard errors of the mass."""
-    place = np.arange(len(body_names))
-    figure = Figure(figsize=(9.0, 0.24 * len(body_names) + 1.4), layout="constrained")
+    """Mass, first moment and inertia of every body with mass; bars on the masses the data determine: standard error."""
+    shown = np.flatnonzero(nominal[:, parameters.INERTIAL].any(axis=1))
+    nominal, identified, standard_error = nominal[shown], identified[shown], standard_error[shown]
+    place = np.arange(len(shown))
+    figure = Figure(figsize=(9.0, 0.24 * len(shown) + 1.4), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     mass = parameters.MASS
     error = np.nan_to_num(standard_error[:, mass])
     for axis, quantity, unit in zip(axes, _QUANTITIES, ("kg", "kg m", "kg m²"), strict=True):
         before, after = (_QUANTITIES[quantity](phi) for phi in (nominal, identified))
         axis.barh(place - 0.2, before, 0.38, color=_NOMINAL, label="URDF")
-        axis.barh(place + 0.2, after, 0.38, color=_IDENTIFIED, label="identified", xerr=error if unit == "kg" else None,
-                  error_kw={"elinewidth": 0.8})  # fmt: skip
+        axis.barh(place + 0.2, after, 0.38, color=_IDENTIFIED, label="identified")
+        if unit == "kg":
+            axis.errorbar(after, place + 0.2, xerr=error, fmt="none", ecolor="black", elinewidth=0.8)
         axis.set_xlabel(f"{quantity} [{unit}]")
-    axes[0].set_yticks(place, body_names, fontsize=7)
-    axes[0].invert_yaxis()
-    axes[-1].legend(loc="lower right")
+    axes[0].set_yticks(place, [body_names[int(body)] for body in shown], fontsize=7)
+    axes[0].set_ylim(len(shown) - 0.4, -0.6)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     return figure
 
 

@@ -13,6 +13,7 @@ from torchid.problem.compress import by_state
 from torchid.problem.predict import forces
 from torchid.problem.rows import RowBuilder, State
 from torchid.problem.samples import Samples
+from torchid.problem.threads import one_thread
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import named_sensors
@@ -86,7 +87,7 @@ class Evaluation:
         columns = torch.from_numpy(phi @ builder.column_map().T).to(builder.device)
         measured, hidden = _Squares(robot.nv), _Squares(1)
         errors = [(_Squares(robot.nv), _Squares(1)) for _ in phi]
-        with torch.no_grad():
+        with torch.no_grad(), one_thread():
             for samples in logs:
                 for state, index in by_state(samples):
                     piece = samples[index].to(builder.device)

@@ -4,25 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from rich.console import Console
 from rich.table import Table
 
 from torchid.report.metrics import GROUPS, Metrics
 
 _ROWS = {
-    "joint_torque": "joint torque [N m], mean over joints",
+    "joint_torque": "joint torque [N m]",
     "base_force": "base force [N]",
     "base_moment": "base moment [N m]",
     "nullspace": "projected force [N m]",
 }
 
 
+def print_tables(*tables: Table) -> None:
+    """Print to standard output, at most 100 columns wide; a file or pipe gets the full 100."""
+    console = Console()
+    console.width = min(console.width, 100) if console.is_terminal else 100
+    for table in tables:
+        console.print(table)
+
+
 def error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
     """Errors of predicted forces, nominal against identified, for each named set of logs."""
-    table = Table(title="Error of predicted forces: rms and share of the measured rms", title_justify="left")
-    table.add_column("")
+    table = Table(
+        title="Error of predicted forces: rms, and share of the rms of the measured; -: not measured",
+        title_justify="left",
+    )
+    table.add_column("", no_wrap=True)
     for name in columns:
-        table.add_column(f"{name}\nURDF", justify="right")
-        table.add_column(f"{name}\nidentified", justify="right")
+        table.add_column(f"{name}\nURDF", justify="right", no_wrap=True)
+        table.add_column(f"{name}\nidentified", justify="right", no_wrap=True)
     for group in GROUPS:
         cells = [_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(_ROWS[group], *cells)
@@ -32,14 +44,14 @@ def error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
 def _cell(metrics: Metrics, group: str) -> str:
     rms, relative = metrics.rms[group], metrics.relative[group]
     if rms is None:
-        return "not measured"
-    return f"{rms:.4g}" + ("" if relative is None else f"  {100 * relative:.3g} %")
+        return "-"
+    return f"{rms:.4g}" + ("" if relative is None else f" ({100 * relative:.3g} %)")
 
 
 def state_table(states: Sequence[Mapping[str, object]]) -> Table:
     """Contact states with sample counts, rows per sample, and what is left of the base."""
     table = Table(title="Contact states", title_justify="left")
-    for heading in ("in contact", "samples", "rows per sample", "rank(S_b V_x)", "smallest singular value"):
+    for heading in ("in contact", "samples", "rows each", "rank(S_b V_x)", "smallest s.v."):
         table.add_column(heading, justify="left" if heading == "in contact" else "right")
     for state in states:
         rank, smallest = state["base_rank"], state["base_singular_value"]

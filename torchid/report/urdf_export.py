@@ -51,7 +51,9 @@ def _inertial(values: Array) -> etree._Element:
     element = etree.Element("inertial")
     etree.SubElement(element, "origin", xyz=" ".join(repr(float(x)) for x in com), rpy="0 0 0")
     etree.SubElement(element, "mass", value=repr(mass))
-    numbers = {"i" + "xyz"[row] + "xyz"[column]: repr(float(inertia[row, column])) for row, column in parameters.INERTIA_AXES}
+    numbers = {
+        "i" + "xyz"[row] + "xyz"[column]: repr(float(inertia[row, column])) for row, column in parameters.INERTIA_AXES
+    }
     etree.SubElement(element, "inertia", numbers)
     return element
 

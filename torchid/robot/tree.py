@@ -111,7 +111,9 @@ def _find_root(path: Path, links: list[Link], joints: list[Joint]) -> str:
             reached.add(child)
             queue.append(child)
     if len(roots) > 1:
-        raise UrdfError(path, "tree", f"several root links: {', '.join(roots[:4])}", "one link that is no joint's child")
+        raise UrdfError(
+            path, "tree", f"several root links: {', '.join(roots[:4])}", "one link that is no joint's child"
+        )
     if len(reached) < len(links):
         lost = next(link.name for link in links if link.name not in reached)
         raise UrdfError(path, f"link '{lost}'", "part of a loop of joints", "a tree without loops")
@@ -131,10 +133,12 @@ def _resolve_mimics(path: Path, joints: list[Joint]) -> dict[str, Mimic]:
             multiplier *= master.mimic.multiplier
             master = by_name[master.mimic.joint]
             if master.name in seen:
-                raise UrdfError(path, f"joint '{joint.name}', <mimic>", "a chain that closes on itself", "a free master")
+                raise UrdfError(
+                    path, f"joint '{joint.name}', <mimic>", "a chain that closes on itself", "a free master"
+                )
             seen.add(master.name)
         if master.type not in MOVING_TYPES:
-            message = f"{path}: joint '{joint.name}': its mimic master '{master.name}' is fixed, so it is held still too"
+            message = f"{path}: joint '{joint.name}': its mimic master '{master.name}' is fixed, so it is held too"
             warnings.warn(message, TorchidWarning, stacklevel=4)
         resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
     return resolved
@@ -154,6 +158,10 @@ def _origin(joint: Joint) -> Array:
     return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
 
 
+def _inverse(T: Array) -> Array:
+    return np.asarray(np.linalg.inv(T), dtype=np.float64)
+
+
 def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None) -> BodyJoint:
     """The joint as seen from the base: turned around, its frame sits at the child link and its axis flips."""
     body, T_body_near = tree.links[joint.child if reverse else joint.parent]
@@ -164,7 +172,7 @@ def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None
         parent=body,
         axis=-axis if reverse else axis,
         T_parent_joint=T_body_near if reverse else T_body_near @ _origin(joint),
-        T_joint_link=np.linalg.inv(_origin(joint)) if reverse else np.eye(4),
+        T_joint_link=_inverse(_origin(joint)) if reverse else np.eye(4),
         mimic=mimic,
         damping=(joint.dynamics.damping or 0.0) if joint.dynamics else 0.0,
         friction=(joint.dynamics.friction or 0.0) if joint.dynamics else 0.0,
@@ -176,7 +184,7 @@ def _locked_pose(joint: Joint, reverse: bool, mimics: dict[str, Mimic]) -> Array
     T_parent_child = _origin(joint)
     if joint.name in mimics:
         T_parent_child = T_parent_child @ _motion(joint, mimics[joint.name].offset)
-    return np.linalg.inv(T_parent_child) if reverse else T_parent_child
+    return _inverse(T_parent_child) if reverse else T_parent_child
 
 
 def _motion(joint: Joint, position: float) -> Array:

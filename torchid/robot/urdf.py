@@ -33,7 +33,7 @@ def parse_xml(path: Path) -> etree._ElementTree:
         raise UrdfError(path, "XML", f"not well-formed: {error.msg}", "a well-formed URDF") from error
     root = tree.getroot()
     if root.tag != "robot":
-        raise UrdfError(path, "XML root", f"<{root.tag}>", "<robot>")
+        raise UrdfError(path, "XML root", f"<{root.tag!s}>", "<robot>")
     return tree
 
 
@@ -50,13 +50,16 @@ def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
     root = parse_xml(path).getroot()
     stripped = etree.Element("robot", name=root.get("name", path.stem))
     for element in root:
-        kept = _KEPT.get(element.tag)
+        kept = _KEPT.get(str(element.tag))
         if kept is not None:
-            copy = etree.SubElement(stripped, element.tag, dict(element.attrib))
+            copy = etree.SubElement(stripped, str(element.tag), dict(element.attrib))
             copy.extend([child for child in element if child.tag in kept])
     _check_names(path, stripped)
-    for element in stripped:
-        (_check_joint if element.tag == "joint" else _check_link)(path, element)
+    links, joints = ([element.get("name", "") for element in stripped.findall(tag)] for tag in ("link", "joint"))
+    for element in stripped.findall("joint"):
+        _check_joint(path, element, links, joints)
+    for element in stripped.findall("link"):
+        _check_link(path, element)
     try:
         model = yourdfpy.URDF.load(
             io.BytesIO(etree.tostring(stripped)), build_scene_graph=False, load_meshes=False
@@ -80,12 +83,11 @@ def _check_names(path: Path, root: etree._Element) -> None:
         raise UrdfError(path, "link", "none found", "at least one <link>")
 
 
-def _check_joint(path: Path, joint: etree._Element) -> None:
+def _check_joint(path: Path, joint: etree._Element, links: list[str], joints: list[str]) -> None:
     field, kind = f"joint '{joint.get('name')}'", joint.get("type")
     if kind not in JOINT_TYPES:
         found = "no type" if kind is None else f"type '{kind}'"
         raise UrdfError(path, field, found, ", ".join(JOINT_TYPES))
-    links = [link.get("name") for link in joint.getparent().findall("link")]
     for end in ("parent", "child"):
         element = joint.find(end)
         name = None if element is None else element.get("link")
@@ -94,10 +96,8 @@ def _check_joint(path: Path, joint: etree._Element) -> None:
         if name not in links:
             raise UnknownNameError(path, f"{field}, <{end}>", name, links)
     mimic = joint.find("mimic")
-    if mimic is not None:
-        joints = [other.get("name") for other in joint.getparent().findall("joint")]
-        if mimic.get("joint") not in joints:
-            raise UnknownNameError(path, f"{field}, <mimic>", str(mimic.get("joint")), joints)
+    if mimic is not None and mimic.get("joint") not in joints:
+        raise UnknownNameError(path, f"{field}, <mimic>", str(mimic.get("joint")), joints)
 
 
 def _check_link(path: Path, link: etree._Element) -> None:

@@ -50,7 +50,8 @@ def evaluate(run: str | Path, logs: Sequence[str | Path]) -> tuple[dict[str, tup
             metrics[Path(log.source).stem] = (nominal, identified)
         output = folder / "evaluation" / Path(logs[0]).stem
         document = {
-            name: {"identified": after.as_dict(), "nominal": before.as_dict()} for name, (before, after) in metrics.items()
+            name: {"identified": after.as_dict(), "nominal": before.as_dict()}
+            for name, (before, after) in metrics.items()
         }
         with new_folder(output, overwrite=True) as new:
             (new / "config.yaml").write_text((folder / "config.yaml").read_text())

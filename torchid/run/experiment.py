@@ -54,7 +54,9 @@ def set_up(config: ExperimentConfig, source: object = "experiment") -> Experimen
     try:
         torch.empty(0, device=config.device)
     except (RuntimeError, AssertionError) as error:
-        raise ConfigError(source, "device", f"'{config.device}' is not available here", "cpu, cuda, cuda:0, ...") from error
+        raise ConfigError(
+            source, "device", f"'{config.device}' is not available here", "cpu, cuda, cuda:0, ..."
+        ) from error
     robot = load_robot(config.robot.urdf, config.robot.base_link, config.robot.fixed_base)
     contacts = check_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
     chosen, levels = config.sensors, config.sensors.noise

@@ -96,11 +96,11 @@ class Projection(nn.Module):
             torque_std, wrench_std, base_std = (torch.as_tensor(x, dtype=torch.float64) for x in noises)
             rows = torch.cat([base_std.expand(base_rows), torque_std.expand(len(torque))])
             self.register_buffer("row_variance", rows**2, persistent=False)
-            self.register_buffer("wrench_variance", wrench_std.expand(len(self.get_buffer("wrench_measured"))) ** 2, False)
+            self.register_buffer(
+                "wrench_variance", wrench_std.expand(len(self.get_buffer("wrench_measured"))) ** 2, False
+            )
 
-    def forward(
-        self, J_C: Tensor, active: Tensor, K: Tensor, torque: Tensor, wrench: Tensor
-    ) -> list[ProjectedGroup]:
+    def forward(self, J_C: Tensor, active: Tensor, K: Tensor, torque: Tensor, wrench: Tensor) -> list[ProjectedGroup]:
         """Project a batch.
 
         Args:
