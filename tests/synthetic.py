@@ -173,9 +173,9 @@ class Oracle:
         """Rate of change of kinetic plus potential energy, (B,) [W], without looking at any force.
 
         d/dt (v^T M v / 2) along a motion is v^T M a + v^T dM/dt v / 2; the last term and the potential's come from
-        differences of 1e-5 s in time, along the geodesic through q.
+        differences over 1e-4 s.
         """
-        step, rates = 1e-5, []
+        step, rates = 1e-4, []
         for state in zip(q, v, a, strict=True):
             full, velocity, acceleration = self._state(*state)
             energies = []

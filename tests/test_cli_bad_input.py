@@ -1,0 +1,244 @@
+"""A user's mistake: exit status 2, one line on standard error, nothing written."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import torchid
+from torchid.cli import main
+
+DEMO = Path(torchid.__file__).parent / "demo"
+Edit = Callable[[Path], None]
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Path:
+    """A copy of the demo, shortened, that would run."""
+    folder = tmp_path / "experiment"
+    shutil.copytree(DEMO, folder)
+    for name in ("sway_train", "sway_test"):
+        with np.load(folder / f"{name}.npz") as log:
+            short = {key: x if key in ("joint_names", "contact_names") else x[:300] for key, x in log.items()}
+        np.savez(folder / f"{name}.npz", **short)
+    return folder
+
+
+def edit_log(**changes: object) -> Edit:
+    """Replace fields of the training log; None drops a field, a function maps the old value."""
+
+    def apply(folder: Path) -> None:
+        path = folder / "sway_train.npz"
+        with np.load(path) as log:
+            fields = dict(log)
+        for name, change in changes.items():
+            if change is None:
+                del fields[name]
+            else:
+                fields[name] = change(fields[name]) if callable(change) else change
+        np.savez(path, **fields)
+
+    return apply
+
+
+def edit_urdf(old: str, new: str) -> Edit:
+    def apply(folder: Path) -> None:
+        path = folder / "quadruped.urdf"
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
+
+    return apply
+
+
+def edit_config(**changes: object) -> Edit:
+    def apply(folder: Path) -> None:
+        path = folder / "quadruped.yaml"
+        settings = yaml.safe_load(path.read_text())
+        for name, value in changes.items():
+            settings[name] = value
+        path.write_text(yaml.safe_dump(settings))
+
+    return apply
+
+
+def write(name: str, content: bytes) -> Edit:
+    return lambda folder: (folder / name).write_bytes(content) and None
+
+
+def with_nan(sample: int) -> Callable[[np.ndarray], np.ndarray]:
+    def change(x: np.ndarray) -> np.ndarray:
+        x = x.copy()
+        x[sample, 3] = np.nan
+        return x
+
+    return change
+
+
+def swapped_time(x: np.ndarray) -> np.ndarray:
+    x = x.copy()
+    x[[10, 11]] = x[[11, 10]]
+    return x
+
+
+def renamed(old: str, new: str) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda names: np.array([new if name == old else name for name in names])
+
+
+LOOP = """<link name="extra"/><joint name="a" type="fixed"><parent link="trunk"/><child link="extra"/></joint>
+<joint name="b" type="fixed"><parent link="front_left_foot"/><child link="extra"/></joint></robot>"""
+CONTACTS = [{"frame": f"{leg}_foot", "type": "point"} for leg in ("front_left", "front_right", "rear_left", "rear_right")]
+
+LOGS: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "unknown joint": (edit_log(joint_names=renamed("rear_left_knee", "rear_left_kne")), ("rear_left_kne", "rear_left_knee")),
+    "joint missing": (
+        edit_log(joint_names=lambda x: x[:11], joint_position=lambda x: x[:, :11], joint_torque=lambda x: x[:, :11]),
+        ("rear_right_knee", "missing"),
+    ),
+    "wrong shape": (edit_log(joint_position=lambda x: x[:, :5]), ("joint_position", "(300, 5)")),
+    "NaN in a position": (edit_log(joint_position=with_nan(7)), ("joint_position", "7")),
+    "NaN in a measured torque": (edit_log(joint_torque=with_nan(7)), ("joint_torque",)),
+    "torque missing": (edit_log(joint_torque=None), ("joint_torque", "missing")),
+    "time runs backward": (edit_log(time=swapped_time), ("time", "11")),
+    "quaternion not normalised": (edit_log(base_quat_wxyz=lambda x: 2.0 * x), ("base_quat_wxyz", "2")),
+    "orientation missing": (edit_log(base_quat_wxyz=None), ("base_quat", "missing")),
+    "base position missing": (edit_log(base_position_world=None), ("base_linear_acceleration", "base_position_world")),
+    "contact not in the URDF": (
+        edit_log(contact_names=renamed("rear_left_foot", "rear_left_paw")),
+        ("rear_left_paw", "rear_left_foot"),
+    ),
+    "contact activity missing": (edit_log(contact_active=None), ("contact_active", "missing")),
+    "pickled content": (
+        edit_log(joint_names=np.array([f"{leg}_hip" for leg in "abcdefghijkl"], dtype=object)),
+        ("joint_names", "pickle"),
+    ),
+    "unknown field": (edit_log(joint_positon=np.zeros((300, 12))), ("joint_positon", "joint_position")),
+    "not a log": (write("sway_train.npz", b"PK\x03\x04 truncated"), ("sway_train.npz",)),
+    "log too short to differentiate": (
+        lambda folder: edit_log(**{n: lambda x: x[:3] for n in _PER_SAMPLE})(folder),
+        ("sway_train.npz",),
+    ),
+}
+_PER_SAMPLE = (
+    *("time", "joint_position", "joint_torque", "base_position_world", "base_quat_wxyz"),
+    *("contact_active", "contact_wrench_local"),
+)
+
+ROBOTS: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "planar joint": (edit_urdf('type="revolute"', 'type="planar"'), ("front_left_hip", "planar", "revolute")),
+    "floating joint": (edit_urdf('type="revolute"', 'type="floating"'), ("front_left_hip", "floating")),
+    "link without a name": (edit_urdf('<link name="rear_left_foot"/>', "<link/>"), ("link", "no name")),
+    "duplicate link": (edit_urdf("</robot>", '<link name="trunk"/></robot>'), ("trunk", "more than once")),
+    "loop": (edit_urdf("</robot>", LOOP), ("extra", "one parent")),
+    "unknown parent": (edit_urdf('<parent link="trunk"/>', '<parent link="trunc"/>'), ("trunc", "trunk")),
+    "mass missing": (edit_urdf('<mass value="11.0"/>', ""), ("trunk", "mass")),
+    "negative mass": (edit_urdf('value="11.0"', 'value="-11"'), ("trunk", "-11 kg")),
+    "malformed XML": (edit_urdf("</robot>", ""), ("quadruped.urdf", "well-formed")),
+    "missing file": (lambda folder: (folder / "quadruped.urdf").unlink(), ("quadruped.urdf", "cannot be read")),
+}
+
+FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "unknown key": (edit_config(preprocesing={"cutoff_hz": 8}), ("preprocesing", "preprocessing")),
+    "unknown nested key": (edit_config(estimator={"rige": 1.0}), ("estimator", "rige", "ridge")),
+    "unknown estimator": (edit_config(estimator={"name": "magic"}), ("estimator.name", "magic", "least_squares")),
+    "negative ridge": (edit_config(estimator={"ridge": -1.0}), ("estimator.ridge", "-1")),
+    "cutoff above Nyquist": (edit_config(preprocessing={"cutoff_hz": 80.0}), ("cutoff_hz", "80")),
+    "unknown sensor set": (edit_config(sensors="everything"), ("sensors", "everything", "full")),
+    "unknown sensor joint": (
+        edit_config(sensors={"joint_torques": ["front_left_hop"]}),
+        ("front_left_hop", "front_left_hip"),
+    ),
+    "component a point cannot exert": (
+        edit_config(sensors={"contact_wrenches": {"rear_left_foot": ["mx"]}}),
+        ("rear_left_foot", "mx", "fx"),
+    ),
+    "unknown contact frame": (
+        edit_config(contacts=[{"frame": "front_left_fot", "type": "point"}]),
+        ("front_left_fot", "front_left_foot"),
+    ),
+    "active contact left out": (edit_config(contacts=CONTACTS[:3]), ("rear_right_foot", "active")),
+    "contact missing in the log": (edit_config(contacts=[*CONTACTS, {"frame": "trunk", "type": "flat"}]), ("trunk",)),
+    "unknown base link": (
+        edit_config(robot={"urdf": "quadruped.urdf", "base_link": "trnk"}),
+        ("base_link", "trnk", "trunk"),
+    ),
+    "no training log": (edit_config(logs={"train": []}), ("logs.train", "at least one")),
+    "log missing": (edit_config(logs={"train": ["nowhere.npz"]}), ("nowhere.npz",)),
+    "unknown log type": (
+        lambda folder: (write("log.mat", b"x")(folder), edit_config(logs={"train": ["log.mat"]})(folder)) and None,
+        ("log.mat", ".npz"),
+    ),
+    "base lost": (
+        edit_config(sensors={"joint_torques": ["front_left_hip", "front_left_thigh"]}),
+        ("rank(S_b V_x)", "rank 2 of 6"),
+    ),
+    "unavailable device": (edit_config(device="cuda:77"), ("device", "cuda:77")),
+    "malformed YAML": (write("quadruped.yaml", b"robot: [unclosed"), ("quadruped.yaml",)),
+    "YAML that is no mapping": (write("quadruped.yaml", b"- a\n- b\n"), ("quadruped.yaml", "mapping")),
+    "YAML with a tag": (write("quadruped.yaml", b"robot: !!python/object/apply:os.getcwd []"), ("quadruped.yaml",)),
+    "output is a file": (
+        lambda folder: (write("taken", b"")(folder), edit_config(output="taken")(folder)) and None,
+        ("taken", "output"),
+    ),
+    "output not empty": (
+        lambda folder: ((folder / "full").mkdir(), write("full/mine", b"x")(folder), edit_config(output="full")(folder))
+        and None,
+        ("full", "not empty"),
+    ),
+}
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.parametrize(("change", "expected"), [*LOGS.values(), *ROBOTS.values(), *FILES.values()],
+                         ids=[*LOGS, *ROBOTS, *FILES])  # fmt: skip
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_bad_input_exits_2_with_one_line_and_writes_nothing(
+    experiment: Path, capsys: pytest.CaptureFixture[str], change: Edit, expected: tuple[str, ...]
+) -> None:
+    change(experiment)
+    before = tree(experiment.parent)
+    status = main(["identify", str(experiment / "quadruped.yaml")])
+    printed = capsys.readouterr()
+    complaint = [line for line in printed.err.splitlines() if "Warning:" not in line]
+    assert status == 2, printed.err
+    assert len(complaint) == 1
+    assert complaint[0].startswith("torchid: ")
+    assert "accepted: " in complaint[0]
+    for part in expected:
+        assert part in complaint[0]
+    assert printed.out == ""
+    assert tree(experiment.parent) == before
+
+
+def test_unknown_override_names_the_nearest_key(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["identify", str(experiment / "quadruped.yaml"), "estimator.rigde=1"]) == 2
+    assert "accepted: ridge" in capsys.readouterr().err
+    assert main(["identify", str(experiment / "quadruped.yaml"), "estimator.ridge"]) == 2
+    assert "key.subkey=value" in capsys.readouterr().err
+
+
+def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(tmp_path), "--log", "x.npz"]) == 2
+    assert "config.yaml" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_that_is_no_bad_input_exits_1_without_a_traceback(
+    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("torchid.run.identify.write_json", full_disk)
+    before = tree(experiment.parent)
+    assert main(["identify", str(experiment / "quadruped.yaml")]) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert tree(experiment.parent) == before
