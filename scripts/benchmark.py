@@ -24,6 +24,7 @@ from rich.table import Table
 
 from torchid.errors import TorchidWarning
 from torchid.estimators import LeastSquares
+from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.rows import ChunkTerms
 from torchid.regressor import Regressor
@@ -43,7 +44,12 @@ class Case:
 
 CASES = (
     Case("Solo12", "solo_description/robots/solo12.urdf", ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), "point"),
-    Case("Alexander legs", "alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf", ("LEFT_FOOT", "RIGHT_FOOT"), "flat"),
+    Case(
+        "Alexander legs",
+        "alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf",
+        ("LEFT_FOOT", "RIGHT_FOOT"),
+        "flat",
+    ),
     Case("G1", "g1_description/urdf/g1_29dof_rev_1_0.urdf", ("left_ankle_roll_link", "right_ankle_roll_link"), "flat"),
 )
 
@@ -72,9 +78,9 @@ def random_samples(robot: Robot, contacts: int, count: int) -> Samples:
         "base_angular_acceleration_base": normal(count, 3),
         "base_linear_acceleration_world": normal(count, 3),
     }
-    joints = [normal(count, robot.n) for _ in range(4)]
+    position, velocity, acceleration, torque = (normal(count, robot.n) for _ in range(4))
     time_stamps = torch.arange(count, dtype=torch.float64)
-    return Samples("random", time_stamps, *joints[:3], base, joints[3], None, False, active)
+    return Samples("random", time_stamps, position, velocity, acceleration, base, torque, None, False, active)
 
 
 class PerSample:
@@ -92,7 +98,7 @@ class PerSample:
         noise = SensorNoise()
         self.variance = np.append(noise.base, np.full(robot.n, noise.joint_torque)) ** 2
 
-    def states(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def states(self, samples: Samples) -> tuple[Array, Array, Array, Array]:
         """Pinocchio's q, v, a and the torques in its order."""
         count, model = len(samples), self.model
         q, v, a, f = (np.zeros((count, size)) for size in (model.nq, model.nv, model.nv, model.nv))
@@ -108,11 +114,13 @@ class PerSample:
         f[:, self.v_place] = samples.torque
         return q, v, a, f
 
-    def projected(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, f: np.ndarray, active: np.ndarray) -> tuple:
+    def projected(self, q: Array, v: Array, a: Array, f: Array, active: Array) -> tuple[Array, Array]:
         """V^T [K, friction] and V^T f of one sample, whitened; the same rows, up to a rotation, as torchid's."""
         K = pin.computeJointTorqueRegressor(self.model, self.data, q, v, a)
         feet = [foot for foot, touches in zip(self.feet, active, strict=True) if touches]
-        J = np.vstack([pin.computeFrameJacobian(self.model, self.data, q, foot, pin.LOCAL)[: self.rows] for foot in feet])
+        J = np.vstack(
+            [pin.computeFrameJacobian(self.model, self.data, q, foot, pin.LOCAL)[: self.rows] for foot in feet]
+        )
         _, singular, Vh = np.linalg.svd(J)
         V = Vh[(singular > 1e-9 * singular[0]).sum() :]
         L = np.linalg.cholesky((V * self.variance) @ V.T)
@@ -120,19 +128,19 @@ class PerSample:
         friction = np.hstack([V[:, 6:] * np.sign(v[6:]), V[:, 6:] * v[6:]])
         return np.hstack([V @ K, friction]), V @ f
 
-    def residual(self, samples: Samples, phi: np.ndarray) -> float:
+    def residual(self, samples: Samples, phi: Array) -> float:
         """Root mean square of the whitened residual at parameters in `by_stack`'s order."""
         q, v, a, f = self.states(samples)
         blocks = [self.projected(*x) for x in zip(q, v, a, f, samples.active.numpy(), strict=True)]
         return float(np.sqrt(np.mean(np.concatenate([Y @ phi - y for Y, y in blocks]) ** 2)))
 
-    def by_stack(self, samples: Samples) -> np.ndarray:
+    def by_stack(self, samples: Samples) -> Array:
         """All rows stacked, one `numpy.linalg.lstsq`."""
         q, v, a, f = self.states(samples)
         blocks = [self.projected(*x) for x in zip(q, v, a, f, samples.active.numpy(), strict=True)]
         return np.linalg.lstsq(np.vstack([b[0] for b in blocks]), np.concatenate([b[1] for b in blocks]), rcond=None)[0]
 
-    def by_gram(self, samples: Samples) -> np.ndarray:
+    def by_gram(self, samples: Samples) -> Array:
         """Normal equations summed sample by sample (half of the digits)."""
         q, v, a, f = self.states(samples)
         columns = 10 * (self.model.njoints - 1) + 2 * (self.model.nv - 6)
@@ -165,7 +173,11 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
         robot = load_robot(urdf)
     contacts = [Contact(foot, case.kind) for foot in case.feet]
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts)))
-    samples, old, regressor = random_samples(robot, len(contacts), count), PerSample(urdf, robot, case), Regressor(robot)
+    samples, old, regressor = (
+        random_samples(robot, len(contacts), count),
+        PerSample(urdf, robot, case),
+        Regressor(robot),
+    )
     few = samples[torch.arange(0, count, 16)]
 
     def pipeline() -> None:
@@ -191,7 +203,7 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
         "torchid": (pipeline, count),
     }
     times: dict[str, list[float]] = {name: [] for name in contestants}
-    for name, (work, _) in contestants.items():
+    for work, _ in contestants.values():
         work()
     for _ in range(repeats):
         for name, (work, size) in contestants.items():

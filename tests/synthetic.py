@@ -115,6 +115,10 @@ class Oracle:
         rows = [pin.rnea(self.model, self.data, *self._state(*state)) for state in zip(q, v, a, strict=True)]
         return np.array(rows) @ self.expand
 
+    def mass_matrix(self, q: Array) -> Array:
+        """Joint-space inertia, (nv, nv), at one sample's coordinates."""
+        return self.expand.T @ pin.crba(self.model, self.data, self.coordinates(q)) @ self.expand
+
     def friction_torques(self, v: Array) -> Array:
         """Torque that friction takes from the actuators, (B, n)."""
         velocity = v[:, self.base :] @ self.ratios.T
@@ -132,7 +136,7 @@ class Oracle:
         places = self._places(robot)
         for sample, state in enumerate(zip(q, v, a, strict=True)):
             columns = pin.computeJointTorqueRegressor(self.model, self.data, *self._state(*state))
-            by_body = (self.expand.T @ columns).reshape(self.expand.shape[1], -1, 10)
+            by_body = (self.expand.T @ columns).reshape(self.expand.shape[1], columns.shape[1] // 10, 10)
             for body, place in places:
                 out[sample, :, body, PINOCCHIO_ORDER] = by_body[:, place - 1].T
         return out
@@ -215,31 +219,35 @@ def random_states(
     return np.hstack([rng.normal(size=(samples, 3)), quat, joints]), v, a
 
 
-def _forces_of_contacts(
-    oracle: Oracle, q: Array, needed: Array, contacts: Sequence[tuple[str, int]], active: NDArray[np.bool_],
+def _close_the_dynamics(
+    oracle: Oracle, q: Array, v: Array, a: Array, contacts: Sequence[tuple[str, int]], active: NDArray[np.bool_],
     rng: np.random.Generator,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Torques (B, n) and wrenches (B, C, 6) that close the dynamics, with random internal forces.
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Accelerations (B, nv), torques (B, n) and wrenches (B, C, 6) that obey the dynamics, with random internal forces.
 
-    A bolted base carries what it must, so that its contacts push at random.
+    Contacts carry of the base wrench what they can; the base accelerates by the rest, as in flight. A bolted base
+    carries what it must, so that its contacts push at random.
     """
-    base = oracle.base
-    J = np.zeros((len(q), len(contacts), 6, needed.shape[1]))
+    base, a = oracle.base, a.copy()
+    J = np.zeros((len(q), len(contacts), 6, a.shape[1]))
     for k, (frame, _) in enumerate(contacts):
         J[:, k] = oracle.jacobian(q, frame)
-    torque = np.zeros((len(q), needed.shape[1] - base))
-    wrench = 100.0 * rng.normal(size=(len(q), len(contacts), 6))  # noise where a contact is inactive
+    wrench = 100.0 * rng.normal(size=(len(q), len(contacts), 6))  # noise wherever nothing can push
+    through_contacts, needed = np.zeros_like(a), oracle.forces(q, v, a)
     for i in range(len(q)):
         rows = [(k, component) for k, (_, size) in enumerate(contacts) if active[i, k] for component in range(size)]
-        J_C = np.array([J[i, k, component] for k, component in rows]).reshape(-1, needed.shape[1])
+        J_C = np.array([J[i, k, component] for k, component in rows]).reshape(-1, a.shape[1])
         force = 20.0 * rng.normal(size=len(rows))
         if base:
-            inverse = np.linalg.pinv(J_C[:, :6].T)
+            inverse = np.linalg.pinv(J_C[:, :6].T, rcond=0.01)
             force += inverse @ (needed[i, :6] - J_C[:, :6].T @ force)
-        torque[i] = needed[i, base:] - J_C[:, base:].T @ force
+            left = needed[i, :6] - J_C[:, :6].T @ force
+            a[i, :6] -= np.linalg.solve(oracle.mass_matrix(q[i])[:6, :6], left)
+        through_contacts[i] = J_C.T @ force
         for (k, component), value in zip(rows, force, strict=True):
             wrench[i, k, component] = value
-    return torque, wrench
+    torque = (oracle.forces(q, v, a) - through_contacts)[:, base:]
+    return a, torque, wrench
 
 
 def make_log(
@@ -255,14 +263,14 @@ def make_log(
     Args:
         oracle: the true robot.
         contacts: frames with the number of components, 3 or 6, they can exert.
-        states: contact states to cycle through; each must be able to carry any base wrench.
+        states: contact states to cycle through, flight included.
         samples: number of samples.
         rng: draws states and internal forces.
         source: name of the log.
     """
     q, v, a = random_states(rng, len(oracle.joint_names), samples, fixed_base=not oracle.base)
     active = np.array([states[i % len(states)] for i in range(samples)], dtype=bool).reshape(samples, len(contacts))
-    torque, wrench = _forces_of_contacts(oracle, q, oracle.forces(q, v, a), contacts, active, rng)
+    a, torque, wrench = _close_the_dynamics(oracle, q, v, a, contacts, active, rng)
     extra = 7 if oracle.base else 0
     base: dict[str, Any] = {}
     if oracle.base:

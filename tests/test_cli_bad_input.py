@@ -68,7 +68,19 @@ def edit_config(**changes: object) -> Edit:
 
 
 def write(name: str, content: bytes) -> Edit:
-    return lambda folder: (folder / name).write_bytes(content) and None
+    def apply(folder: Path) -> None:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(content)
+
+    return apply
+
+
+def both(first: Edit, second: Edit) -> Edit:
+    def apply(folder: Path) -> None:
+        first(folder)
+        second(folder)
+
+    return apply
 
 
 def with_nan(sample: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -92,10 +104,15 @@ def renamed(old: str, new: str) -> Callable[[np.ndarray], np.ndarray]:
 
 LOOP = """<link name="extra"/><joint name="a" type="fixed"><parent link="trunk"/><child link="extra"/></joint>
 <joint name="b" type="fixed"><parent link="front_left_foot"/><child link="extra"/></joint></robot>"""
-CONTACTS = [{"frame": f"{leg}_foot", "type": "point"} for leg in ("front_left", "front_right", "rear_left", "rear_right")]
+CONTACTS = [
+    {"frame": f"{leg}_foot", "type": "point"} for leg in ("front_left", "front_right", "rear_left", "rear_right")
+]
 
 LOGS: dict[str, tuple[Edit, tuple[str, ...]]] = {
-    "unknown joint": (edit_log(joint_names=renamed("rear_left_knee", "rear_left_kne")), ("rear_left_kne", "rear_left_knee")),
+    "unknown joint": (
+        edit_log(joint_names=renamed("rear_left_knee", "rear_left_kne")),
+        ("rear_left_kne", "rear_left_knee"),
+    ),
     "joint missing": (
         edit_log(joint_names=lambda x: x[:11], joint_position=lambda x: x[:, :11], joint_torque=lambda x: x[:, :11]),
         ("rear_right_knee", "missing"),
@@ -112,7 +129,10 @@ LOGS: dict[str, tuple[Edit, tuple[str, ...]]] = {
         edit_log(contact_names=renamed("rear_left_foot", "rear_left_paw")),
         ("rear_left_paw", "rear_left_foot"),
     ),
-    "contact activity missing": (edit_log(contact_active=None), ("contact_active", "missing")),
+    "contact activity missing": (
+        edit_log(contact_active=None),
+        ("contact_wrench_local", "given without contact_active"),
+    ),
     "pickled content": (
         edit_log(joint_names=np.array([f"{leg}_hip" for leg in "abcdefghijkl"], dtype=object)),
         ("joint_names", "pickle"),
@@ -170,24 +190,23 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "no training log": (edit_config(logs={"train": []}), ("logs.train", "at least one")),
     "log missing": (edit_config(logs={"train": ["nowhere.npz"]}), ("nowhere.npz",)),
     "unknown log type": (
-        lambda folder: (write("log.mat", b"x")(folder), edit_config(logs={"train": ["log.mat"]})(folder)) and None,
+        both(write("log.mat", b"x"), edit_config(logs={"train": ["log.mat"]})),
         ("log.mat", ".npz"),
     ),
     "base lost": (
         edit_config(sensors={"joint_torques": ["front_left_hip", "front_left_thigh"]}),
-        ("rank(S_b V_x)", "rank 2 of 6"),
+        ("rank(S_b V_x)", "rank 0 of 6"),
     ),
     "unavailable device": (edit_config(device="cuda:77"), ("device", "cuda:77")),
     "malformed YAML": (write("quadruped.yaml", b"robot: [unclosed"), ("quadruped.yaml",)),
     "YAML that is no mapping": (write("quadruped.yaml", b"- a\n- b\n"), ("quadruped.yaml", "mapping")),
     "YAML with a tag": (write("quadruped.yaml", b"robot: !!python/object/apply:os.getcwd []"), ("quadruped.yaml",)),
     "output is a file": (
-        lambda folder: (write("taken", b"")(folder), edit_config(output="taken")(folder)) and None,
+        both(write("taken", b""), edit_config(output="taken")),
         ("taken", "output"),
     ),
     "output not empty": (
-        lambda folder: ((folder / "full").mkdir(), write("full/mine", b"x")(folder), edit_config(output="full")(folder))
-        and None,
+        both(write("full/mine", b"x"), edit_config(output="full")),
         ("full", "not empty"),
     ),
 }
@@ -237,7 +256,7 @@ def test_a_failure_that_is_no_bad_input_exits_1_without_a_traceback(
     def full_disk(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchid.run.identify.write_json", full_disk)
+    monkeypatch.setattr("json.dumps", full_disk)
     before = tree(experiment.parent)
     assert main(["identify", str(experiment / "quadruped.yaml")]) == 1
     assert "No space left" in capsys.readouterr().err

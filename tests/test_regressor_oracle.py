@@ -420,7 +420,7 @@ def test_a_sample_does_not_see_its_batch(urdf: Path) -> None:
 def test_a_motion_knows_all_that_the_regressor_needs(small: Robot) -> None:
     state = tensors(*random_states(np.random.default_rng(16), small.n, 3))
     K = Regressor(small)
-    torch.testing.assert_close(K.from_motion(motion_from_state(*state)), K(*state), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(K.from_motion(motion_from_state(*state, n=small.n)), K(*state), rtol=0.0, atol=0.0)
 
 
 @base_kinds
@@ -503,7 +503,7 @@ def reduced_regressor(robot: Robot, *state: Array) -> Array:
     """K's inertial part in the columns that are left after regrouping, (B, nv, columns)."""
     tree = KinematicTree(robot)
     layout = reduced_layout(tree)
-    joints = joint_states(tree, motion := motion_from_state(*tensors(*state), robot.fixed_base))
+    joints = joint_states(tree, motion := motion_from_state(*tensors(*state), robot.n, robot.fixed_base))
     states = body_states(tree, motion, joints)
     wrenches = all_wrench_columns(states, layout)
     directions = joint_directions(tree, states)

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import torch
 import yaml
@@ -93,7 +92,7 @@ def test_evaluating_the_test_log_again_gives_the_same_figures(run: Path, capsys:
     assert "sway_test" in capsys.readouterr().out
     found = json.loads((run / "evaluation" / "sway_test" / "metrics.json").read_text())["sway_test"]
     expected = json.loads((run / "metrics.json").read_text())
-    assert found["identified"] == pytest.approx(expected["test"])
+    assert found["identified"] == expected["test"]
     assert found["nominal"]["base_force_rms"] == pytest.approx(expected["test_nominal"]["base_force_rms"])
 
 
@@ -110,19 +109,19 @@ def test_the_same_experiment_gives_the_same_parameters_again(run: Path, tmp_path
     assert json.loads((output / "parameters.json").read_text()) == json.loads((run / "parameters.json").read_text())
 
 
-def test_identified_urdf_moves_as_its_parameters_say() -> None:
+def test_identified_urdf_moves_as_its_parameters_say(tmp_path: Path) -> None:
     robot = torchid.load_robot(DEMO / "quadruped.urdf")
     rng = np.random.default_rng(0)
     phi = robot.nominal * rng.uniform(0.9, 1.1, (len(robot.bodies), 1))
     phi[1:, 10:] = rng.uniform(0.1, 0.5, (12, 2))
-    content = identified_urdf(robot, phi)
-    model = pin.buildModelFromXML(content.decode(), pin.JointModelFreeFlyer())
-    oracle = Oracle(model, robot.joint_names)
+    path = tmp_path / "identified.urdf"
+    path.write_bytes(identified_urdf(robot, phi))
+    oracle = Oracle(path, robot.joint_names)
     q, v, a = random_states(rng, robot.n, 20)
     inertial = phi.copy()
     inertial[:, 10:] = 0.0
     predicted = torchid.Regressor(robot)(*map(torch.tensor, (q, v, a))) @ torch.tensor(inertial).flatten()
-    expected = np.stack([oracle.forces(*state) for state in zip(q, v, a, strict=True)])
+    expected = oracle.frictionless_forces(q, v, a)
     np.testing.assert_allclose(predicted.numpy(), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
 

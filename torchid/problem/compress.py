@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,7 +12,8 @@ import torch
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
-from torchid.problem.rows import RowBuilder, State
+from torchid.problem.plan import State
+from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.triangular import TriangularFactor
 from torchid.problem.workspace import Workspace
@@ -67,7 +67,7 @@ def compress(
     def run(part: Sequence[tuple[Samples, State, slice | torch.Tensor]]) -> TriangularFactor:
         if threads > 1:
             torch.set_num_threads(1)
-        factor, workspace = TriangularFactor(builder.columns), Workspace()
+        factor, workspace = TriangularFactor(builder.columns.count), Workspace()
         with torch.no_grad():
             for samples, state, index in part:
                 piece = samples[index].to(device)
@@ -103,7 +103,7 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     if not friction:
         free[:, parameters.FRICTION] = False
     return LinearProblem(
-        A=R[:-1, :-1] @ builder.column_map(),
+        A=R[:-1, :-1] @ builder.columns.from_parameters(),
         b=R[:-1, -1],
         residual=float(R[-1, -1] ** 2),
         rows=factor.rows,
@@ -129,5 +129,3 @@ def parameter_scale(nominal: Array) -> Array:
     scale[:, parameters.FIRST_MOMENT] = (mass * radius)[:, None]
     scale[:, parameters.INERTIA] = (mass * radius**2)[:, None]
     return scale
-
-

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem.compress import by_state
-from torchid.problem.rows import ChunkTerms, RowBuilder, State
+from torchid.problem.plan import State
+from torchid.problem.rows import ChunkTerms, RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
-from torchid.regressor.kinematics import cross, rotate
+from torchid.regressor.jacobian import generalized_forces, wrench_map, wrenches_at_base
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Ten
 
     Bodies' wrenches, summed over subtrees, work along screw axes: the rows of K are never formed.
     """
-    tree, layout = builder.tree, builder.layout
+    tree, layout = builder.tree, builder.columns.layout
     by_body = phi.new_zeros(tree.bodies, layout.count)
     for body, start in enumerate(layout.starts[:-1]):
         end = layout.starts[body + 1]
@@ -52,27 +53,16 @@ def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Ten
 def contact_forces(builder: RowBuilder, samples: Samples, state: State, terms: ChunkTerms) -> Tensor:
     """J_C^T lambda, (nv, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
     tree = builder.tree
-    total = samples.time.new_zeros(tree.base_rows + tree.joint_map.shape[1], len(samples))
+    joints = range(tree.joint_map.shape[1])
+    total = samples.time.new_zeros(tree.base_rows + len(joints), len(samples))
     for contact, active in enumerate(state):
-        if not active:
-            continue
-        body, T_joint_frame = builder.frames[contact]
-        local = builder.local_wrench(samples, contact, terms)
-        possible = list(builder.contacts[contact].components)
-        wrench = torch.zeros_like(local)
-        wrench[:, possible] = local[:, possible]
-        R = terms.states.rotation[:, :, body]
-        turn = torch.stack([rotate(R, R.new_tensor(T_joint_frame[:3, k, None])) for k in range(3)], dim=1)
-        point = terms.states.position[:, body] + rotate(R, R.new_tensor(T_joint_frame[:3, 3, None]))
-        force, moment = rotate(turn, wrench.T[:3]), rotate(turn, wrench.T[3:])
-        at_base = torch.cat([force, moment + cross(point, force)])
-        if tree.base_rows:
-            total[:6] += at_base
-        path = tree.path(body)
-        torque = (terms.directions[:, path] * at_base[:, None]).sum(0)
-        ratios = tree.joint_map[path]  # (path, n)
-        for step, joint in torch.nonzero(ratios).tolist():
-            total[tree.base_rows + joint] += ratios[step, joint] * torque[step]
+        if active:
+            body, T_joint_frame = builder.frames[contact]
+            possible = list(builder.contacts[contact].components)
+            units = total.new_tensor(wrench_map(T_joint_frame).T[possible])
+            components = builder.local_wrench(samples, contact, terms)[:, possible].T
+            wrench = (wrenches_at_base(terms.states, body, units) * components).sum(1, keepdim=True)
+            total += generalized_forces(tree, terms.directions, body, wrench, joints)[0]
     return total
 
 
@@ -80,16 +70,15 @@ def forces(builder: RowBuilder, samples: Samples, state: State, phi: Tensor) -> 
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, columns)."""
     terms = builder.terms(samples)
     base_rows = builder.tree.base_rows
-    given = samples.torque if samples.torque is not None else torch.full_like(samples.joint_position, torch.nan)
-    torque = torch.nn.functional.pad(given, (base_rows, 0))
+    torque = torch.nn.functional.pad(builder.torque(samples), (base_rows, 0))
     measured = torque + contact_forces(builder, samples, state, terms).T
     return Forces(measured, torque, torch.stack([predicted_forces(builder, terms, p).T for p in phi]))
 
 
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
     """Measured (N, nv) and predicted (M, N, nv) forces of a whole log in its own order, parameters (M, 12 L)."""
-    columns = torch.from_numpy(phi @ builder.column_map().T).to(builder.device)
-    nv = builder.tree.base_rows + len(builder.joint_rows)
+    columns = torch.from_numpy(phi @ builder.columns.from_parameters().T).to(builder.device)
+    nv = builder.tree.base_rows + len(builder.columns.joint_rows)
     measured, predicted = np.empty((len(samples), nv)), np.empty((len(phi), len(samples), nv))
     with torch.no_grad(), one_thread():
         for state, index in by_state(samples):

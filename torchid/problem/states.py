@@ -10,7 +10,8 @@ import torch
 
 from torchid.errors import BaseLostError, BaseLostWarning
 from torchid.problem.compress import by_state
-from torchid.problem.rows import RowBuilder, State
+from torchid.problem.plan import State
+from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
 from torchid.sensing.projection import BASE_RANK_TOLERANCE, base_singular_values
@@ -23,8 +24,8 @@ class StateReport:
     """A contact state in the logs.
 
     `name`: frames in contact, joined by "+". `rows`: equations per sample. `base_rank`: rank(S_b V_x), the best over
-    the samples checked, None for a fixed base. `base_singular_value`: median of its smallest singular value; near 0, base
-    accelerations are all but lost.
+    the samples checked, None for a fixed base. `base_singular_value`: median of its smallest singular value; near 0,
+    base accelerations are all but lost.
     """
 
     name: str

@@ -26,7 +26,9 @@ def _inertia_moments(omega: Tensor, alpha: Tensor) -> dict[tuple[int, int], tupl
     }
 
 
-def _first_moment_wrenches(omega: Tensor, alpha: Tensor, force: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
+def _first_moment_wrenches(
+    omega: Tensor, alpha: Tensor, force: Tensor
+) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
     """Force ([alpha]x + [omega]x^2) e_k and moment e_k x specific force, for k = x, y, z, in the frame."""
     x, y, z = omega
     ax, ay, az = alpha

@@ -1,6 +1,8 @@
-"""Body and frame Jacobians."""
+"""Jacobians, by virtual work: the rows of J are the generalized forces of unit wrenches."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -8,42 +10,40 @@ from torch import Tensor, nn
 
 from torchid.parameters import Array
 from torchid.regressor.dynamics import joint_directions
-from torchid.regressor.kinematics import BodyStates, JointStates, body_states, cross, joint_states, rotate
+from torchid.regressor.kinematics import BodyStates, body_states, cross, joint_states
 from torchid.regressor.motion import GRAVITY_WORLD, motion_from_state
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
 
-def body_jacobian(tree: KinematicTree, states: BodyStates, directions: Tensor, body: int, joints: list[int]) -> Tensor:
-    """Jacobian of a body's joint frame: twist of its origin in its own axes, linear part first.
+def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor) -> Tensor:
+    """Wrenches that are constant in a body's joint frame, (k, 6), at the base origin in base axes, (6, k, B)."""
+    rotation, position = states.rotation[:, :, body], states.position[:, body]
+    force = wrenches[:, :3] @ rotation
+    return torch.cat([force, wrenches[:, 3:] @ rotation + cross(position[:, None].expand_as(force), force)])
+
+
+def generalized_forces(
+    tree: KinematicTree, directions: Tensor, body: int, wrenches: Tensor, joints: Sequence[int]
+) -> Tensor:
+    """Work of wrenches on a body, per unit of base twist and joint velocity.
 
     Args:
         tree: the robot's constants.
-        states: of the joint frames.
         directions: from `joint_directions`, (6, L, B).
         body: which body.
+        wrenches: at the base origin, (6, k, B).
         joints: independent joints to give columns for, after the base's six (none for a fixed base).
 
     Returns:
-        (6, base rows + len(joints), B).
+        (k, base rows + len(joints), B).
     """
-    samples = directions.shape[-1]
-    unit = torch.eye(6, dtype=directions.dtype, device=directions.device)[..., None].expand(6, 6, samples)
     path = tree.path(body)
-    columns = [unit[:, k] for k in range(tree.base_rows)]
-    ratios = tree.joint_map.T.tolist()
-    for joint in joints:
-        column = torch.zeros_like(directions[:, 0])
-        for moved in path:
-            if ratios[joint][moved]:
-                column = column + ratios[joint][moved] * directions[:, moved]
-        columns.append(column)
-    if not columns:
-        return directions.new_zeros(6, 0, samples)
-    screw = torch.stack(columns, dim=1)
-    inverse = states.rotation[:, :, body].transpose(0, 1).unsqueeze(2)
-    linear = screw[:3] + cross(screw[3:], states.position[:, body].unsqueeze(1).expand_as(screw[3:]))
-    return torch.cat([rotate(inverse, linear), rotate(inverse, screw[3:])])
+    screws = tree.joint_map[path][:, list(joints)].T @ directions[:, path]
+    torque = wrenches[0][:, None] * screws[0]
+    for axis in range(1, 6):
+        torque.addcmul_(wrenches[axis][:, None], screws[axis])
+    return torch.cat([wrenches.transpose(0, 1), torque], dim=1) if tree.base_rows else torque
 
 
 def wrench_map(T: Array) -> Array:
@@ -68,16 +68,17 @@ class FrameJacobian(nn.Module):
         super().__init__()
         self.tree = KinematicTree(robot)
         self._body, T_link_frame = robot.link(frame)
-        in_joint_frame = wrench_map(self.tree.T_joint_link[self._body] @ T_link_frame)
-        self.register_buffer("to_frame", torch.tensor(in_joint_frame.T.copy()), persistent=False)
-        self._joints = list(range(robot.n))
+        unit_wrenches = wrench_map(self.tree.T_joint_link[self._body] @ T_link_frame).T
+        self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
+        self._joints = range(robot.n)
 
     def forward(self, q: Tensor) -> Tensor:
         """Jacobian (B, 6, nv) at coordinates `q`, (B, n + 7) or (B, n) for a fixed base (see `Regressor`)."""
         tree = self.tree
-        still = q.new_zeros(q.shape[0], len(self._joints) + tree.base_rows)
-        motion = motion_from_state(q, still, still, not tree.base_rows, GRAVITY_WORLD)
-        joints: JointStates = joint_states(tree, motion)
-        states = body_states(tree, motion, joints)
-        J = body_jacobian(tree, states, joint_directions(tree, states), self._body, self._joints)
-        return torch.tensordot(self.get_buffer("to_frame"), J, dims=1).permute(2, 0, 1)
+        n = len(self._joints)
+        still = q.new_zeros(q.shape[0], n + tree.base_rows)
+        motion = motion_from_state(q, still, still, n, not tree.base_rows, GRAVITY_WORLD)
+        states = body_states(tree, motion, joint_states(tree, motion))
+        wrenches = wrenches_at_base(states, self._body, self.get_buffer("unit_wrenches"))
+        J = generalized_forces(tree, joint_directions(tree, states), self._body, wrenches, self._joints)
+        return J.permute(2, 0, 1)

@@ -41,7 +41,12 @@ class Motion:
 
 
 def motion_from_state(
-    q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False, gravity: tuple[float, float, float] = GRAVITY_WORLD
+    q: Tensor,
+    v: Tensor,
+    a: Tensor,
+    n: int,
+    fixed_base: bool = False,
+    gravity: tuple[float, float, float] = GRAVITY_WORLD,
 ) -> Motion:
     """Motion from generalized coordinates in Pinocchio's free-flyer layout.
 
@@ -50,17 +55,17 @@ def motion_from_state(
             (B, n) for a fixed base.
         v: (B, nv): base linear and angular velocity in the base frame, then joints.
         a: (B, nv): d/dt of `v`.
+        n: number of independent joints.
         fixed_base: whether the base is bolted, with its axes those of the world.
         gravity: (3,), in the world [m/s^2].
 
     Raises:
-        ValueError: the widths of `q`, `v` and `a` do not belong together.
+        ValueError: the shapes of `q`, `v` and `a` are others.
     """
-    extra = 0 if fixed_base else 6
-    n = v.shape[-1] - extra
-    if a.shape != v.shape or q.shape[-1] != n + (0 if fixed_base else 7) or n < 0:
+    width_q, width_v = (n, n) if fixed_base else (n + 7, n + 6)
+    if q.ndim != 2 or q.shape[1] != width_q or v.shape != (q.shape[0], width_v) or a.shape != v.shape:
         shapes = ", ".join(str(tuple(x.shape)) for x in (q, v, a))
-        raise ValueError(f"q, v, a: found shapes {shapes}; accepted: (B, n + 7), (B, n + 6), (B, n + 6), fixed base n, n, n")
+        raise ValueError(f"q, v, a: found shapes {shapes}; accepted: (B, {width_q}), (B, {width_v}), (B, {width_v})")
     g_world = q.new_tensor(gravity)
     if fixed_base:
         zero = q.new_zeros(q.shape[0], 3)

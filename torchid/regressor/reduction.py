@@ -10,6 +10,7 @@ Source: Gautier and Khalil, "Direct calculation of minimum set of inertial param
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -29,7 +30,7 @@ class ColumnLayout:
 
     kept: tuple[tuple[int, ...], ...]
 
-    @property
+    @cached_property
     def starts(self) -> list[int]:
         """First column of every body, then the total."""
         return [0, *np.cumsum([len(k) for k in self.kept]).tolist()]

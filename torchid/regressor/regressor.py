@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 from torchid import parameters
@@ -49,7 +48,7 @@ class Regressor(nn.Module):
         Raises:
             ValueError: the shapes do not belong together.
         """
-        return self.from_motion(motion_from_state(q, v, a, not self.tree.base_rows, self.gravity))
+        return self.from_motion(motion_from_state(q, v, a, len(self._rows), not self.tree.base_rows, self.gravity))
 
     def from_motion(self, motion: Motion) -> Tensor:
         """As `forward`, from a `Motion` (which knows no base position, heading or linear velocity)."""

@@ -19,8 +19,8 @@ class KinematicTree(nn.Module):
     """Constant tensors of a robot, batch-last: a trailing axis of length 1 broadcasts over samples.
 
     Attributes (buffers, so `.to()` moves and casts them):
-        pose: (3, 4, L, 1), rotation and offset [m] of every joint frame at position 0 in its parent's joint frame, bodies
-            sorted by depth (`by_depth`; `depth_first` sorts back).
+        pose: (3, 4, L, 1), rotation and offset [m] of every joint frame at position 0 in its parent's joint frame,
+            bodies sorted by depth (`by_depth`; `depth_first` sorts back).
         link_rotation, (3, 3, L, 1), and link_offset, (3, L, 1): the body's link frame in its joint frame.
         revolute, prismatic: (L, 1) of 0 and 1.
         parent: (L,), index of the parent body, 0 for the base.

@@ -10,8 +10,9 @@ import torch
 
 from torchid.parameters import Array
 from torchid.problem.compress import by_state
+from torchid.problem.plan import State
 from torchid.problem.predict import forces
-from torchid.problem.rows import RowBuilder, State
+from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
 from torchid.robot import Robot
@@ -84,7 +85,7 @@ class Evaluation:
     ) -> list[Metrics]:
         """One `Metrics` per row of `phi`, (M, 12 L), over all samples of the logs together."""
         builder, robot = self.builder, self.robot
-        columns = torch.from_numpy(phi @ builder.column_map().T).to(builder.device)
+        columns = torch.from_numpy(phi @ builder.columns.from_parameters().T).to(builder.device)
         measured, hidden = _Squares(robot.nv), _Squares(1)
         errors = [(_Squares(robot.nv), _Squares(1)) for _ in phi]
         with torch.no_grad(), one_thread():
@@ -93,22 +94,26 @@ class Evaluation:
                     piece = samples[index].to(builder.device)
                     found = forces(builder, piece, state, columns)
                     measured.add(found.measured)
-                    self._project(piece, state, found.torque, hidden)
-                    for (rows, projected), prediction in zip(errors, found.predicted, strict=True):
+                    for (rows, _), prediction in zip(errors, found.predicted, strict=True):
                         rows.add(prediction - found.measured)
-                        self._project(piece, state, prediction - found.torque, projected)
+                    misfits = [found.torque, *(found.predicted - found.torque)]
+                    sums = [hidden, *(projected for _, projected in errors)]
+                    self._project(piece, state, misfits, sums)
                     if progress is not None:
                         progress(len(piece))
         return [self._summary(rows, projected, measured, hidden) for rows, projected in errors]
 
-    def _project(self, samples: Samples, state: State, rows: torch.Tensor, squares: _Squares) -> None:
-        """Add V_x^T rows, V_x the contacts' null space; joints away from contacts pass unchanged."""
+    def _project(
+        self, samples: Samples, state: State, vectors: Sequence[torch.Tensor], sums: Sequence[_Squares]
+    ) -> None:
+        """Add V_x^T of each (B, nv), V_x the contacts' null space; joints away from contacts pass unchanged."""
         plan, base = self.builder.plan(state), self.robot.base_rows
         mixed = [*range(base), *(base + joint for joint in plan.mixed_joints)]
         lone = [base + joint for joint in plan.lone_joints]
         for index, V in self.builder.bases(samples, state):
-            inside = (V.mT @ rows[index][:, mixed, None])[..., 0]
-            squares.add(torch.cat([inside, rows[index][:, lone]], dim=1).flatten()[:, None])
+            for vector, squares in zip(vectors, sums, strict=True):
+                inside = (V.mT @ vector[index][:, mixed, None])[..., 0]
+                squares.add(torch.cat([inside, vector[index][:, lone]], dim=1).flatten()[:, None])
 
     def _summary(self, errors: _Squares, projected: _Squares, measured: _Squares, hidden: _Squares) -> Metrics:
         base = self.robot.base_rows

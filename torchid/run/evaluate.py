@@ -13,8 +13,8 @@ from torchid.report.figures import error_figure
 from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.parameters_json import read_parameters
 from torchid.run.experiment import set_up
-from torchid.run.folder import new_folder
-from torchid.run.identify import forces_of, write_json
+from torchid.run.folder import new_folder, write_json
+from torchid.run.identify import forces_of
 from torchid.run.progress import progress_bars
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -24,6 +25,11 @@ def check_free(output: Path, overwrite: bool) -> None:
             raise ConfigError(output, "output", "not empty", "a new folder, or overwrite=true")
         if not (output / "config.yaml").is_file():
             raise ConfigError(output, "output", "not empty and not a run folder", "a new folder, or a run to overwrite")
+
+
+def write_json(path: Path, document: object) -> None:
+    """Write strict JSON: a number that is not finite is an error, not a NaN in the file."""
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 @contextmanager

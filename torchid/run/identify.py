@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -25,7 +24,7 @@ from torchid.report.tensorboard import write_events
 from torchid.report.urdf_export import identified_urdf
 from torchid.robot import Robot
 from torchid.run.experiment import Experiment, set_up
-from torchid.run.folder import check_free, new_folder
+from torchid.run.folder import check_free, new_folder, write_json
 from torchid.run.progress import progress_bars
 
 _PLOTTED_SAMPLES = 3000
@@ -150,11 +149,6 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "contact_states": [asdict(state) for state in run.states],
         "seconds": run.seconds,
     }
-
-
-def write_json(path: Path, document: object) -> None:
-    """Write strict JSON: a number that is not finite is an error, not a NaN in the file."""
-    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:

@@ -30,29 +30,53 @@ def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
     samples, k, m = A.shape
     if samples == 0:
         return
+    identity = torch.eye(m, dtype=A.dtype, device=A.device)
     if k == 0:
-        yield slice(None), torch.eye(m, dtype=A.dtype, device=A.device).expand(samples, m, m)
+        yield slice(None), identity.expand(samples, m, m)
         return
     suspect = torch.ones(samples, dtype=torch.bool, device=A.device)
     if k <= m:
-        Q, R = torch.linalg.qr(A.mT, mode="complete")
-        triangle = R[:, :k]
-        diagonal = triangle.diagonal(dim1=1, dim2=2)
-        scale = torch.linalg.matrix_norm(triangle)
-        singular = diagonal.abs().amin(1) <= RANK_TOLERANCE * scale
-        safe = triangle + torch.diag_embed(singular[:, None].to(A.dtype).expand(-1, k))
-        identity = torch.eye(k, dtype=A.dtype, device=A.device).expand_as(safe)
-        inverse = torch.linalg.solve_triangular(safe, identity, upper=True)
-        suspect = singular | (torch.linalg.matrix_norm(inverse) * scale > 1.0 / _SUSPECT)
+        reflectors, tau = torch.geqrf(A.mT)
+        R = reflectors[:, :k].triu()
+        inverse = torch.linalg.solve_triangular(R, identity[:k, :k].expand_as(R), upper=True)
+        condition = torch.linalg.matrix_norm(R) * torch.linalg.matrix_norm(inverse)
+        suspect = ~(condition < 1.0 / _SUSPECT)  # so written, infinite and undefined ones are suspect too
+        V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
         if not suspect.any():
-            yield slice(None), Q[:, :, k:]
+            yield slice(None), V
             return
         regular = torch.nonzero(~suspect)[:, 0]
         if len(regular):
-            yield regular, Q[regular, :, k:]
+            yield regular, V[regular]
     left = torch.nonzero(suspect)[:, 0]
     _, values, Vh = torch.linalg.svd(A[left], full_matrices=True)
     rank = (values > RANK_TOLERANCE * values[:, :1].clamp_min(torch.finfo(A.dtype).tiny)).sum(1)
     for r in rank.unique().tolist():
         same = rank == r
         yield left[same], Vh[same, r:].mT
+
+
+def whitened_null_space(
+    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor
+) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    """Bases W of the null spaces of A under which the projected sensor noise is white, grouped by rank.
+
+    Args:
+        A: (B, k, m).
+        row_std: (m,), > 0, noise of the generalized force itself (torque sensors, floor of the base rows).
+        J_m: (B, k_m, m), rows of the contact Jacobian whose wrench component is measured.
+        wrench_std: (k_m,), noise of each measured wrench component.
+
+    Yields:
+        (index of the samples, W): W is (B', m, m - rank) with `A @ W = 0` and `W^T S W = I`, where S, the covariance of
+        the generalized force, is `diag(row_std^2) + J_m^T diag(wrench_std^2) J_m`.
+    """
+    J_m = J_m.detach()
+    for index, V in null_space(A / row_std):
+        W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
+        if len(wrench_std):
+            through_contacts = (J_m[index] @ W) * wrench_std[:, None]
+            identity = torch.eye(W.shape[2], dtype=W.dtype, device=W.device)
+            L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
+            W = torch.linalg.solve_triangular(L, W.mT, upper=False).mT
+        yield index, W

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from torchid.sensing.nullspace import null_space
+from torchid.sensing.nullspace import null_space, whitened_null_space
 
 BASE_RANK_TOLERANCE = 1e-6
 """A singular value of S_b V_x below this counts as a lost direction of the base (V_x is orthonormal: at most 1)."""
@@ -28,22 +28,6 @@ class ProjectedGroup:
     K: Tensor
     f: Tensor
     base_rank: Tensor
-
-
-def whitened(V: Tensor, J_m: Tensor, row_variance: Tensor, wrench_variance: Tensor) -> Tensor:
-    """Basis V L^-T under which the projected sensor noise is white; `L L^T` is its covariance under V.
-
-    Args:
-        V: (B, m, r).
-        J_m: (B, k_m, m), rows of the contact Jacobian whose wrench component is measured.
-        row_variance: (m,), noise variance of the generalized force itself (torque sensors, floor of the base rows).
-        wrench_variance: (k_m,), noise variance of each measured wrench component.
-    """
-    direct = V * row_variance.sqrt()[:, None]
-    through_contacts = (J_m @ V) * wrench_variance.sqrt()[:, None]
-    covariance = direct.mT @ direct + through_contacts.mT @ through_contacts
-    L = torch.linalg.cholesky(covariance)
-    return torch.linalg.solve_triangular(L, V.mT, upper=False).mT
 
 
 def base_singular_values(V: Tensor) -> Tensor:
@@ -80,7 +64,7 @@ class Projection(nn.Module):
             base_noise: floor of the base rows [N or N m], scalar or (6,).
 
         Raises:
-            ValueError: some but not all noises given.
+            ValueError: some but not all noises given, or one that is not positive.
         """
         super().__init__()
         noises = (torque_noise, wrench_noise, base_noise)
@@ -95,10 +79,11 @@ class Projection(nn.Module):
         if self._whiten:
             torque_std, wrench_std, base_std = (torch.as_tensor(x, dtype=torch.float64) for x in noises)
             rows = torch.cat([base_std.expand(base_rows), torque_std.expand(len(torque))])
-            self.register_buffer("row_variance", rows**2, persistent=False)
-            self.register_buffer(
-                "wrench_variance", wrench_std.expand(len(self.get_buffer("wrench_measured"))) ** 2, False
-            )
+            wrench_std = wrench_std.expand(len(self.get_buffer("wrench_measured")))
+            if not bool((rows > 0.0).all()) or not bool((wrench_std > 0.0).all()):
+                raise ValueError("torque_noise, base_noise, wrench_noise: found a value that is not positive")
+            self.register_buffer("row_std", rows, persistent=False)
+            self.register_buffer("wrench_std", wrench_std, persistent=False)
 
     def forward(self, J_C: Tensor, active: Tensor, K: Tensor, torque: Tensor, wrench: Tensor) -> list[ProjectedGroup]:
         """Project a batch.
@@ -129,17 +114,23 @@ class Projection(nn.Module):
         f[:, self.base_rows :] = torch.where(self.get_buffer("torque_measured"), torque, torch.zeros_like(torque))
         f = f + (J_m.mT @ wrench[:, measured, None])[..., 0]
         groups = []
-        for rows, basis in null_space(J[:, state & ~self.get_buffer("wrench_measured")][:, :, kept]):
+        for rows, basis in self._bases(J[:, state & ~self.get_buffer("wrench_measured")], J_m, measured):
             V = basis.new_zeros(basis.shape[0], len(kept), basis.shape[2])
             V[:, kept] = basis
             if self.base_rows:
-                base_rank = (base_singular_values(V) > BASE_RANK_TOLERANCE).sum(1)
+                orthonormal = torch.linalg.qr(V).Q if self._whiten else V
+                base_rank = (base_singular_values(orthonormal) > BASE_RANK_TOLERANCE).sum(1)
             else:
                 base_rank = index.new_zeros(V.shape[0])
-            if self._whiten:
-                variance, wrench_variance = self.get_buffer("row_variance"), self.get_buffer("wrench_variance")
-                V = whitened(V, J_m[rows].detach(), variance.to(V), wrench_variance[measured].to(V))
             groups.append(
                 ProjectedGroup(index[rows], state, V, V.mT @ K[rows], (V.mT @ f[rows, :, None])[..., 0], base_rank)
             )
         return groups
+
+    def _bases(self, J_x: Tensor, J_m: Tensor, measured: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
+        """Of what is left free on the rows that are kept: the others' torques are unknown."""
+        kept = self.get_buffer("kept")
+        if not self._whiten:
+            return null_space(J_x[:, :, kept])
+        row_std, wrench_std = (self.get_buffer(name).to(J_x) for name in ("row_std", "wrench_std"))
+        return whitened_null_space(J_x[:, :, kept], row_std[kept], J_m[:, :, kept], wrench_std[measured])

@@ -1,0 +1,74 @@
+"""Null spaces of batches in which every sample may have a rank of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic import Array
+
+from torchid.sensing.nullspace import null_space
+
+
+def orthogonal(rng: np.random.Generator, size: int) -> Array:
+    return np.linalg.qr(rng.normal(size=(size, size)))[0]
+
+
+def of_rank(rng: np.random.Generator, k: int, m: int, rank: int) -> Array:
+    """A matrix with singular values between 0.1 and 10, all multiplied by up to 10^6 or 10^-6."""
+    values = 10.0 ** rng.uniform(-1.0, 1.0, rank) * 10.0 ** rng.uniform(-6.0, 6.0)
+    return orthogonal(rng, k)[:, :rank] * values @ orthogonal(rng, m)[:, :rank].T
+
+
+def bases(A: Array) -> list[Array]:
+    """The basis of each sample, after making sure that every sample has one."""
+    found: dict[int, Array] = {}
+    for index, V in null_space(torch.from_numpy(A)):
+        samples = torch.arange(len(A))[index].tolist()
+        assert len(samples) == len(V)
+        assert not found.keys() & samples
+        found |= dict(zip(samples, V.numpy(), strict=True))
+    assert found.keys() == set(range(len(A)))
+    return [found[i] for i in range(len(A))]
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), k=st.integers(0, 14), m=st.integers(1, 20), samples=st.integers(0, 6))
+def test_a_null_space_is_all_that_a_matrix_maps_to_nothing(seed: int, k: int, m: int, samples: int) -> None:
+    rng = np.random.default_rng(seed)
+    ranks = [rng.choice([min(k, m), rng.integers(0, min(k, m) + 1)]) for _ in range(samples)]
+    A = np.array([of_rank(rng, k, m, rank) for rank in ranks]).reshape(samples, k, m)
+    for matrix, V, rank in zip(A, bases(A), ranks, strict=True):
+        assert V.shape == (m, m - rank)
+        np.testing.assert_allclose(V.T @ V, np.eye(m - rank), rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(matrix @ V, 0.0, rtol=0.0, atol=1e-13 * np.abs(matrix).max(initial=0.0))
+
+
+@pytest.mark.parametrize("k", [1, 3, 5, 8])
+def test_without_any_constraint_everything_is_free_and_so_it_is_under_zero_constraints(k: int) -> None:
+    (free,) = bases(np.zeros((1, 0, 5)))
+    np.testing.assert_array_equal(free, np.eye(5))
+    mixed = np.zeros((3, k, 5))
+    mixed[1, 0, 2] = 1.0
+    zero, one, other_zero = bases(mixed)
+    for V in (zero, other_zero):
+        np.testing.assert_allclose(V @ V.T, np.eye(5), rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(one @ one.T, np.diag([1.0, 1.0, 0.0, 1.0, 1.0]), rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("smallest", "rank"), [(1e-3, 3), (1e-5, 3), (1e-7, 3), (1e-8, 3), (1e-10, 2), (0.0, 2)])
+@pytest.mark.parametrize("k", [3, 6])
+def test_a_direction_is_lost_below_a_billionth_of_the_largest(smallest: float, rank: int, k: int) -> None:
+    rng = np.random.default_rng(0)
+    A = 1e4 * orthogonal(rng, k)[:, :3] * [1.0, 0.5, smallest] @ orthogonal(rng, 5)[:, :3].T
+    regular = rng.normal(size=(k, 5))
+    V = bases(np.array([A, regular]))
+    assert [x.shape[1] for x in V] == [5 - rank, 5 - min(k, 5)]
+
+
+def test_a_basis_carries_no_gradient() -> None:
+    A = torch.randn(4, 2, 5, dtype=torch.float64, requires_grad=True)
+    for _, V in null_space(A):
+        assert not V.requires_grad

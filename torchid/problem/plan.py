@@ -1,0 +1,159 @@
+"""What is constant in a contact state, worked out once: which columns, joints and wrench directions take part."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid import parameters
+from torchid.parameters import Array
+from torchid.problem.samples import measured_components
+from torchid.regressor.dynamics import JointRow, joint_rows
+from torchid.regressor.jacobian import wrench_map
+from torchid.regressor.reduction import reduced_layout, reduction_matrix
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+from torchid.sensing.sensors import SensorSet
+
+State = tuple[bool, ...]
+"""Which contacts touch the ground."""
+
+_DEPENDENT = 1e-9  # singular values of constant unit wrenches below this share of the largest count as zero
+
+
+class Columns:
+    """Columns of the rows: those of `reduced_layout`, then two friction columns for each of the L - 1 joints."""
+
+    def __init__(self, tree: KinematicTree) -> None:
+        """Lay out the columns of a robot."""
+        self.tree = tree
+        self.layout = reduced_layout(tree)
+        self.joint_rows: list[JointRow] = joint_rows(tree, self.layout)
+
+    @property
+    def count(self) -> int:
+        """Number of columns, without the right-hand side."""
+        return self.layout.count + 2 * (self.tree.bodies - 1)
+
+    def friction(self, body: int) -> int:
+        """The first of the two friction columns of a body's joint."""
+        return self.layout.count + 2 * (body - 1)
+
+    def friction_of(self, joint: int) -> list[int]:
+        """Friction columns of an independent joint and those that mimic it."""
+        return [self.friction(body) + k for body, _ in self.joint_rows[joint].moved for k in (0, 1)]
+
+    def joints_above(self, body: int) -> list[int]:
+        """Independent joints that move a body."""
+        path = set(self.tree.path(body))
+        return [j for j, row in enumerate(self.joint_rows) if any(moved in path for moved, _ in row.moved)]
+
+    def from_parameters(self) -> Array:
+        """Matrix M, (count, 12 L), that takes parameters to these columns: `K = K_columns @ M`."""
+        matrix = np.zeros((self.count, self.tree.bodies, parameters.PER_BODY))
+        inertial = reduction_matrix(self.tree).reshape(self.layout.count, self.tree.bodies, -1)
+        matrix[: self.layout.count, :, parameters.INERTIAL] = inertial
+        for body in range(1, self.tree.bodies):
+            matrix[self.friction(body), body, parameters.COULOMB] = 1.0
+            matrix[self.friction(body) + 1, body, parameters.VISCOUS] = 1.0
+        return matrix.reshape(self.count, -1)
+
+
+@dataclass(frozen=True)
+class ContactBody:
+    """A body with active contacts.
+
+    `unmeasured`, (k_x, 6): orthonormal rows that span the unmeasured wrench directions, `measured`, (k_m, 6): one row
+    per measured component, both as wrenches at the body's joint frame, in its axes. `components`: contact and component
+    of each measured row. `joints`: places among the mixed joints of those that move the body.
+    """
+
+    body: int
+    unmeasured: Tensor
+    measured: Tensor
+    components: tuple[tuple[int, int], ...]
+    joints: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class StatePlan:
+    """A contact state: bodies in contact; measured joints that the projection mixes, and those it leaves alone.
+
+    `support`: columns in which mixed rows can differ from zero. `row_std`: noise of the base rows and mixed joints;
+    `wrench_std`: of the measured components, body by body.
+    """
+
+    contact_bodies: tuple[ContactBody, ...]
+    mixed_joints: tuple[int, ...]
+    lone_joints: tuple[int, ...]
+    support: tuple[int, ...]
+    row_std: Tensor
+    wrench_std: Tensor
+
+
+class Planner:
+    """Makes the plans of one robot with its contacts and sensors."""
+
+    def __init__(self, robot: Robot, columns: Columns, contacts: Sequence[Contact], sensors: SensorSet) -> None:
+        """Look the contacts' frames up."""
+        self.columns = columns
+        self.contacts = tuple(contacts)
+        self.sensors = sensors
+        self.frames = [self._frame(robot, contact) for contact in contacts]
+        self._measured = measured_components(self.contacts, sensors)
+
+    def _frame(self, robot: Robot, contact: Contact) -> tuple[int, Array]:
+        body, T_link_frame = robot.link(contact.frame)
+        return body, self.columns.tree.T_joint_link[body] @ T_link_frame
+
+    def plan(self, state: State) -> StatePlan:
+        """The plan of a contact state."""
+        touching: dict[int, list[int]] = {}
+        for contact, active in enumerate(state):
+            if active:
+                touching.setdefault(self.frames[contact][0], []).append(contact)
+        moving = {joint for body in touching for joint in self.columns.joints_above(body)}
+        measured = np.flatnonzero(self.sensors.torque).tolist()
+        mixed = tuple(joint for joint in measured if joint in moving)
+        bodies = tuple(self._contact_body(body, members, mixed) for body, members in touching.items())
+        noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
+        return StatePlan(
+            bodies,
+            mixed,
+            tuple(joint for joint in measured if joint not in moving),
+            self._support(mixed),
+            self._tensor(np.append(noise.base[:base_rows], np.full(len(mixed), noise.joint_torque))),
+            self._tensor(noise.wrench[[k for body in bodies for _, k in body.components]]),
+        )
+
+    def _support(self, mixed: tuple[int, ...]) -> tuple[int, ...]:
+        inertial = range(self.columns.layout.count)
+        if not self.columns.tree.base_rows:
+            rows = [self.columns.joint_rows[joint] for joint in mixed]
+            inertial = range(min((r.start for r in rows), default=0), max((r.end for r in rows), default=0))
+        return (*inertial, *sorted({column for joint in mixed for column in self.columns.friction_of(joint)}))
+
+    def _contact_body(self, body: int, contacts: list[int], mixed: tuple[int, ...]) -> ContactBody:
+        unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []
+        for contact in contacts:
+            at_body = wrench_map(self.frames[contact][1]).T
+            for k in self.contacts[contact].components:
+                if self._measured[contact, k]:
+                    measured.append(at_body[k][None])
+                    components.append((contact, k))
+                else:
+                    unmeasured.append(at_body[k][None])
+        _, values, Vh = np.linalg.svd(np.concatenate(unmeasured), full_matrices=False)
+        span = Vh[values > _DEPENDENT * max(values, default=0.0)]
+        above = set(self.columns.joints_above(body))
+        joints = tuple(place for place, joint in enumerate(mixed) if joint in above)
+        return ContactBody(body, self._tensor(span), self._tensor(np.concatenate(measured)), tuple(components), joints)
+
+    def _tensor(self, values: Array) -> Tensor:
+        ancestors = self.columns.tree.ancestors
+        return torch.tensor(values, dtype=ancestors.dtype, device=ancestors.device)
