@@ -138,7 +138,7 @@ def _resolve_mimics(path: Path, joints: list[Joint]) -> dict[str, Mimic]:
                 )
             seen.add(master.name)
         if master.type not in MOVING_TYPES:
-            message = f"{path}: joint '{joint.name}': its mimic master '{master.name}' is fixed, so it is held too"
+            message = f"{path}: joint '{joint.name}': its mimic master '{master.name}' is fixed, so it is held still too"
             warnings.warn(message, TorchidWarning, stacklevel=4)
         resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
     return resolved
@@ -174,8 +174,8 @@ def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None
         T_parent_joint=T_body_near if reverse else T_body_near @ _origin(joint),
         T_joint_link=_inverse(_origin(joint)) if reverse else np.eye(4),
         mimic=mimic,
-        damping=(joint.dynamics.damping or 0.0) if joint.dynamics else 0.0,
-        friction=(joint.dynamics.friction or 0.0) if joint.dynamics else 0.0,
+        damping=joint.dynamics.damping if joint.dynamics else 0.0,
+        friction=joint.dynamics.friction if joint.dynamics else 0.0,
     )
 
 

@@ -64,9 +64,14 @@ def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
         model = yourdfpy.URDF.load(
             io.BytesIO(etree.tostring(stripped)), build_scene_graph=False, load_meshes=False
         ).robot
+        for joint in model.joints:
+            if joint.dynamics is not None:  # left as text by yourdfpy
+                joint.dynamics.damping = float(joint.dynamics.damping or 0.0)
+                joint.dynamics.friction = float(joint.dynamics.friction or 0.0)
     except ValueError as error:
         raise UrdfError(path, "XML", f"a number cannot be read: {error}", "decimal numbers") from error
-    _check_values(path, model.links, model.joints)
+    _check_inertials(path, model.links)
+    _check_joint_values(path, model.joints)
     return model.links, model.joints
 
 
@@ -113,7 +118,7 @@ def _check_link(path: Path, link: etree._Element) -> None:
         raise UrdfError(path, field, f"no {', '.join(missing)}", "all six numbers of <inertia> [kg m^2]")
 
 
-def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
+def _check_inertials(path: Path, links: list[Link]) -> None:
     for link in links:
         if link.inertial is None:
             continue
@@ -125,8 +130,18 @@ def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
             raise UrdfError(path, field, "a number that is not finite", "finite numbers")
         if link.inertial.mass < 0.0:
             raise UrdfError(path, field, f"mass {link.inertial.mass:g} kg", "mass > 0, or 0 for a massless link")
+
+
+def _check_joint_values(path: Path, joints: list[Joint]) -> None:
     for joint in joints:
         field = f"joint '{joint.name}'"
+        if joint.mimic is not None and not np.isfinite([joint.mimic.multiplier, joint.mimic.offset]).all():
+            raise UrdfError(path, f"{field}, <mimic>", "a number that is not finite", "finite numbers")
+        if joint.dynamics is not None:
+            friction = np.array([joint.dynamics.damping, joint.dynamics.friction])
+            if not (np.isfinite(friction).all() and (friction >= 0.0).all()):
+                found = "damping {:g}, friction {:g}".format(*friction)
+                raise UrdfError(path, f"{field}, <dynamics>", found, "finite numbers of at least 0")
         if joint.origin is not None and not np.isfinite(joint.origin).all():
             raise UrdfError(path, f"{field}, <origin>", "a number that is not finite", "finite numbers")
         if joint.type in MOVING_TYPES:
