@@ -84,16 +84,25 @@ class ContactBody:
 class StatePlan:
     """A contact state: bodies in contact; measured joints that the projection mixes, and those it leaves alone.
 
-    `support`: columns in which mixed rows can differ from zero. `row_std`: noise of the base rows and mixed joints;
-    `wrench_std`: of the measured components, body by body.
+    `moved`: bodies that mixed joints move directly, ascending, with the joint's place among the mixed ones and the
+    ratio of its motion. `bodies`: on whose parameters mixed rows depend, by the columns `inertial` and `friction`.
+    `row_std`: noise of the base rows and mixed joints; `wrench_std`: of the measured components, body by body.
     """
 
     contact_bodies: tuple[ContactBody, ...]
     mixed_joints: tuple[int, ...]
     lone_joints: tuple[int, ...]
-    support: tuple[int, ...]
+    moved: tuple[tuple[int, int, float], ...]
+    bodies: range
+    inertial: range
+    friction: tuple[int, ...]
     row_std: Tensor
     wrench_std: Tensor
+
+    @property
+    def support(self) -> tuple[int, ...]:
+        """Columns of mixed rows."""
+        return (*self.inertial, *self.friction)
 
 
 class Planner:
@@ -121,22 +130,31 @@ class Planner:
         measured = np.flatnonzero(self.sensors.torque).tolist()
         mixed = tuple(joint for joint in measured if joint in moving)
         bodies = tuple(self._contact_body(body, members, mixed) for body, members in touching.items())
+        moved = sorted(
+            (body, place, ratio)
+            for place, joint in enumerate(mixed)
+            for body, ratio in self.columns.joint_rows[joint].moved
+        )
+        bodies_below, starts = self._bodies_below([body for body, _, _ in moved]), self.columns.layout.starts
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
         return StatePlan(
             bodies,
             mixed,
             tuple(joint for joint in measured if joint not in moving),
-            self._support(mixed),
+            tuple(moved),
+            bodies_below,
+            range(starts[bodies_below.start], starts[bodies_below.stop]),
+            tuple(self.columns.friction(body) + k for body, _, _ in moved for k in (0, 1)),
             self._tensor(np.append(noise.base[:base_rows], np.full(len(mixed), noise.joint_torque))),
             self._tensor(noise.wrench[[k for body in bodies for _, k in body.components]]),
         )
 
-    def _support(self, mixed: tuple[int, ...]) -> tuple[int, ...]:
-        inertial = range(self.columns.layout.count)
-        if not self.columns.tree.base_rows:
-            rows = [self.columns.joint_rows[joint] for joint in mixed]
-            inertial = range(min((r.start for r in rows), default=0), max((r.end for r in rows), default=0))
-        return (*inertial, *sorted({column for joint in mixed for column in self.columns.friction_of(joint)}))
+    def _bodies_below(self, moved: list[int]) -> range:
+        """Hull of the subtrees of some bodies; with a floating base, all bodies."""
+        tree = self.columns.tree
+        if tree.base_rows:
+            return range(tree.bodies)
+        return range(min(moved, default=0), max((tree.subtree_end[body] for body in moved), default=0))
 
     def _contact_body(self, body: int, contacts: list[int], mixed: tuple[int, ...]) -> ContactBody:
         unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []

@@ -53,8 +53,7 @@ def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Ten
 def contact_forces(builder: RowBuilder, samples: Samples, state: State, terms: ChunkTerms) -> Tensor:
     """J_C^T lambda, (nv, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
     tree = builder.tree
-    joints = range(tree.joint_map.shape[1])
-    total = samples.time.new_zeros(tree.base_rows + len(joints), len(samples))
+    total = samples.time.new_zeros(tree.base_rows + len(builder.columns.joint_rows), len(samples))
     for contact, active in enumerate(state):
         if active:
             body, T_joint_frame = builder.frames[contact]
@@ -62,7 +61,9 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: State, terms: C
             units = total.new_tensor(wrench_map(T_joint_frame).T[possible])
             components = builder.local_wrench(samples, contact, terms)[:, possible].T
             wrench = (wrenches_at_base(terms.states, body, units) * components).sum(1, keepdim=True)
-            total += generalized_forces(tree, terms.directions, body, wrench, joints)[0]
+            joints = builder.columns.joints_above(body)  # and no others, where an unmeasured force would be NaN
+            rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
+            total[rows] += generalized_forces(tree, terms.directions, body, wrench, joints)[0]
     return total
 
 

@@ -7,7 +7,7 @@ the columns they can touch.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -160,41 +160,44 @@ class RowBuilder(nn.Module):
         A_i^T times its wrench columns, with A_i the sum of W's rows along i's path, each carried by its screw axis. No
         joint row is ever formed. Columns are contiguous, as the factorization wants them.
         """
-        columns, layout, base_rows = self.columns, self.columns.layout, self.tree.base_rows
+        tree, layout, inertial = self.tree, self.columns.layout, plan.inertial
         X = workspace.zeros("projected", None, W, len(plan.support) + 1, *W.shape[1:])
-        by_body: dict[int, Tensor] = {0: W[:6] if base_rows else W.new_zeros(6, *W.shape[1:])}
-        mixed = {
-            moved: (place, ratio)
-            for place, joint in enumerate(plan.mixed_joints)
-            for moved, ratio in columns.joint_rows[joint].moved
-        }
-        first = plan.support[0] if plan.support else 0
-        friction = {column: place for place, column in enumerate(plan.support)}
-        for body in range(self.tree.bodies):
-            if body:
-                by_body[body] = by_body[self.tree.parents[body]]
-            if body in mixed:
-                place, ratio = mixed[body]
-                own = W[base_rows + place] * ratio
-                by_body[body] = torch.addcmul(by_body[body], terms.directions[:, body, None], own)
-                velocity, start = terms.joints.velocity[body], friction[columns.friction(body)]
-                torch.mul(own, torch.sign(velocity), out=X[start])
-                torch.mul(own, velocity, out=X[start + 1])
-            start, end = layout.starts[body] - first, layout.starts[body + 1] - first
-            if start >= 0 and end <= len(plan.support):
-                pulling = sum(column < parameters.INERTIA.start for column in layout.kept[body])
-                self._carry(terms.wrenches[:, start + first : end + first], by_body[body], pulling, X[start:end])
         torch.sum(W * f[:, None], dim=0, out=X[-1])
+        moved = {body: index for index, (body, _, _) in enumerate(plan.moved)}
+        own = W[self._index(tree.base_rows + place for _, place, _ in plan.moved)]
+        own *= own.new_tensor([ratio for _, _, ratio in plan.moved])[:, None, None]
+        velocity = terms.joints.velocity[self._index(moved)][:, None]
+        friction = X[len(inertial) : -1].unflatten(0, (len(moved), 2))
+        torch.mul(own, torch.sign(velocity), out=friction[:, 0])
+        torch.mul(own, velocity, out=friction[:, 1])
+
+        carried = workspace.zeros("carried", None, W, 6, tree.bodies, *W.shape[1:])
+        if tree.base_rows:
+            carried[:, 0] = W[:6]
+        for body in range(1, tree.bodies):
+            above = carried[:, tree.parents[body]]
+            if body in moved:
+                torch.addcmul(above, terms.directions[:, body, None], own[moved[body]], out=carried[:, body])
+            else:
+                carried[:, body] = above
+        for kept, bodies in layout.runs(plan.bodies):
+            if kept:
+                start, end = layout.starts[bodies.start], layout.starts[bodies.stop]
+                shape = (len(bodies), len(kept))
+                pulling = sum(column < parameters.INERTIA.start for column in kept)
+                columns = X[start - inertial.start : end - inertial.start].unflatten(0, shape)
+                wrenches = terms.wrenches[:, start:end].unflatten(1, shape)
+                self._carry(wrenches, carried[:, bodies.start : bodies.stop], pulling, columns)
         return X.flatten(1).T
 
     @staticmethod
     def _carry(wrenches: Tensor, carried: Tensor, pulling: int, out: Tensor) -> None:
-        """Write A^T w for wrench columns (6, c, B) into (c, r, B); only the first `pulling` columns have a force."""
-        torch.mul(wrenches[3][:, None], carried[3], out=out)
+        """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `pulling` columns have a force."""
+        torch.mul(wrenches[3].unsqueeze(2), carried[3].unsqueeze(1), out=out)
         for k in (4, 5):
-            out.addcmul_(wrenches[k][:, None], carried[k])
+            out.addcmul_(wrenches[k].unsqueeze(2), carried[k].unsqueeze(1))
         for k in (0, 1, 2):
-            out[:pulling].addcmul_(wrenches[k, :pulling, None], carried[k])
+            out[:, :pulling].addcmul_(wrenches[k, :, :pulling].unsqueeze(2), carried[k].unsqueeze(1))
 
     def _contact_rows(self, plan: StatePlan, terms: ChunkTerms) -> tuple[Tensor, Tensor]:
         """Unmeasured and measured contact rows on the base and the mixed joints, (B, k, base rows + mixed joints)."""
@@ -210,9 +213,12 @@ class RowBuilder(nn.Module):
                     at_base = wrenches_at_base(terms.states, contact.body, wrenches)
                     rows = generalized_forces(self.tree, terms.directions, contact.body, at_base, joints)
                     target = both[starts[kind] : starts[kind] + len(wrenches)]
-                    target.index_copy_(1, torch.tensor(columns, device=rows.device), rows)
+                    target.index_copy_(1, self._index(columns), rows)
                     starts[kind] += len(wrenches)
         return tuple(both.permute(2, 0, 1).split(sizes, dim=1))
+
+    def _index(self, places: Iterable[int]) -> Tensor:
+        return torch.tensor(list(places), dtype=torch.int64, device=self.device)
 
     def _measured_wrench(self, samples: Samples, plan: StatePlan, terms: ChunkTerms) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""

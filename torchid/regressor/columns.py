@@ -75,8 +75,5 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
 
 def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
     """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B)."""
-    components = [torch.stack([vector[axis] for vector in vectors], dim=1) for axis in range(3)]
-    turned = rotation.unsqueeze(3)
-    return torch.addcmul(
-        torch.addcmul(turned[:, 0] * components[0], turned[:, 1], components[1]), turned[:, 2], components[2]
-    )
+    components = torch.stack([torch.stack([vector[axis] for vector in vectors], dim=1) for axis in range(3)])
+    return rotate(rotation.unsqueeze(3), components)

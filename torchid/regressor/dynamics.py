@@ -7,7 +7,6 @@ of columns because bodies are in depth-first order.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import groupby
 
 import torch
 from torch import Tensor
@@ -59,11 +58,10 @@ def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | N
     """
     if out is None:
         out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
-    for kept, run in groupby(range(len(layout.kept)), key=lambda body: layout.kept[body]):
-        bodies = list(run)
+    for kept, bodies in layout.runs():
         if kept:
-            columns = out[:, layout.starts[bodies[0]] : layout.starts[bodies[-1] + 1]]
-            wrench_columns(states.run(bodies[0], bodies[-1] + 1), kept, columns.unflatten(1, (-1, len(kept))))
+            columns = out[:, layout.starts[bodies.start] : layout.starts[bodies.stop]]
+            wrench_columns(states.run(bodies.start, bodies.stop), kept, columns.unflatten(1, (-1, len(kept))))
     return out
 
 

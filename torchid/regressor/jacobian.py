@@ -40,9 +40,7 @@ def generalized_forces(
     """
     path = tree.path(body)
     screws = tree.joint_map[path][:, list(joints)].T @ directions[:, path]
-    torque = wrenches[0][:, None] * screws[0]
-    for axis in range(1, 6):
-        torque.addcmul_(wrenches[axis][:, None], screws[axis])
+    torque = (wrenches[:, :, None] * screws[:, None]).sum(0)
     return torch.cat([wrenches.transpose(0, 1), torque], dim=1) if tree.base_rows else torque
 
 

@@ -9,8 +9,10 @@ Source: Gautier and Khalil, "Direct calculation of minimum set of inertial param
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 
 import numpy as np
 
@@ -34,6 +36,12 @@ class ColumnLayout:
     def starts(self) -> list[int]:
         """First column of every body, then the total."""
         return [0, *np.cumsum([len(k) for k in self.kept]).tolist()]
+
+    def runs(self, bodies: range | None = None) -> Iterator[tuple[tuple[int, ...], range]]:
+        """Runs of consecutive bodies that keep the same columns, of all bodies or some: the columns, the bodies."""
+        for kept, run in groupby(bodies or range(len(self.kept)), key=lambda body: self.kept[body]):
+            members = list(run)
+            yield kept, range(members[0], members[-1] + 1)
 
     @property
     def count(self) -> int:

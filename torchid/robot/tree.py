@@ -138,8 +138,8 @@ def _resolve_mimics(path: Path, joints: list[Joint]) -> dict[str, Mimic]:
                 )
             seen.add(master.name)
         if master.type not in MOVING_TYPES:
-            message = f"{path}: joint '{joint.name}': its mimic master '{master.name}' is fixed, so it is held still too"
-            warnings.warn(message, TorchidWarning, stacklevel=4)
+            found = f"its mimic master '{master.name}' is fixed, so it is held still too"
+            warnings.warn(f"{path}: joint '{joint.name}': {found}", TorchidWarning, stacklevel=4)
         resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
     return resolved
 

@@ -99,7 +99,10 @@ class Projection(nn.Module):
             One group per contact state and rank, every sample in exactly one.
         """
         groups: list[ProjectedGroup] = []
-        states, which = torch.unique(active, dim=0, return_inverse=True)
+        if active.shape[1]:
+            states, which = torch.unique(active, dim=0, return_inverse=True)
+        else:
+            states, which = active[:1], torch.zeros(len(active), dtype=torch.int64, device=active.device)
         for number, state in enumerate(states):
             index = torch.nonzero(which == number)[:, 0]
             groups += self._state(index, state, J_C[index], K[index], torque[index], wrench[index])
