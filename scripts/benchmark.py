@@ -1,6 +1,6 @@
 """Time the regressor and the whole pipeline against a per-sample pipeline of Pinocchio and NumPy, in one run.
 
-    python scripts/benchmark.py [--samples 32768] [--repeats 5]
+    python scripts/benchmark.py [--samples 65536] [--repeats 5]
 
 Needs the packages pin and example-robot-data (extra `[oracle]`). Both pipelines start from the arrays of a log and end
 with parameters, `joints` sensors: torques measured, contact forces not, two thirds of the samples on all feet.
@@ -178,7 +178,7 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
         PerSample(urdf, robot, case),
         Regressor(robot),
     )
-    few = samples[torch.arange(0, count, 16)]
+    few = samples[torch.arange(0, count, 32)]
 
     def pipeline() -> None:
         LeastSquares().solve(linear_problem(compress([samples], builder), builder, robot))
@@ -214,7 +214,7 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
 def main() -> None:
     """Measure all robots and print one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=int, default=32768)
+    parser.add_argument("--samples", type=int, default=65536)
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
     table = Table(title=f"Median microseconds per sample, {torch.get_num_threads()} threads, float64")

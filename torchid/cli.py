@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
+from textwrap import fill
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning
 
@@ -71,7 +72,7 @@ def _identify(options: argparse.Namespace) -> None:
     print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
     print(f"total mass    {mass:.3f} kg (URDF: {robot.nominal[:, 0].sum():.3f} kg)")
     if robot.massless:
-        print(f"left out      massless: {', '.join(robot.massless)}")
+        print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
     timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
     print(f"time          {run.samples} samples: {timed}")
     print(f"written to    {run.experiment.config.output}")

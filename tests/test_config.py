@@ -1,0 +1,276 @@
+"""The experiment file: what is written is what is run, and a slip is named, never swallowed."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from torchid.config import ExperimentConfig, dump_config, load_config
+from torchid.errors import ConfigError, UnknownNameError
+
+LEAST: dict[str, Any] = {
+    "robot": {"urdf": "robot.urdf"}, "logs": {"train": ["a.npz"]}, "sensors": "full", "output": "out",
+}  # fmt: skip
+ALL: dict[str, Any] = {
+    "robot": {"urdf": "models/robot.urdf", "base_link": "pelvis", "fixed_base": True},
+    "contacts": [{"frame": "l_sole", "type": "flat"}, {"frame": "r_sole", "type": "line", "line_axis": "x"}],
+    "logs": {"train": ["a.npz", "/logs/b.h5"], "test": ["../c.csv"]},
+    "preprocessing": {"cutoff_hz": 20, "sample_rate_hz": 200.0},
+    "sensors": {
+        "joint_torques": ["hip", "knee"],
+        "contact_wrenches": {"l_sole": ["fx", "mz"], "r_sole": []},
+        "noise": {
+            **{"joint_torque": 0.1, "contact_force": 3.0, "contact_moment": 0.3},
+            **{"base_force": 1.5, "base_moment": 0.25},
+        },
+        "on_base_lost": "warn",
+    },
+    "estimator": {"name": "least_squares", "ridge": 1e-5, "rank_tolerance": 1e-7, "friction": False},
+    "output": "runs/all",
+    "device": "cuda:1",
+    "overwrite": True,
+}
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "experiments" / "experiment.yaml"
+    path.parent.mkdir()
+    return path
+
+
+def load(file: Path, settings: Any, *overrides: str) -> ExperimentConfig:
+    file.write_text(settings if isinstance(settings, str) else yaml.safe_dump(settings))
+    return load_config(file, overrides)
+
+
+def changed(**changes: Any) -> dict[str, Any]:
+    return LEAST | changes
+
+
+# ------------------------------------------------------------------------------------------------------------- values
+
+
+def test_the_least_experiment_has_four_keys_and_the_documented_defaults(file: Path) -> None:
+    config = load(file, LEAST)
+    assert config.robot.base_link is None
+    assert not config.robot.fixed_base
+    assert config.contacts == []
+    assert config.logs.test == []
+    assert config.preprocessing.cutoff_hz is config.preprocessing.sample_rate_hz is None
+    assert config.sensors.set == "full"
+    noise = config.sensors.noise
+    assert (noise.joint_torque, noise.contact_force, noise.contact_moment) == (0.5, 2.0, 0.2)
+    assert noise.base_force is noise.base_moment is None
+    assert config.sensors.on_base_lost == "error"
+    assert (config.estimator.name, config.estimator.ridge, config.estimator.friction) == ("least_squares", 0.0, True)
+    assert (config.device, config.overwrite) == ("cpu", False)
+
+
+def test_every_key_of_the_file_arrives(file: Path) -> None:
+    config = dataclasses.asdict(load(file, ALL))
+    assert config["sensors"].pop("set") is None
+    assert config["sensors"].pop("ft_sensors") == []
+    for name in ("contacts", "preprocessing", "sensors", "estimator", "device", "overwrite"):
+        expected = ALL[name]
+        if name == "contacts":
+            expected = [{"line_axis": "y"} | contact for contact in expected]
+        assert config[name] == expected
+    assert config["robot"]["base_link"] == "pelvis"
+    assert config["robot"]["fixed_base"] is True
+    assert config.keys() == ALL.keys()
+
+
+@pytest.mark.parametrize("settings", [LEAST, ALL], ids=["least", "all"])
+def test_what_a_run_writes_down_reads_back_as_itself_anywhere(file: Path, tmp_path: Path, settings: Any) -> None:
+    config = load(file, settings)
+    elsewhere = tmp_path / "elsewhere.yaml"
+    elsewhere.write_text(dump_config(config))
+    assert load_config(elsewhere) == config
+    assert dump_config(load_config(elsewhere)) == dump_config(config)
+
+
+@pytest.mark.parametrize("ridge", ["1e-4", "1E-4", "0.0001", "1.0e-04", "'1e-4'"])
+def test_numbers_may_be_written_as_people_write_them(file: Path, ridge: str) -> None:
+    """YAML 1.1 takes 1e-4, without a dot, for a string."""
+    text = yaml.safe_dump(LEAST) + f"estimator: {{ridge: {ridge}}}\n"
+    assert load(file, text).estimator.ridge == 1e-4
+    assert load(file, LEAST, f"estimator.ridge={ridge}").estimator.ridge == 1e-4
+
+
+@pytest.mark.parametrize("ridge", [0.0, 1e-300, 0.1, 1.0 / 3.0, 12345678.9, 1e22])
+def test_numbers_survive_to_the_last_bit(file: Path, ridge: float) -> None:
+    config = load(file, changed(estimator={"ridge": ridge}))
+    assert load(file, dump_config(config)).estimator.ridge == ridge
+
+
+# -------------------------------------------------------------------------------------------------------------- paths
+
+
+def test_paths_in_the_file_are_relative_to_it_and_not_to_the_caller(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "caller").mkdir()
+    monkeypatch.chdir(tmp_path / "caller")
+    monkeypatch.setenv("HOME", "/home/me")
+    config = load(file, ALL)
+    assert config.robot.urdf == file.parent / "models" / "robot.urdf"
+    assert config.logs.train == [file.parent / "a.npz", Path("/logs/b.h5")]
+    assert config.logs.test == [tmp_path / "c.csv"]
+    assert config.output == file.parent / "runs" / "all"
+    assert load(file, changed(output="~/runs")).output == Path("/home/me/runs")
+    load(file, ALL)
+    assert load_config(Path("../experiments/experiment.yaml")) == config
+
+
+def test_paths_in_overrides_are_relative_to_the_caller(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = load(file, ALL, "output=here", "logs.test=[x.npz, y/z.npz]", "robot.urdf=../r.urdf")
+    assert config.output == tmp_path / "here"
+    assert config.logs.test == [tmp_path / "x.npz", tmp_path / "y" / "z.npz"]
+    assert config.robot.urdf == tmp_path.parent / "r.urdf"
+    assert config.logs.train[0] == file.parent / "a.npz"
+    assert config.robot.base_link == "pelvis"
+
+
+# ----------------------------------------------------------------------------------------------- overrides and sensors
+
+
+def test_an_override_changes_its_key_and_no_other(file: Path) -> None:
+    before = dataclasses.asdict(load(file, ALL))
+    after = dataclasses.asdict(load(file, ALL, "estimator.ridge=0.25", "sensors.noise.contact_force=9", "device=cpu"))
+    before["estimator"]["ridge"], before["sensors"]["noise"]["contact_force"], before["device"] = 0.25, 9.0, "cpu"
+    assert after == before
+
+
+def test_an_override_may_add_what_the_file_leaves_out(file: Path) -> None:
+    config = load(file, LEAST, "preprocessing.cutoff_hz=8", "contacts=[{frame: sole, type: flat}]", "overwrite=true")
+    assert config.preprocessing.cutoff_hz == 8.0
+    assert config.contacts[0].frame == "sole"
+    assert config.overwrite
+    assert load(file, ALL, "preprocessing.cutoff_hz=null").preprocessing.cutoff_hz is None
+
+
+def test_a_set_of_sensors_is_short_for_a_mapping(file: Path) -> None:
+    for name in ("full", "contacts", "joints"):
+        assert load(file, changed(sensors=name)) == load(file, changed(sensors={"set": name}))
+        assert load(file, LEAST, f"sensors={name}") == load(file, LEAST, f"sensors.set={name}")
+
+
+def test_noise_joins_a_named_set_and_a_named_set_keeps_the_noise(file: Path) -> None:
+    config = load(file, LEAST, "sensors.noise.joint_torque=2")
+    assert (config.sensors.set, config.sensors.noise.joint_torque) == ("full", 2.0)
+    config = load(file, ALL, "sensors=contacts")
+    assert (config.sensors.set, config.sensors.joint_torques, config.sensors.contact_wrenches) == ("contacts", [], {})
+    assert config.sensors.noise.joint_torque == 0.1
+    assert config.sensors.on_base_lost == "warn"
+
+
+@pytest.mark.parametrize(
+    ("sensors", "found"),
+    [
+        ({}, "no sensor"),
+        ({"noise": {"joint_torque": 1.0}}, "no sensor"),
+        ({"set": "full", "joint_torques": ["hip"]}, "set: full together with sensors by name"),
+        ({"set": "joints", "contact_wrenches": {"sole": ["fx"]}}, "set: joints together with sensors by name"),
+        ({"set": "full", "ft_sensors": ["wrist"]}, "sensors.ft_sensors: limb-mounted sensors, which are not supported"),
+    ],
+)
+def test_sensors_that_contradict_themselves_are_refused(file: Path, sensors: Any, found: str) -> None:
+    with pytest.raises(ConfigError, match=found):
+        load(file, changed(sensors=sensors))
+
+
+# ------------------------------------------------------------------------------------------------------------ refusals
+
+
+@pytest.mark.parametrize(
+    ("settings", "place", "name", "nearest"),
+    [
+        (changed(contact=[]), "key", "contact", "contacts"),
+        (changed(sensor="full"), "key", "sensor", "sensors"),
+        (changed(robot={"urdf": "r", "baselink": "x"}), "robot", "baselink", "base_link"),
+        (changed(logs={"train": ["a"], "tests": []}), "logs", "tests", "test"),
+        (changed(preprocessing={"cutof_hz": 3}), "preprocessing", "cutof_hz", "cutoff_hz"),
+        (changed(sensors={"joint_torque": ["hip"]}), "sensors", "joint_torque", "joint_torques"),
+        (changed(sensors={"set": "full", "noise": {"contact_forces": 1}}), "sensors.noise", "contact_forces",
+         "contact_force"),
+        (changed(contacts=[{"frame": "a", "type": "flat"}, {"frme": "b"}]), "contacts.1", "frme", "frame"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_an_unknown_key_is_refused_by_its_place_and_the_nearest_that_exists(
+    file: Path, settings: Any, place: str, name: str, nearest: str
+) -> None:
+    with pytest.raises(UnknownNameError) as raised:
+        load(file, settings)
+    message = str(raised.value)
+    assert message.startswith(f"{file}: {place}: unknown name '{name}'; accepted: ")
+    assert nearest in message.split("accepted: ")[1].split(", ")
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("settings", "place", "found"),
+    [
+        (changed(robot="robot.urdf"), "robot", "'robot.urdf'"),
+        (changed(robot=None), "robot", "None"),
+        (changed(robot={"urdf": "r", "fixed_base": "perhaps"}), "robot.fixed_base", "'perhaps'"),
+        (changed(logs={"train": "a.npz"}), "logs.train", "a.npz"),
+        (changed(contacts={"frame": "a", "type": "flat"}), "contacts", "a mapping"),
+        (changed(contacts=[{"frame": "a", "type": "round"}]), "contacts.0.type", "'round'"),
+        (changed(contacts=["a"]), "contacts.0", "'a'"),
+        (changed(preprocessing={"cutoff_hz": "fast"}), "preprocessing.cutoff_hz", "'fast'"),
+        (changed(preprocessing={"cutoff_hz": -1}), "preprocessing.cutoff_hz", "-1"),
+        (changed(preprocessing={"sample_rate_hz": float("inf")}), "preprocessing.sample_rate_hz", "inf"),
+        (changed(sensors=3), "sensors", "3"),
+        (changed(sensors={"joint_torques": "hip"}), "sensors.joint_torques", "'hip'"),
+        (changed(sensors={"contact_wrenches": {"sole": ["fw"]}}), "sensors.contact_wrenches.sole.0", "'fw'"),
+        (changed(sensors={"set": "full", "noise": {"joint_torque": 0}}), "sensors.noise.joint_torque", "0"),
+        (changed(sensors={"set": "full", "on_base_lost": "ignore"}), "sensors.on_base_lost", "'ignore'"),
+        (changed(estimator="least_squares"), "estimator", "'least_squares'"),
+        (changed(estimator={"ridge": float("nan")}), "estimator.ridge", "nan"),
+        (changed(estimator={"ridge": True}), "estimator.ridge", "True"),
+        (changed(estimator={"rank_tolerance": 1.0}), "estimator.rank_tolerance", "1.0"),
+        (changed(device=3), "device", "3"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings: Any, place: str, found: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        load(file, settings)
+    message = str(raised.value)
+    assert message.startswith(f"{file}: {place}: ")
+    assert found in message
+    assert "accepted: " in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("key", LEAST)
+def test_each_of_the_four_keys_is_needed(file: Path, key: str) -> None:
+    with pytest.raises(ConfigError, match=f"{key}: missing"):
+        load(file, {name: value for name, value in LEAST.items() if name != key})
+
+
+@pytest.mark.parametrize("text", ["estimator.ridge", "output", "estimator.ridge=[1", "--ridge 3"])
+def test_an_override_that_is_none_is_refused(file: Path, text: str) -> None:
+    with pytest.raises(ConfigError, match="command line: .*accepted: key.subkey=value"):
+        load(file, LEAST, text)
+
+
+def test_a_file_that_cannot_be_read_is_named(file: Path) -> None:
+    with pytest.raises(ConfigError, match="experiment.yaml: file: cannot be read .*No such file"):
+        load_config(file)
+    with pytest.raises(ConfigError, match="file: cannot be read"):
+        load_config(file.parent)
+    with pytest.raises(ConfigError, match="YAML: not readable: .*duplicate key output"):
+        load(file, yaml.safe_dump(LEAST) + "output: again\n")
+    file.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="YAML: not readable"):
+        load_config(file)

@@ -1,0 +1,302 @@
+"""Parameters found on noise-free logs of a Pinocchio robot predict every force of motions that no fit has seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic import G1, ROBOTS, Array, Oracle, load, make_log, random_states
+
+from torchid import parameters
+from torchid.estimators import Estimate, LeastSquares
+from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem.compress import parameter_scale
+from torchid.problem.predict import force_series
+from torchid.problem.states import check_base, state_reports
+from torchid.regressor import Regressor
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors
+
+ANYMAL_B = ROBOTS / "anymal_b_simple_description/robots/anymal.urdf"
+TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
+SAMPLES, UNSEEN = 900, 200
+EXACT = 1e-12  # of the largest force; 3e-15 measured
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A robot, its feet, and the joints of the leg above the first foot."""
+
+    urdf: Path
+    feet: tuple[str, ...]
+    foot: str
+    leg: tuple[str, ...]
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        return tuple(Contact(frame, self.foot) for frame in self.feet)
+
+    @property
+    def states(self) -> list[list[bool]]:
+        """Every foot down, each lifted in turn, a trot for a quadruped, flight."""
+        count = len(self.feet)
+        one_lifted = [[foot != lifted for foot in range(count)] for lifted in range(count)]
+        trot = [[True, False, False, True]] if count == 4 else []
+        return [[True] * count, *one_lifted, *trot, [False] * count]
+
+
+LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+KINDS = {
+    "G1": Kind(
+        G1, ("left_ankle_roll_link", "right_ankle_roll_link"), "flat", tuple(f"left_{part}_joint" for part in LEG)
+    ),
+    "ANYmal": Kind(ANYMAL_B, ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT"), "point", ("LF_HAA", "LF_HFE", "LF_KFE")),
+    "Talos": Kind(
+        TALOS_FULL, ("left_sole_link", "right_sole_link"), "flat", tuple(f"leg_left_{k}_joint" for k in range(1, 7))
+    ),
+}
+
+
+@dataclass(frozen=True)
+class World:
+    """A true robot that differs from its URDF, and what was recorded of it."""
+
+    kind: Kind
+    robot: Robot
+    oracle: Oracle
+    logs: list[Samples]
+
+
+@cache
+def world(name: str) -> World:
+    """Made once per robot: the oracle's Python loops cost more than the fits."""
+    kind, rng = KINDS[name], np.random.default_rng(len(name))
+    robot = load(kind.urdf)
+    oracle = Oracle.of(robot)
+    oracle.perturb(rng, 0.2)
+    size = 3 if kind.foot == "point" else 6
+    contacts = [(frame, size) for frame in kind.feet]
+    logs = [make_log(oracle, contacts, kind.states, n, rng, f"{n}.npz") for n in (SAMPLES // 3, SAMPLES * 2 // 3)]
+    return World(kind, robot, oracle, [bind(log, robot, kind.contacts) for log in logs])
+
+
+def sensors_of(w: World, name: str) -> SensorSet:
+    """A named set; or the first foot's wrench and every torque but those of the leg above it."""
+    if name != "mixed":
+        return named_sensors(name, w.robot.n, len(w.kind.feet))
+    torques = [joint for joint in w.robot.joint_names if joint not in w.kind.leg]
+    contact = w.kind.contacts[0]
+    return chosen_sensors(w.robot.joint_names, w.kind.contacts, torques, {contact.frame: contact.component_names})
+
+
+def fit(w: World, sensors: SensorSet, logs: Sequence[Samples] | None = None, **options: int) -> Estimate:
+    """Least squares on logs whose unmeasured forces are not even numbers."""
+    builder = RowBuilder(w.robot, w.kind.contacts, sensors)
+    hidden = [hide(samples, sensors) for samples in logs or w.logs]
+    factor = compress(hidden, builder, **options)  # type: ignore[arg-type]
+    return LeastSquares().solve(linear_problem(factor, builder, w.robot))
+
+
+def hide(samples: Samples, sensors: SensorSet) -> Samples:
+    """NaN for all that the sensors do not measure: nothing can leak into the fit."""
+    assert samples.torque is not None
+    assert samples.wrench is not None
+    torque, wrench = samples.torque.clone(), samples.wrench.clone()
+    torque[:, ~torch.from_numpy(sensors.torque)] = torch.nan
+    wrench[:, ~torch.from_numpy(sensors.wrench)] = torch.nan
+    return replace(samples, torque=torque, wrench=wrench)
+
+
+@cache
+def found(name: str, sensors: str) -> Estimate:
+    return fit(world(name), sensors_of(world(name), sensors))
+
+
+@cache
+def unseen(name: str) -> tuple[Array, Array, Array]:
+    return random_states(np.random.default_rng(99), world(name).robot.n, UNSEEN)
+
+
+def predicted(robot: Robot, phi: Array, q: Array, v: Array, a: Array) -> Array:
+    """K phi, (B, nv), by the dense regressor."""
+    return (Regressor(robot)(*map(torch.from_numpy, (q, v, a))) @ torch.from_numpy(phi)).numpy()
+
+
+def driving(robot: Robot) -> set[str]:
+    """Joints that others mimic."""
+    return {body.joint.mimic.master for body in robot.bodies if body.joint and body.joint.mimic}
+
+
+def worst(found: Array, true: Array) -> float:
+    """Largest error over largest force among the base forces, base moments and joint torques."""
+    groups = [g for g in (slice(0, 3), slice(3, 6), slice(6, None)) if true[:, g].size]
+    return max(float(np.abs(found[:, g] - true[:, g]).max() / np.abs(true[:, g]).max()) for g in groups)
+
+
+robots = pytest.mark.parametrize("name", KINDS)
+
+
+@robots
+def test_the_recorded_forces_close_the_dynamics_in_every_contact_state_and_in_flight(name: str) -> None:
+    w = world(name)
+    builder = RowBuilder(w.robot, w.kind.contacts, sensors_of(w, "full"))
+    nominal = w.robot.nominal.flatten()
+    phi = found(name, "full").phi
+    measured, forces = force_series(builder, w.logs[0], np.stack([nominal, phi]))
+    assert worst(forces[1], measured) < EXACT
+    assert worst(forces[0], measured) > 0.02, "the URDF must be wrong for the test to mean anything"
+    states = {tuple(state) for samples in w.logs for state in samples.active.tolist()}
+    assert {tuple(state) for state in w.kind.states} == states
+
+
+@robots
+@pytest.mark.parametrize("sensors", ["full", "joints"])
+def test_torque_sensors_find_all_that_moves_the_robot(name: str, sensors: str) -> None:
+    w = world(name)
+    true = w.oracle.forces(*unseen(name))
+    assert worst(predicted(w.robot, found(name, sensors).phi, *unseen(name)), true) < EXACT
+
+
+@robots
+def test_contact_sensors_alone_find_all_inertial_forces_and_leave_friction_at_the_urdf(name: str) -> None:
+    w = world(name)
+    phi = found(name, "contacts").phi.reshape(-1, parameters.PER_BODY).copy()
+    np.testing.assert_allclose(phi[:, parameters.FRICTION], w.robot.nominal[:, parameters.FRICTION], atol=1e-12)
+    phi[:, parameters.FRICTION] = 0.0
+    forces = predicted(w.robot, phi.flatten(), *unseen(name))
+    true = w.oracle.frictionless_forces(*unseen(name))
+    seen = np.array([True] * 6 + [joint not in driving(w.robot) for joint in w.robot.joint_names])
+    assert worst(forces[:, seen], true[:, seen]) < EXACT
+    if not seen.all():  # mimic fingers that turn against each other: their common inertia never reaches the base
+        assert worst(forces, true) > 1e-7
+
+
+@robots
+def test_one_foots_wrench_and_the_other_legs_torques_find_all_but_friction_of_the_unmeasured_leg(name: str) -> None:
+    w = world(name)
+    leg = np.isin(w.robot.joint_names, w.kind.leg)
+    assert leg.sum() == len(w.kind.leg)
+    phi = found(name, "mixed").phi
+    measured = np.concatenate([np.ones(6, bool), ~leg])
+    true = w.oracle.forces(*unseen(name))
+    assert worst(predicted(w.robot, phi, *unseen(name))[:, measured], true[:, measured]) < EXACT
+    frictionless = phi.reshape(-1, parameters.PER_BODY).copy()
+    frictionless[:, parameters.FRICTION] = 0.0
+    true = w.oracle.frictionless_forces(*unseen(name))
+    assert worst(predicted(w.robot, frictionless.flatten(), *unseen(name)), true) < EXACT
+
+
+@robots
+@pytest.mark.parametrize("sensors", ["full", "joints", "contacts", "mixed"])
+def test_the_result_says_that_it_is_exact_and_that_the_urdf_was_not(name: str, sensors: str) -> None:
+    w = world(name)
+    estimate = found(name, sensors)
+    assert estimate.residual_std < 1e-11
+    assert np.sqrt(estimate.cost / estimate.nominal_cost) < 1e-12
+    reports = state_reports(w.logs, RowBuilder(w.robot, w.kind.contacts, sensors_of(w, sensors)))
+    check_base(reports)
+    assert {report.base_rank for report in reports} == {6}
+    assert sum(report.samples for report in reports) == SAMPLES
+
+
+@robots
+def test_base_parameters_are_the_true_ones_and_the_identifiable_among_all_too(name: str) -> None:
+    w = world(name)
+    estimate = found(name, "joints")
+    true = np.zeros((len(w.robot.bodies), parameters.PER_BODY))
+    true[:, parameters.INERTIAL] = w.oracle.inertial_parameters(w.robot)
+    order = [w.oracle.moving.index(body.joint.name) for body in w.robot.bodies if body.joint]
+    true[1:, parameters.FRICTION] = w.oracle.friction[order]
+    scale = parameter_scale(w.robot.nominal).flatten()
+    known = estimate.identifiable
+    assert known.sum() > 2 * w.robot.n
+    np.testing.assert_allclose((estimate.phi - true.flatten())[known] / scale[known], 0.0, rtol=0, atol=1e-10)
+    nominal = w.robot.nominal.flatten()
+    bounds = np.linalg.norm((true.flatten() - nominal) / scale)
+    assert np.linalg.norm((estimate.phi - nominal) / scale) <= bounds, "of all exact answers, the nearest to the URDF"
+
+
+# ---------------------------------------------------------------------------------------------- how it is computed
+
+
+@cache
+def noisy_logs() -> tuple[Samples, ...]:
+    """ANYmal's logs with noise: an inconsistent system hides nothing."""
+    generator = torch.Generator().manual_seed(5)
+    logs = []
+    for samples in world("ANYmal").logs:
+        assert samples.torque is not None
+        assert samples.wrench is not None
+        torque = samples.torque + 0.5 * torch.randn(samples.torque.shape, generator=generator, dtype=torch.float64)
+        wrench = samples.wrench + 2.0 * torch.randn(samples.wrench.shape, generator=generator, dtype=torch.float64)
+        logs.append(replace(samples, torque=torque, wrench=wrench))
+    return tuple(logs)
+
+
+def merged(w: World, sensors: SensorSet, logs: Sequence[Samples]) -> Estimate:
+    """Each log in a factor of its own."""
+    builder = RowBuilder(w.robot, w.kind.contacts, sensors)
+    total, *others = [compress([hide(samples, sensors)], builder) for samples in logs]
+    for other in others:
+        total.merge(other)
+    return LeastSquares().solve(linear_problem(total, builder, w.robot))
+
+
+def pieces(logs: Sequence[Samples]) -> list[Samples]:
+    """The logs in pieces of unequal length, one of a single sample."""
+    cuts = (0, 1, 100, 250, None)
+    return [samples[slice(*ends)] for samples in logs for ends in zip(cuts, cuts[1:], strict=False)]
+
+
+def shuffled(logs: Sequence[Samples]) -> list[Samples]:
+    generator = torch.Generator().manual_seed(6)
+    return [samples[torch.randperm(len(samples), generator=generator)] for samples in logs]
+
+
+Way = Callable[[World, SensorSet], Estimate]
+WAYS: dict[str, Way] = {
+    "chunks of 7": lambda w, s: fit(w, s, noisy_logs(), chunk=7),
+    "chunks of 64": lambda w, s: fit(w, s, noisy_logs(), chunk=64),
+    "chunks of 300": lambda w, s: fit(w, s, noisy_logs(), chunk=300),
+    "one thread": lambda w, s: fit(w, s, noisy_logs(), threads=1),
+    "two threads": lambda w, s: fit(w, s, noisy_logs(), threads=2),
+    "five threads": lambda w, s: fit(w, s, noisy_logs(), threads=5, chunk=64),
+    "logs reversed": lambda w, s: fit(w, s, noisy_logs()[::-1]),
+    "samples shuffled": lambda w, s: fit(w, s, shuffled(noisy_logs())),
+    "logs cut in pieces": lambda w, s: fit(w, s, pieces(noisy_logs())),
+    "factors merged": lambda w, s: merged(w, s, pieces(noisy_logs())),
+}
+
+
+@cache
+def usual(sensors: str) -> Estimate:
+    return fit(world("ANYmal"), sensors_of(world("ANYmal"), sensors), noisy_logs(), chunk=2048)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("sensors", ["joints", "mixed"])
+def test_how_samples_are_cut_ordered_and_shared_out_does_not_change_the_result(way: str, sensors: str) -> None:
+    w = world("ANYmal")
+    expected, estimate = usual(sensors), WAYS[way](w, sensors_of(w, sensors))
+    scale = parameter_scale(w.robot.nominal).flatten()
+    assert np.linalg.norm((estimate.phi - expected.phi) / scale) < 1e-9 * np.linalg.norm(expected.phi / scale)
+    forces = predicted(w.robot, expected.phi, *unseen("ANYmal"))
+    assert worst(predicted(w.robot, estimate.phi, *unseen("ANYmal")), forces) < 1e-9
+    assert (estimate.rows, estimate.rank) == (expected.rows, expected.rank)
+    assert estimate.cost == pytest.approx(expected.cost, rel=1e-10)
+    np.testing.assert_array_equal(estimate.identifiable, expected.identifiable)
+    known = expected.identifiable
+    np.testing.assert_allclose(estimate.standard_error[known], expected.standard_error[known], rtol=1e-8)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_threads_are_given_back(threads: int) -> None:
+    before = torch.get_num_threads()
+    w = world("ANYmal")
+    fit(w, sensors_of(w, "full"), [w.logs[0][:50]], threads=threads)
+    assert torch.get_num_threads() == before

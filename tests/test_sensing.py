@@ -1,0 +1,266 @@
+"""The projection: what is not measured leaves no trace, what is left is exact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache, cached_property
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic import ANYMAL, G1, SOLO12, Array, load, random_states
+from torch import Tensor
+
+from torchid.regressor import FrameJacobian
+from torchid.robot import Robot
+from torchid.sensing import Contact, ProjectedGroup, Projection
+
+FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]
+SOLOS_FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
+robot_of = cache(load)
+seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=20, deadline=None, derandomize=True)
+
+
+def numpy_projector(A: Array) -> tuple[Array, float]:
+    """Onto the null space of one matrix (k, m), and the rounding to expect of it, which grows with A's condition."""
+    _, values, Vh = np.linalg.svd(A)
+    kept = values[values > 1e-9 * max(values, default=0.0)]
+    return Vh[len(kept) :].T @ Vh[len(kept) :], 1e-14 * float(kept[0] / kept[-1] if len(kept) else 1.0)
+
+
+# ------------------------------------------------------------------------------------------------------- projection
+
+
+class Scene:
+    """Random postures and forces of a robot in random contact states."""
+
+    def __init__(self, robot: Robot, contacts: Sequence[Contact], seed: int, samples: int = 12) -> None:
+        rng = np.random.default_rng(seed)
+        self.q, _, _ = map(torch.from_numpy, random_states(rng, robot.n, samples))
+        self.robot, self.contacts = robot, contacts
+        self.components = [(c, k) for c, contact in enumerate(contacts) for k in contact.components]
+        self.touching = torch.from_numpy(rng.random((samples, len(contacts))) < 0.5)
+        self.K = torch.from_numpy(rng.normal(size=(samples, robot.nv, 9)))
+        self.torque = torch.from_numpy(20.0 * rng.normal(size=(samples, robot.n)))
+        self.wrench = torch.from_numpy(50.0 * rng.normal(size=(samples, len(self.components))))
+
+    @cached_property
+    def J(self) -> Tensor:
+        frames = [FrameJacobian(self.robot, contact.frame)(self.q) for contact in self.contacts]
+        rows = [frames[c][:, k] for c, k in self.components]
+        return torch.stack(rows, dim=1) if rows else torch.zeros(len(self.q), 0, self.robot.nv, dtype=torch.float64)
+
+    @property
+    def active(self) -> Tensor:
+        return self.touching[:, [c for c, _ in self.components]]
+
+    def project(self, projection: Projection) -> list[ProjectedGroup]:
+        return projection(self.J, self.active, self.K, self.torque, self.wrench)
+
+    def expected(self, sample: int, torque: Array, wrench: Array) -> tuple[Array, float, Array]:
+        """Projector (nv, nv), its rounding, and measured force (nv,) of one sample, from the masks, by numpy."""
+        J, active = self.J[sample].numpy(), self.active[sample].numpy()
+        S = np.eye(self.robot.nv)[6:]
+        f = S[torque].T @ self.torque[sample].numpy()[torque]
+        f += J[active & wrench].T @ self.wrench[sample].numpy()[active & wrench]
+        return *numpy_projector(np.vstack([S[~torque], J[active & ~wrench]])), f
+
+
+def check(scene: Scene, torque: Array, wrench: Array) -> list[ProjectedGroup]:
+    """The projection of every sample equals numpy's, which knows no batch, state or rank."""
+    groups = scene.project(Projection(torque, wrench))
+    assert sorted(torch.cat([group.index for group in groups]).tolist()) == list(range(len(scene.q)))
+    for group in groups:
+        for i, sample in enumerate(group.index.tolist()):
+            P, rounding, f = scene.expected(sample, torque, wrench)
+            V, K, size = group.V[i].numpy(), scene.K[sample].numpy(), np.abs(f).max()
+            np.testing.assert_allclose(V @ V.T, P, rtol=0.0, atol=rounding)
+            np.testing.assert_allclose(V @ group.K[i].numpy(), P @ K, rtol=0.0, atol=10.0 * rounding)
+            np.testing.assert_allclose(V @ group.f[i].numpy(), P @ f, rtol=0.0, atol=10.0 * rounding * size)
+            assert group.base_rank[i] == np.linalg.matrix_rank(P[:6], tol=1e-6)
+            np.testing.assert_array_equal(group.active, scene.active[sample])
+    return groups
+
+
+@few
+@given(seed=seeds)
+def test_any_sensors_project_as_sample_by_sample_with_numpy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    robot, kind = robot_of(ANYMAL), rng.choice(["point", "line", "flat"])
+    scene = Scene(robot, [Contact(foot.frame, kind) for foot in FEET], seed)
+    share = rng.random(2)
+    check(scene, rng.random(robot.n) < share[0], rng.random(len(scene.components)) < share[1])
+
+
+def test_with_everything_measured_nothing_is_projected() -> None:
+    scene = Scene(robot_of(ANYMAL), FEET, 1)
+    for group in check(scene, np.ones(12, bool), np.ones(12, bool)):
+        torch.testing.assert_close(group.V, torch.eye(18, dtype=torch.float64).expand_as(group.V), rtol=0, atol=0)
+        torch.testing.assert_close(group.K, scene.K[group.index], rtol=0, atol=0)
+        assert (group.base_rank == 6).all()
+
+
+def test_contact_sensors_leave_the_base_rows_and_nothing_else() -> None:
+    for group in check(Scene(robot_of(ANYMAL), FEET, 2), np.zeros(12, bool), np.ones(12, bool)):
+        assert group.V.shape[1:] == (18, 6)
+        assert not group.V[:, 6:].any()
+
+
+def test_without_sensors_each_foot_on_the_ground_hides_more_of_the_base() -> None:
+    """Points on the ground leave a body 6, 3, 1 and 0 ways to move."""
+    scene = Scene(robot_of(ANYMAL), FEET, 3, samples=40)
+    left = {0: 6, 1: 3, 2: 1, 3: 0, 4: 0}
+    seen = set()
+    for group in check(scene, np.zeros(12, bool), np.zeros(12, bool)):
+        feet = int(group.active.sum()) // 3
+        seen.add(feet)
+        assert group.V.shape[2] == left[feet]
+        assert group.K.shape[1:] == (left[feet], 9)
+        assert (group.base_rank == left[feet]).all()
+    assert seen == set(left)
+
+
+def test_without_contacts_a_robot_flies_in_one_state() -> None:
+    (group,) = check(Scene(robot_of(ANYMAL), [], 4), np.ones(12, bool), np.zeros(0, bool))
+    assert group.V.shape == (12, 18, 18)
+    (group,) = check(Scene(robot_of(ANYMAL), [], 4), np.zeros(12, bool), np.zeros(0, bool))
+    assert group.V.shape == (12, 18, 6)
+
+
+def test_no_samples_make_no_groups() -> None:
+    assert Scene(robot_of(ANYMAL), FEET, 4, samples=0).project(Projection([True] * 12, [False] * 12)) == []
+
+
+def test_a_bolted_base_has_no_rows_and_no_base_to_lose() -> None:
+    rng = np.random.default_rng(5)
+    K, torque, J = (torch.from_numpy(rng.normal(size=size)) for size in ((5, 4, 2), (5, 4), (5, 2, 4)))
+    active, unread = torch.ones(5, 2, dtype=torch.bool), torch.full((5, 2), torch.nan, dtype=torch.float64)
+    (group,) = Projection([True] * 4, [False, False], base_rows=0)(J, active, K, torque, unread)
+    assert group.V.shape == (5, 4, 2)
+    assert not group.base_rank.any()
+    for sample in range(5):
+        P, rounding = numpy_projector(J[sample].numpy())
+        f = (group.V[sample] @ group.f[sample]).numpy()
+        np.testing.assert_allclose(f, P @ torque[sample].numpy(), rtol=0.0, atol=10.0 * rounding)
+
+
+# --------------------------------------------------------------------------------------------------- lost directions
+
+
+def test_four_points_on_a_rigid_foot_hide_what_a_flat_foot_hides() -> None:
+    scene = Scene(load(G1), [Contact("left_ankle_roll_link", "flat")], 6)
+    scene.touching[:] = True
+    torque, nothing = np.ones(29, bool), np.zeros(6, bool)
+    (flat,) = check(scene, torque, nothing)
+    points = torch.tensor([[0.1, 0.05, -0.03], [0.1, -0.05, -0.03], [-0.1, 0.05, -0.03], [-0.1, -0.05, -0.03]])
+    twist = scene.J
+    J = torch.cat(
+        [twist[:, :3] - torch.linalg.cross(p.to(twist).view(1, 3, 1), twist[:, 3:], dim=1) for p in points], 1
+    )
+    project = Projection(torque, np.zeros(12, bool))
+    active, unread = torch.ones(12, 12, dtype=torch.bool), torch.full((12, 12), torch.nan, dtype=torch.float64)
+    (group,) = project(J, active, scene.K, scene.torque, unread)
+    assert group.V.shape == flat.V.shape == (12, 35, 29)
+    torch.testing.assert_close(group.V @ group.V.mT, flat.V @ flat.V.mT, rtol=0.0, atol=1e-13)
+    torch.testing.assert_close(group.V @ group.K, flat.V @ flat.K, rtol=0.0, atol=1e-12)
+
+
+def test_each_straight_knee_hides_one_direction_of_the_base_from_the_torques() -> None:
+    """A force in the plane of hip and straight knee, along the leg, does no work on the leg's joints."""
+    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 7, samples=16)
+    scene.touching[:] = True
+    rng = np.random.default_rng(7)
+    straight = torch.from_numpy(rng.random((16, 4)) < 0.5)
+    scene.q[:, [9, 12, 15, 18]] *= ~straight  # the knees
+    found = {}
+    for group in check(scene, np.ones(12, bool), np.zeros(12, bool)):
+        found |= dict(zip(group.index.tolist(), group.base_rank.tolist(), strict=True))
+    assert [found[sample] for sample in range(16)] == (6 - straight.sum(1)).tolist()
+    assert len(set(found.values())) > 3
+
+
+def test_samples_that_lose_rank_share_a_batch_with_others() -> None:
+    """Without hip-roll sensors, four straight parallel legs can push up and sideways, 8 ways, in a plane: 3 unseen."""
+    scene = Scene(robot_of(SOLO12), SOLOS_FEET, 8, samples=16)
+    scene.touching[:] = True
+    straight = [0, 5, 6, 15]
+    scene.q[straight, 7:] = 0.0
+    torque = np.array(["HAA" not in name for name in scene.robot.joint_names])
+    rank = {}
+    for group in check(scene, torque, np.zeros(12, bool)):
+        rank |= dict.fromkeys(group.index.tolist(), 18 - group.V.shape[2])
+    assert {rank[sample] for sample in straight} == {13}
+    assert {rank[sample] for sample in set(rank) - set(straight)} == {16}
+
+
+# ------------------------------------------------------------------------------------------------- noise, leaks, grads
+
+
+def noises(scene: Scene, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    return rng.uniform(0.1, 2.0, 12), rng.uniform(0.5, 5.0, len(scene.components)), rng.uniform(0.1, 1.0, 6)
+
+
+@few
+@given(seed=seeds)
+def test_whitened_rows_have_unit_noise_and_span_the_same_equations(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene, share = Scene(robot_of(ANYMAL), FEET, seed), rng.random(2)
+    torque, wrench = rng.random(12) < share[0], rng.random(12) < share[1]
+    torque_std, wrench_std, base_std = noises(scene, rng)
+    project = Projection(torque, wrench, 6, *map(torch.from_numpy, (torque_std, wrench_std, base_std)))
+    for group in scene.project(project):
+        for i, sample in enumerate(group.index.tolist()):
+            J = (scene.J[sample].numpy() * wrench_std[:, None])[scene.active[sample].numpy() & wrench]
+            covariance = np.diag(np.concatenate([base_std, torque_std]) ** 2) + J.T @ J
+            P, rounding, f = scene.expected(sample, torque, wrench)
+            V = group.V[i].numpy()
+            assert V.shape[1] == round(np.trace(P))
+            np.testing.assert_allclose(V.T @ covariance @ V, np.eye(V.shape[1]), rtol=0.0, atol=1e-12)
+            size = np.abs(V).max(initial=0.0)
+            np.testing.assert_allclose(P @ V, V, rtol=0.0, atol=10.0 * rounding * size)
+            np.testing.assert_allclose(group.K[i], V.T @ scene.K[sample].numpy(), rtol=0.0, atol=1e-13 * size)
+            np.testing.assert_allclose(group.f[i], V.T @ f, rtol=0.0, atol=1e-13 * size * np.abs(f).max())
+
+
+def test_noise_is_given_whole_or_not_at_all() -> None:
+    with pytest.raises(ValueError, match="all three or none"):
+        Projection([True], [True], torque_noise=0.5)
+    with pytest.raises(ValueError, match="all three or none"):
+        Projection([True], [True], torque_noise=0.5, wrench_noise=1.0)
+
+
+@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
+def test_what_is_not_measured_or_does_not_touch_never_reaches_the_result(noise: float | None) -> None:
+    rng = np.random.default_rng(9)
+    scene = Scene(robot_of(ANYMAL), FEET, 9)
+    torque, wrench = rng.random(12) < 0.5, rng.random(12) < 0.5
+    project = Projection(torque, wrench, 6, noise, noise, noise)
+    expected = scene.project(project)
+    scene.torque[:, ~torque] = torch.nan
+    scene.wrench[:, ~wrench] = torch.nan
+    scene.wrench[~scene.active] = torch.nan
+    scene.wrench.requires_grad_()
+    for group, other in zip(scene.project(project), expected, strict=True):
+        torch.testing.assert_close(group.f, other.f, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(group.K, other.K, rtol=0.0, atol=0.0)
+    sum(group.f.sum() for group in scene.project(project)).backward()
+    assert scene.wrench.grad is not None
+    assert not scene.wrench.grad[~(scene.active & torch.from_numpy(wrench))].any()
+
+
+@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
+def test_gradients_flow_through_regressor_and_measured_forces(noise: float | None) -> None:
+    scene = Scene(robot_of(ANYMAL), FEET, 10, samples=3)
+    project = Projection([True] * 6 + [False] * 6, [True] * 3 + [False] * 9, 6, noise, noise, noise)
+    weights = torch.randn(9, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def projected(K: Tensor, torque: Tensor, wrench: Tensor) -> Tensor:
+        groups = project(scene.J, scene.active, K @ weights, torque, wrench)
+        return torch.cat([torch.cat([group.K, group.f[..., None]], dim=2).flatten() for group in groups])
+
+    assert torch.autograd.gradcheck(
+        projected, [x.clone().requires_grad_() for x in (scene.K, scene.torque, scene.wrench)], fast_mode=True
+    )
