@@ -17,9 +17,18 @@ from pydantic.dataclasses import dataclass
 from torchid.errors import ConfigError, UnknownNameError
 
 _STRICT = ConfigDict(extra="forbid")
-_PATHS = (("robot", "urdf"), ("logs", "train"), ("logs", "test"), ("output",))
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+_PATHS = (("robot", "urdf", False), ("logs", "train", True), ("logs", "test", True))  # and whether it is a list
+
+
+def _no_flag(value: object) -> object:
+    if isinstance(value, bool):
+        raise ValueError("a number")  # and not 1.0 for `true`
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_no_flag), Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
 Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
 
 
@@ -86,7 +95,7 @@ class EstimatorConfig:
 
     name: Literal["least_squares"] = "least_squares"
     ridge: NotNegative = 0.0
-    rank_tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-10
+    rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
     friction: bool = True
 
 
@@ -171,17 +180,18 @@ def _absolute(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """The settings with paths made absolute; anything that is not a path where one belongs is left to the checks."""
 
     def resolved(value: object) -> object:
-        if isinstance(value, str):
-            return os.path.normpath(folder / Path(value).expanduser())
+        return os.path.normpath(folder / Path(value).expanduser()) if isinstance(value, str) else value
+
+    def all_resolved(value: object) -> object:
         return [resolved(item) for item in value] if isinstance(value, list) else value
 
     settings = dict(settings)
-    for key, *below in _PATHS:
-        value = settings.get(key)
-        if below and isinstance(value, Mapping) and below[0] in value:
-            settings[key] = {**value, below[0]: resolved(value[below[0]])}
-        elif not below and key in settings:
-            settings[key] = resolved(value)
+    for section, key, many in _PATHS:
+        value = settings.get(section)
+        if isinstance(value, Mapping) and key in value:
+            settings[section] = {**value, key: all_resolved(value[key]) if many else resolved(value[key])}
+    if "output" in settings:
+        settings["output"] = resolved(settings["output"])
     return settings
 
 
@@ -212,7 +222,10 @@ def _in_one_line(path: Path, error: ValidationError) -> ConfigError | UnknownNam
         return ConfigError(path, field, f"found {shown}", f"a mapping with {', '.join(_keys_at(place))}")
     if first["type"] == "too_short":
         return ConfigError(path, field, "an empty list", "at least one item")
-    return ConfigError(path, field, f"found {shown}", first["msg"].removeprefix("Input should be "))
+    if first["type"] == "path_type":
+        return ConfigError(path, field, f"found {shown}", "a path")
+    accepted = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return ConfigError(path, field, f"found {shown}", accepted)
 
 
 def _keys_at(place: list[str]) -> list[str]:

@@ -11,6 +11,8 @@ from torchid.estimators.result import Estimate
 from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 
+_HIDDEN = 1e-6  # far above rounding (1e-10 on a humanoid) and below any share found in a robot (1e-4)
+
 
 @dataclass(frozen=True)
 class LeastSquares:
@@ -26,6 +28,13 @@ class LeastSquares:
     ridge: float = 0.0
     rank_tolerance: float = 1e-10
 
+    def __post_init__(self) -> None:
+        """Check the weights."""
+        if not (np.isfinite(self.ridge) and self.ridge >= 0.0):
+            raise ValueError(f"ridge: found {self.ridge}; accepted: a finite number of at least 0")
+        if not 0.0 < self.rank_tolerance < 1.0:
+            raise ValueError(f"rank_tolerance: found {self.rank_tolerance}; accepted: a number between 0 and 1")
+
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters.
 
@@ -36,12 +45,13 @@ class LeastSquares:
         A = problem.A[:, free] * scale
         b = problem.b - problem.A @ problem.nominal
         pinv, values, rank = _pseudo_inverse(A, self.rank_tolerance)
-        resolution = np.einsum("ij,ji->i", pinv, A)
+        hidden = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # share in directions that no row sees
         gain = pinv
         if self.ridge > 0.0:
             pull = np.sqrt(self.ridge * problem.rows)
             stacked = np.vstack([A, pull * np.eye(A.shape[1])])
             gain = _pseudo_inverse(stacked, 0.0)[0][:, : len(b)]
+            gain = pinv @ (A @ gain)  # what no row sees stays nominal: a tiny pull would leave it to rounding
         step = gain @ b
 
         phi = problem.nominal.copy()
@@ -49,7 +59,7 @@ class LeastSquares:
         cost = problem.cost(phi)
         noise = cost / max(problem.rows - rank, 1)
         identifiable = np.zeros(len(phi), dtype=bool)
-        identifiable[free] = resolution > 1.0 - 1e-6
+        identifiable[free] = hidden < _HIDDEN
         standard_error = np.full(len(phi), np.nan)
         standard_error[free] = np.sqrt(noise) * scale * np.linalg.norm(gain, axis=1)
         standard_error[~identifiable] = np.nan

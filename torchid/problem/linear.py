@@ -31,13 +31,18 @@ class LinearProblem:
     free: np.ndarray
 
     def __post_init__(self) -> None:
-        """Check that the shapes belong together."""
+        """Check that the shapes belong together and that every number is one."""
         rows, columns = self.A.shape
         shapes = (self.b.shape, self.nominal.shape, self.scale.shape, self.free.shape)
         if shapes != ((rows,), (columns,), (columns,), (columns,)):
             raise ValueError(
                 f"b, nominal, scale, free: found shapes {shapes}; accepted: {rows} rows, {columns} columns"
             )
+        for name in ("A", "b", "residual", "nominal", "scale"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name}: found a number that is not finite; accepted: finite numbers")
+        if not (self.scale > 0.0).all():
+            raise ValueError("scale: found a number that is not positive; accepted: positive numbers")
 
     def cost(self, phi: Array) -> float:
         """Sum of squared whitened residuals over all rows at parameters `phi`, (P,)."""
