@@ -253,7 +253,7 @@ def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest
 def test_a_failure_that_is_no_bad_input_exits_1_without_a_traceback(
     experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full_disk(*_: object) -> None:
+    def full_disk(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("json.dumps", full_disk)

@@ -489,9 +489,8 @@ def test_stamps_that_nearly_coincide_are_worth_a_warning() -> None:
     assert Path(caught[0].filename) == Path(__file__)
 
 
-def test_an_orientation_without_any_linear_motion_is_refused() -> None:
-    with pytest.raises(LogError, match=r"base_linear_acceleration_world: missing.*base_position_world"):
-        preprocess(moving_log(uniform()))
+def test_an_orientation_alone_says_how_a_bolted_base_is_mounted_and_no_more() -> None:
+    assert preprocess(moving_log(uniform())).base_linear_acceleration_world is None
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
