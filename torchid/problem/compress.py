@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torchid.problem.linear import LinearProblem
 from torchid.problem.plan import State
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.problem.threads import share_out, worker_count
 from torchid.problem.triangular import TriangularFactor
 from torchid.problem.workspace import Workspace
 from torchid.robot import Robot
@@ -57,35 +57,23 @@ def compress(
         progress: called with the number of samples done since the last call.
     """
     device = builder.device
-    if threads is None:
-        threads = torch.get_num_threads() if device.type == "cpu" else 1
     work = [(samples, state, index) for samples in logs for state, index in by_state(samples, chunk)]
     for _, state, _ in work:
         builder.plan(state)
     lock = threading.Lock()
 
     def run(part: Sequence[tuple[Samples, State, slice | torch.Tensor]]) -> TriangularFactor:
-        if threads > 1:
-            torch.set_num_threads(1)
         factor, workspace = TriangularFactor(builder.columns.count), Workspace()
-        with torch.no_grad():
-            for samples, state, index in part:
-                piece = samples[index].to(device)
-                for support, rows in builder.rows(piece, state, workspace):
-                    factor.add(support, rows)
-                if progress is not None:
-                    with lock:
-                        progress(len(piece))
+        for samples, state, index in part:
+            piece = samples[index].to(device)
+            for support, rows in builder.rows(piece, state, workspace):
+                factor.add(support, rows)
+            if progress is not None:
+                with lock:
+                    progress(len(piece))
         return factor
 
-    if threads == 1:
-        return run(work)
-    before = torch.get_num_threads()
-    try:
-        with ThreadPoolExecutor(threads) as pool:
-            factors = list(pool.map(run, [work[i::threads] for i in range(threads)]))
-    finally:
-        torch.set_num_threads(before)
+    factors = share_out(work, run, threads or worker_count(device))
     for other in factors[1:]:
         factors[0].merge(other)
     return factors[0]

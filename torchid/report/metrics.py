@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ from torchid.problem.plan import State
 from torchid.problem.predict import forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.threads import one_thread
+from torchid.problem.threads import share_out, worker_count
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import named_sensors
@@ -72,6 +73,22 @@ class _Squares:
         return float(np.sqrt(self.sum[rows].sum() / count)) if count else np.nan
 
 
+class _Sums:
+    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space."""
+
+    def __init__(self, nv: int) -> None:
+        self.rows, self.projected = _Squares(nv), _Squares(1)
+
+    @classmethod
+    def total(cls, parts: Sequence[_Sums]) -> _Sums:
+        out = cls(len(parts[0].rows.sum))
+        for part in parts:
+            for mine, other in ((out.rows, part.rows), (out.projected, part.projected)):
+                mine.sum += other.sum
+                mine.count += other.count
+        return out
+
+
 class Evaluation:
     """Evaluates several parameter vectors at once, in one pass over the logs."""
 
@@ -84,24 +101,30 @@ class Evaluation:
         self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
     ) -> list[Metrics]:
         """One `Metrics` per row of `phi`, (M, 12 L), over all samples of the logs together."""
-        builder, robot = self.builder, self.robot
+        builder = self.builder
         columns = torch.from_numpy(phi @ builder.columns.from_parameters().T).to(builder.device)
-        measured, hidden = _Squares(robot.nv), _Squares(1)
-        errors = [(_Squares(robot.nv), _Squares(1)) for _ in phi]
-        with torch.no_grad(), one_thread():
-            for samples in logs:
-                for state, index in by_state(samples):
-                    piece = samples[index].to(builder.device)
-                    found = forces(builder, piece, state, columns)
-                    measured.add(found.measured)
-                    for (rows, _), prediction in zip(errors, found.predicted, strict=True):
-                        rows.add(prediction - found.measured)
-                    misfits = [found.torque, *(found.predicted - found.torque)]
-                    sums = [hidden, *(projected for _, projected in errors)]
-                    self._project(piece, state, misfits, sums)
-                    if progress is not None:
+        work = [(samples, state, index) for samples in logs for state, index in by_state(samples)]
+        for _, state, _ in work:
+            builder.plan(state)
+        lock = threading.Lock()
+
+        def run(part: Sequence[tuple[Samples, State, slice | torch.Tensor]]) -> list[_Sums]:
+            sums = [_Sums(self.robot.nv) for _ in range(len(phi) + 1)]
+            for samples, state, index in part:
+                piece = samples[index].to(builder.device)
+                found = forces(builder, piece, state, columns)
+                for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
+                    total.rows.add(predicted - found.measured)
+                projected = [total.projected for total in sums]
+                self._project(piece, state, [found.torque, *(found.predicted - found.torque)], projected)
+                if progress is not None:
+                    with lock:
                         progress(len(piece))
-        return [self._summary(rows, projected, measured, hidden) for rows, projected in errors]
+            return sums
+
+        parts = share_out(work, run, worker_count(builder.device))
+        measured, *errors = [_Sums.total(same) for same in zip(*parts, strict=True)]
+        return [self._summary(error, measured) for error in errors]
 
     def _project(
         self, samples: Samples, state: State, vectors: Sequence[torch.Tensor], sums: Sequence[_Squares]
@@ -115,17 +138,18 @@ class Evaluation:
                 inside = (V.mT @ vector[index][:, mixed, None])[..., 0]
                 squares.add(torch.cat([inside, vector[index][:, lone]], dim=1).flatten()[:, None])
 
-    def _summary(self, errors: _Squares, projected: _Squares, measured: _Squares, hidden: _Squares) -> Metrics:
+    def _summary(self, errors: _Sums, measured: _Sums) -> Metrics:
         base = self.robot.base_rows
         rms: dict[str, float] = {}
         size: dict[str, float] = {}
-        for squares, inside, out in ((errors, projected, rms), (measured, hidden, size)):
+        for sums, out in ((errors, rms), (measured, size)):
+            squares, inside = sums.rows, sums.projected
             joints = squares.rms(slice(base, None))
             out["joint_torque"] = float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan
             out["base_force"] = squares.pooled(slice(0, 3)) if base else np.nan
             out["base_moment"] = squares.pooled(slice(3, 6)) if base else np.nan
             out["nullspace"] = inside.pooled(slice(None))
-        by_joint, joint_size = errors.rms(slice(base, None)), measured.rms(slice(base, None))
+        by_joint, joint_size = errors.rows.rms(slice(base, None)), measured.rows.rms(slice(base, None))
         names = self.robot.joint_names
         return Metrics(
             {group: _figure(rms[group]) for group in GROUPS},
