@@ -159,7 +159,7 @@ ROBOTS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "mass missing": (edit_urdf('<mass value="11.0"/>', ""), ("trunk", "mass")),
     "negative mass": (edit_urdf('value="11.0"', 'value="-11"'), ("trunk", "-11 kg")),
     "malformed XML": (edit_urdf("</robot>", ""), ("quadruped.urdf", "well-formed")),
-    "missing file": (lambda folder: (folder / "quadruped.urdf").unlink(), ("quadruped.urdf", "cannot be read")),
+    "missing file": (lambda folder: (folder / "quadruped.urdf").unlink(), ("quadruped.urdf", "no such file")),
 }
 
 FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
@@ -197,6 +197,22 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
         edit_config(sensors={"joint_torques": ["front_left_hip", "front_left_thigh"]}),
         ("rank(S_b V_x)", "rank 0 of 6"),
     ),
+    "sensors that nothing moves": (
+        both(edit_config(robot={"urdf": "quadruped.urdf", "fixed_base": True}), edit_config(sensors="contacts")),
+        ("sensors", "no parameter is in reach"),
+    ),
+    "resampled to one sample": (
+        edit_config(preprocessing={"sample_rate_hz": 0.01}),
+        ("preprocessing.sample_rate_hz", "leaves one sample"),
+    ),
+    "resampled below twice the cutoff": (
+        edit_config(preprocessing={"cutoff_hz": 8, "sample_rate_hz": 15}),
+        ("preprocessing.sample_rate_hz", "16 Hz"),
+    ),
+    "output where nothing can be made": (edit_config(output="quadruped.urdf/run"), ("output", "no folder can be made")),
+    "output with too long a name": (edit_config(output="x" * 300), ("output", "accepted")),
+    "device of another spelling": (edit_config(device="CPU"), ("device", "cuda:0")),
+    "a number that YAML cannot make": (write("quadruped.yaml", b'device: !!int "x"'), ("quadruped.yaml", "YAML")),
     "unavailable device": (edit_config(device="cuda:77"), ("device", "cuda:77")),
     "malformed YAML": (write("quadruped.yaml", b"robot: [unclosed"), ("quadruped.yaml",)),
     "YAML that is no mapping": (write("quadruped.yaml", b"- a\n- b\n"), ("quadruped.yaml", "mapping")),
@@ -242,6 +258,14 @@ def test_unknown_override_names_the_nearest_key(experiment: Path, capsys: pytest
     assert "accepted: ridge" in capsys.readouterr().err
     assert main(["identify", str(experiment / "quadruped.yaml"), "estimator.ridge"]) == 2
     assert "key.subkey=value" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("override", ["contacts[0].type=flat", "contacts.0.type=flat", "sensors=[joints]"])
+def test_an_override_that_does_not_fit_the_file_is_refused(
+    experiment: Path, capsys: pytest.CaptureFixture[str], override: str
+) -> None:
+    assert main(["identify", str(experiment / "quadruped.yaml"), override]) == 2
+    assert "accepted: " in capsys.readouterr().err
 
 
 def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

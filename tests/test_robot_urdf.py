@@ -132,7 +132,9 @@ WRONG_JOINTS = {
     "an axis of length zero": ('<axis xyz="0 0 0"/>', "<axis>"),
     "an axis that is NaN": ('<axis xyz="0 nan 1"/>', "<axis>"),
     "an infinite axis": ('<axis xyz="0 inf 1"/>', "<axis>"),
-    "an axis of two numbers": ('<axis xyz="0 1"/>', "<axis>"),
+    "an axis of two numbers": ('<axis xyz="0 1"/>', "<axis xyz>"),
+    "an axis left to xacro": ('<axis xyz="0 ${y} 1"/>', "<axis xyz>"),
+    "a mimic tag without a master": ('<axis xyz="0 0 1"/><mimic/>', "<mimic>"),
     "an origin that is NaN": ('<origin xyz="nan 0 0"/><axis xyz="0 0 1"/>', "<origin>"),
     "an origin turned by infinity": ('<origin rpy="0 0 inf"/><axis xyz="0 0 1"/>', "<origin>"),
     "a damping that is NaN": ('<axis xyz="0 0 1"/><dynamics damping="nan"/>', "<dynamics>"),
@@ -266,8 +268,8 @@ def test_a_file_of_another_format_is_refused_by_its_root(tmp_path: Path) -> None
 
 
 def test_a_file_that_cannot_be_opened_is_refused(tmp_path: Path) -> None:
-    assert "file: cannot be read" in refusal(tmp_path / "missing.urdf")
-    assert "file: cannot be read" in refusal(tmp_path)
+    assert "file: no such file" in refusal(tmp_path / "missing.urdf")
+    assert "file: a folder" in refusal(tmp_path)
 
 
 def test_entities_bring_nothing_from_other_files(tmp_path: Path) -> None:

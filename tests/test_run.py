@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,8 @@ import torchid
 from torchid.cli import main
 from torchid.config import load_config
 from torchid.parameters import PARAMETERS
+from torchid.problem.states import StateReport
+from torchid.report.tables import print_tables, state_table
 from torchid.report.urdf_export import identified_urdf
 
 DEMO = Path(torchid.__file__).parent / "demo"
@@ -101,6 +105,50 @@ def test_a_run_is_replaced_only_on_request(run: Path, capsys: pytest.CaptureFixt
     assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={run}"]) == 2
     assert "overwrite=true" in capsys.readouterr().err
     assert (run / "metrics.json").read_bytes() == before
+
+
+def test_overwriting_keeps_what_is_no_part_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "notes.txt").write_text("mine")
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={run}", "overwrite=true"]) == 2
+    assert "notes.txt" in capsys.readouterr().err
+    assert (run / "notes.txt").read_text() == "mine"
+    (run / "notes.txt").unlink()
+
+
+def test_logs_of_one_name_are_not_evaluated_as_one(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = str(DEMO / "sway_test.npz")
+    assert main(["evaluate", str(run), "--log", log, "--log", log]) == 2
+    assert "several logs named 'sway_test'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("damage", [("NaN", "m"), ("true", "Ixx"), ('"1.0"', "fv")], ids=["NaN", "flag", "text"])
+def test_parameters_that_are_no_numbers_are_not_evaluated(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: tuple[str, str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    document = json.loads((copy / "parameters.json").read_text())
+    document["bodies"][3]["identified"][damage[1]] = json.loads(damage[0])
+    (copy / "parameters.json").write_text(json.dumps(document))
+    assert main(["evaluate", str(copy), "--log", str(DEMO / "sway_test.npz")]) == 2
+    printed = capsys.readouterr().err
+    assert f"identified.{damage[1]}" in printed
+    assert document["bodies"][3]["name"] in printed
+
+
+def test_forces_in_other_units_are_noticed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(DEMO, tmp_path / "demo")
+    with np.load(DEMO / "sway_train.npz") as log:
+        fields = dict(log)
+    fields["joint_position"] = np.rad2deg(fields["joint_position"])
+    np.savez(tmp_path / "demo" / "sway_train.npz", **fields)
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml")]) == 0
+    assert "times the stated sensor noise" in capsys.readouterr().err
+
+
+def test_names_are_shown_as_they_are_and_never_as_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    print_tables(state_table([asdict(StateReport("[red]x[/blue]", 3, 6, 6, 0.1))]))
+    assert "[red]x[/blue]" in capsys.readouterr().out
 
 
 def test_the_same_experiment_gives_the_same_parameters_again(run: Path, tmp_path: Path) -> None:

@@ -3,13 +3,28 @@
 Building blocks are here; whole runs, from files to folders, are in `torchid.run`, experiment files in `torchid.config`.
 """
 
-from torchid.errors import TorchidError, TorchidWarning
-from torchid.estimators import Estimate, LeastSquares
-from torchid.logs import Log, preprocess, read_log, write_log
-from torchid.problem import LinearProblem, RowBuilder, TriangularFactor, bind, compress, linear_problem
-from torchid.regressor import FrameJacobian, Motion, Regressor, motion_from_state
-from torchid.robot import Robot, load_robot
-from torchid.sensing import Contact, Projection, SensorNoise, SensorSet, chosen_sensors, named_sensors
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torchid.errors import TorchidError, TorchidWarning
+    from torchid.estimators import Estimate, LeastSquares
+    from torchid.logs import Log, preprocess, read_log, write_log
+    from torchid.problem import LinearProblem, RowBuilder, TriangularFactor, bind, compress, linear_problem
+    from torchid.regressor import FrameJacobian, Motion, Regressor, motion_from_state
+    from torchid.robot import Robot, load_robot
+    from torchid.sensing import Contact, Projection, SensorNoise, SensorSet, chosen_sensors, named_sensors
+
+_HOMES = {
+    "torchid.errors": ("TorchidError", "TorchidWarning"),
+    "torchid.estimators": ("Estimate", "LeastSquares"),
+    "torchid.logs": ("Log", "preprocess", "read_log", "write_log"),
+    "torchid.problem": ("LinearProblem", "RowBuilder", "TriangularFactor", "bind", "compress", "linear_problem"),
+    "torchid.regressor": ("FrameJacobian", "Motion", "Regressor", "motion_from_state"),
+    "torchid.robot": ("Robot", "load_robot"),
+    "torchid.sensing": ("Contact", "Projection", "SensorNoise", "SensorSet", "chosen_sensors", "named_sensors"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Contact",
@@ -39,3 +54,16 @@ __all__ = [
     "read_log",
     "write_log",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import on first use: torch and the kinematics take seconds, which `torchid --help` should not."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'torchid' has no attribute '{name}'")
+    value = getattr(importlib.import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -34,7 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except Exception as error:  # a bug or a full disk: still no wall of text unless asked for
             if options.debug:
                 traceback.print_exc()
-            print(f"torchid: {type(error).__name__}: {error} (--debug shows where)", file=sys.stderr)
+            what = " ".join(str(error).split())
+            print(f"torchid: {type(error).__name__}: {what} (--debug shows where)", file=sys.stderr)
             return 1
     return 0
 
@@ -60,12 +61,12 @@ def _parser() -> argparse.ArgumentParser:
 
 def _identify(options: argparse.Namespace) -> None:
     from torchid.config import load_config
-    from torchid.report.tables import error_table, print_tables, state_table
+    from torchid.report.tables import error_tables, print_tables, state_table
     from torchid.run import identify
 
     run = identify(load_config(options.file, options.overrides), options.file)
     estimate, robot = run.estimate, run.experiment.robot
-    print_tables(state_table([asdict(state) for state in run.states]), error_table(run.metrics))
+    print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
     mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
@@ -79,11 +80,11 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    from torchid.report.tables import error_table, print_tables
+    from torchid.report.tables import error_tables, print_tables
     from torchid.run import evaluate
 
     metrics, output = evaluate(options.run, options.log)
-    print_tables(error_table(metrics))
+    print_tables(*error_tables(metrics))
     print(f"written to    {output}")
 
 

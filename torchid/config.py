@@ -114,7 +114,7 @@ class ExperimentConfig:
     contacts: list[ContactConfig] = dataclasses.field(default_factory=list)
     preprocessing: PreprocessingConfig = dataclasses.field(default_factory=PreprocessingConfig)
     estimator: EstimatorConfig = dataclasses.field(default_factory=EstimatorConfig)
-    device: str = "cpu"
+    device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d+)?)$")] = "cpu"
     overwrite: bool = False
 
 
@@ -141,7 +141,11 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     if isinstance(given.get("sensors"), str) and isinstance(settings.get("sensors"), dict):
         kept = {key: x for key, x in settings["sensors"].items() if key in ("noise", "on_base_lost")}
         settings = settings | {"sensors": kept}  # a named set replaces sensors by name
-    merged = _container(OmegaConf.merge(_expand_sensors(settings), _expand_sensors(_absolute(given, Path.cwd()))))
+    try:
+        merged = _container(OmegaConf.merge(_expand_sensors(settings), _expand_sensors(_absolute(given, Path.cwd()))))
+    except (OmegaConfBaseException, TypeError) as error:
+        accepted = "key.subkey=value, a list as a whole: 'contacts=[{frame: l_sole, type: flat}]'"
+        raise ConfigError("command line", " ".join(overrides), "does not fit the file", accepted) from error
     try:
         config = TypeAdapter(ExperimentConfig).validate_python(merged)
     except ValidationError as error:
@@ -160,7 +164,7 @@ def _read(path: Path) -> dict[str, Any]:
         loaded = _container(OmegaConf.load(path))
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", "a YAML experiment file") from error
-    except (OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError) as error:
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
         raise ConfigError(path, "YAML", f"not readable: {error}", "a YAML mapping") from error
     if not isinstance(loaded, dict):
         raise ConfigError(path, "YAML", f"a {type(loaded).__name__}", "a mapping with robot, logs, sensors, output")
@@ -212,8 +216,9 @@ def _in_one_line(path: Path, error: ValidationError) -> ConfigError | UnknownNam
     field = ".".join(place)
     if first["type"] == "unexpected_keyword_argument":
         return UnknownNameError(path, ".".join(place[:-1]) or "key", place[-1], _keys_at(place[:-1]))
-    if first["type"] == "missing":
-        return ConfigError(path, field, "missing", "a value")
+    missing = [".".join(map(str, e["loc"])) for e in complaints if e["type"] == "missing"]
+    if missing:
+        return ConfigError(path, ", ".join(missing), "missing", "a value")
     if place == ["sensors", "ft_sensors"]:
         return ConfigError(path, field, "limb-mounted sensors, which are not supported yet", "an empty list")
     found = first["input"]
@@ -222,8 +227,9 @@ def _in_one_line(path: Path, error: ValidationError) -> ConfigError | UnknownNam
         return ConfigError(path, field, f"found {shown}", f"a mapping with {', '.join(_keys_at(place))}")
     if first["type"] == "too_short":
         return ConfigError(path, field, "an empty list", "at least one item")
-    if first["type"] == "path_type":
-        return ConfigError(path, field, f"found {shown}", "a path")
+    plain = {"path_type": "a path", "string_pattern_mismatch": "cpu, cuda, cuda:0, ..., mps", "list_type": "a list"}
+    if first["type"] in plain:
+        return ConfigError(path, field, f"found {shown}", plain[first["type"]])
     accepted = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     return ConfigError(path, field, f"found {shown}", accepted)
 

@@ -70,7 +70,14 @@ def plan(
     if sample_rate_hz is not None:
         accepted = f"{FASTEST:g} times the log's median sample rate"
         _check_rate(source, "sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
+        if cutoff_hz is not None and cutoff_hz >= 0.5 * sample_rate_hz:
+            accepted = f"a rate above {2.0 * cutoff_hz:g} Hz, twice the cutoff, so that nothing aliases"
+            raise InputError(source, "preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
         output = _uniform(grid[kept], sample_rate_hz)
+        if len(output) < 2:
+            found = f"{sample_rate_hz:g}, which leaves one sample"
+            accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
+            raise InputError(source, "preprocessing.sample_rate_hz", found, accepted)
     return Timeline(native, grid, kept, output, low_pass)
 
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import torch
 
 from torchid.errors import BaseLostError, BaseLostWarning
-from torchid.problem.compress import by_state
 from torchid.problem.plan import State
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.problem.streaming import by_state
 from torchid.problem.threads import one_thread
 from torchid.sensing.projection import BASE_RANK_TOLERANCE, base_singular_values
 

@@ -16,6 +16,7 @@ from torchid.report.metrics import GROUPS, Metrics
 
 _STYLE: dict[Any, Any] = {
     "font.size": 9,
+    "text.parse_math": False,  # names may hold dollar signs
     "axes.grid": True,
     "axes.axisbelow": True,
     "grid.alpha": 0.3,

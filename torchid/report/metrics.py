@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from torchid.parameters import Array
-from torchid.problem.compress import by_state
 from torchid.problem.plan import State
 from torchid.problem.predict import forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.problem.streaming import by_state
 from torchid.problem.threads import share_out, worker_count
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact

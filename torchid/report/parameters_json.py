@@ -46,13 +46,22 @@ def read_parameters(path: Path, robot: Robot) -> Array:
         InputError: the file cannot be read or holds other bodies.
     """
     try:
-        bodies = json.loads(path.read_text())["bodies"]
-        found = {body["name"]: [float(body["identified"][name]) for name in PARAMETERS] for body in bodies}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(path, "file", f"not readable as parameters ({error})", "a run's parameters.json") from error
-    if tuple(found) != robot.body_names:
-        raise InputError(path, "bodies", f"other bodies than those of {robot.path}", "parameters of the same robot")
-    return np.array([found[name] for name in robot.body_names])
+        document = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(path, "file", f"not readable as JSON ({error})", "a run's parameters.json") from error
+    bodies = document.get("bodies") if isinstance(document, dict) else None
+    names = [body.get("name") if isinstance(body, dict) else None for body in bodies or []]
+    if names != list(robot.body_names):
+        raise InputError(path, "bodies", f"not the bodies of {robot.path}", ", ".join(robot.body_names))
+    return np.array([[_number(path, body, name) for name in PARAMETERS] for body in bodies or []])
+
+
+def _number(path: Path, body: dict[str, Any], name: str) -> float:
+    identified = body.get("identified")
+    value = identified.get(name) if isinstance(identified, dict) else None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise InputError(path, f"body '{body['name']}', identified.{name}", f"{value!r}", "a finite number")
+    return float(value)
 
 
 def _plain(x: Any) -> float | bool | None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from torchid.report.metrics import GROUPS, Metrics
 
@@ -25,16 +26,21 @@ def print_tables(*tables: Table) -> None:
         console.print(table)
 
 
-def error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
-    """Errors of predicted forces, nominal against identified, for each named set of logs."""
+def error_tables(columns: Mapping[str, tuple[Metrics, Metrics]]) -> list[Table]:
+    """Errors of predicted forces, nominal against identified, two named sets of logs to a table."""
+    named = list(columns.items())
+    return [_error_table(dict(named[i : i + 2])) for i in range(0, len(named), 2)]
+
+
+def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
     table = Table(
         title="Error of predicted forces: rms, and share of the rms of the measured; -: not measured",
         title_justify="left",
     )
     table.add_column("", no_wrap=True)
     for name in columns:
-        table.add_column(f"{name}\nURDF", justify="right", no_wrap=True)
-        table.add_column(f"{name}\nidentified", justify="right", no_wrap=True)
+        for which in ("URDF", "identified"):
+            table.add_column(Text(f"{name}\n{which}"), justify="right", overflow="fold")
     for group in GROUPS:
         cells = [_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(_ROWS[group], *cells)
@@ -56,7 +62,7 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
     for state in states:
         rank, smallest = state["base_rank"], state["base_singular_value"]
         table.add_row(
-            str(state["name"]),
+            Text(str(state["name"])),
             str(state["samples"]),
             str(state["rows"]),
             "fixed base" if rank is None else f"{rank} of 6",

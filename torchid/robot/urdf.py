@@ -15,6 +15,7 @@ from torchid.errors import UnknownNameError, UrdfError
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING_TYPES, "fixed")
+_NUMBERS = {"xyz": 3, "rpy": 3, "value": 1, "multiplier": 1, "offset": 1, "damping": 1, "friction": 1}
 _KEPT = {"link": {"inertial"}, "joint": {"origin", "parent", "child", "axis", "mimic", "dynamics"}}
 _INERTIA_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
@@ -28,7 +29,8 @@ def parse_xml(path: Path) -> etree._ElementTree:
     try:
         tree = etree.parse(str(path), etree.XMLParser(resolve_entities=False, no_network=True))
     except OSError as error:
-        raise UrdfError(path, "file", "cannot be read", "a readable URDF file") from error
+        found = "a folder" if path.is_dir() else "cannot be read" if path.exists() else "no such file"
+        raise UrdfError(path, "file", found, "a readable URDF file") from error
     except etree.XMLSyntaxError as error:
         raise UrdfError(path, "XML", f"not well-formed: {error.msg}", "a well-formed URDF") from error
     root = tree.getroot()
@@ -56,6 +58,8 @@ def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
             copy.extend([child for child in element if child.tag in kept])
     _check_names(path, stripped)
     links, joints = ([element.get("name", "") for element in stripped.findall(tag)] for tag in ("link", "joint"))
+    for element in stripped:
+        _check_numbers(path, element)
     for element in stripped.findall("joint"):
         _check_joint(path, element, links, joints)
     for element in stripped.findall("link"):
@@ -88,6 +92,25 @@ def _check_names(path: Path, root: etree._Element) -> None:
         raise UrdfError(path, "link", "none found", "at least one <link>")
 
 
+def _check_numbers(path: Path, owner: etree._Element) -> None:
+    """Refuse what is no decimal number, before a parser that would not say where it stands."""
+    for element in owner.iter():
+        for name, text in element.attrib.items():
+            count = 1 if name in _INERTIA_ATTRIBUTES else _NUMBERS.get(str(name), 0)
+            if not count:
+                continue
+            words = str(text).split()
+            try:
+                readable = len([float(word) for word in words]) == count
+            except ValueError:
+                readable = False
+            if not readable:
+                hint = " (expand xacro first)" if "${" in str(text) else ""
+                field = f"{owner.tag!s} '{owner.get('name')}', <{element.tag!s} {name!s}>"
+                accepted = f"{count} decimal number{'s' if count > 1 else ''}{hint}"
+                raise UrdfError(path, field, f"'{text!s}'", accepted)
+
+
 def _check_joint(path: Path, joint: etree._Element, links: list[str], joints: list[str]) -> None:
     field, kind = f"joint '{joint.get('name')}'", joint.get("type")
     if kind not in JOINT_TYPES:
@@ -101,6 +124,8 @@ def _check_joint(path: Path, joint: etree._Element, links: list[str], joints: li
         if name not in links:
             raise UnknownNameError(path, f"{field}, <{end}>", name, links)
     mimic = joint.find("mimic")
+    if mimic is not None and mimic.get("joint") is None:
+        raise UrdfError(path, f"{field}, <mimic>", "no joint", "the name of a joint")
     if mimic is not None and mimic.get("joint") not in joints:
         raise UnknownNameError(path, f"{field}, <mimic>", str(mimic.get("joint")), joints)
 

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from torchid.config import load_config
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, TorchidWarning
 from torchid.report.figures import error_figure
 from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.parameters_json import read_parameters
 from torchid.run.experiment import set_up
-from torchid.run.folder import new_folder, write_json
+from torchid.run.folder import check_free, new_folder, write_json
 from torchid.run.identify import forces_of
 from torchid.run.progress import progress_bars
 
 
 def evaluate(run: str | Path, logs: Sequence[str | Path]) -> tuple[dict[str, tuple[Metrics, Metrics]], Path]:
-    """Evaluate nominal and identified parameters; results go to `RUN/evaluation/<name of the first log>`.
+    """Evaluate nominal and identified parameters.
+
+    Results go to `RUN/evaluation/<name of the first log>` and replace an earlier evaluation of that name.
 
     Args:
         run: folder that `identify` wrote.
@@ -34,6 +37,12 @@ def evaluate(run: str | Path, logs: Sequence[str | Path]) -> tuple[dict[str, tup
     folder = Path(run)
     if not (folder / "config.yaml").is_file():
         raise ConfigError(folder, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
+    names = [Path(log).stem for log in logs]
+    again = [name for name in names if names.count(name) > 1]
+    if again:
+        raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
+    output = folder / "evaluation" / names[0]
+    check_free(output, overwrite=True)
     config = load_config(folder / "config.yaml")
     with progress_bars() as bars:
         experiment = set_up(config, folder / "config.yaml")
@@ -48,7 +57,9 @@ def evaluate(run: str | Path, logs: Sequence[str | Path]) -> tuple[dict[str, tup
         for log in samples:
             nominal, identified = evaluation.metrics([log], candidates, lambda n: bars.advance(evaluating, n))
             metrics[Path(log.source).stem] = (nominal, identified)
-        output = folder / "evaluation" / Path(logs[0]).stem
+            if not any(x is not None for x in identified.rms.values()):
+                message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
+                warnings.warn(message, TorchidWarning, stacklevel=2)
         document = {
             name: {"identified": after.as_dict(), "nominal": before.as_dict()}
             for name, (before, after) in metrics.items()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -12,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchid.config import ExperimentConfig, dump_config
+from torchid.errors import NumericalWarning, SensorError
 from torchid.estimators import Estimate, LeastSquares
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
@@ -28,6 +30,7 @@ from torchid.run.folder import check_free, new_folder, write_json
 from torchid.run.progress import progress_bars
 
 _PLOTTED_SAMPLES = 3000
+_IMPLAUSIBLE = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,7 @@ def identify(config: ExperimentConfig, source: object = "experiment") -> Identif
             problem = linear_problem(factor, builder, robot, config.estimator.friction)
             settings = config.estimator
             estimate = LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
+            _check_sense(estimate, source)
         with clock("evaluate"):
             evaluation = Evaluation(robot, experiment.contacts, config.device)
             candidates = np.stack([robot.nominal.flatten(), estimate.phi])
@@ -97,6 +101,16 @@ def identify(config: ExperimentConfig, source: object = "experiment") -> Identif
         bars.add_task("writing", total=None)
         _write(run, evaluation, (test or train)[0], candidates)
     return run
+
+
+def _check_sense(estimate: Estimate, source: object) -> None:
+    """Refuse a fit of nothing, and warn of one that the dynamics cannot explain."""
+    if not estimate.rank:
+        raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
+    if estimate.residual_std > _IMPLAUSIBLE:
+        found = f"forces differ from any rigid-body model by {estimate.residual_std:.3g} times the stated sensor noise"
+        advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
+        warnings.warn(f"{source}: {found}; {advice}", NumericalWarning, stacklevel=3)
 
 
 def _write(run: Identification, evaluation: Evaluation, shown: Samples, candidates: Array) -> None:
