@@ -40,6 +40,8 @@ TALOS = ROBOTS / "talos_data/robots/talos_reduced.urdf"
 PANDA = ROBOTS / "panda_description/urdf/panda.urdf"
 BAXTER = ROBOTS / "baxter_description/urdf/baxter.urdf"
 TIAGO = ROBOTS / "tiago_description/robots/tiago_no_hand.urdf"
+ROMEO = ROBOTS / "romeo_description/urdf/romeo.urdf"
+TIAGO_PRO = ROBOTS / "tiago_pro_description/robots/tiago_pro.urdf"
 UR5 = ROBOTS / "ur_description/urdf/ur5_robot.urdf"
 DRONE = ROBOTS / "hector_description/robots/quadrotor_base.urdf"
 
@@ -65,6 +67,13 @@ def joint_map(urdf: Path, joint_names: Sequence[str]) -> dict[str, tuple[Array, 
         return ratio * row, ratio * offset + float(mimic.get("offset", 0.0))
 
     return {name: follow(name) for name in joints}
+
+
+def transform(rotation: Array, position: Array) -> Array:
+    """A pose, (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation, position
+    return T
 
 
 class Oracle:

@@ -1,0 +1,29 @@
+"""Robots that several test files use."""
+
+from __future__ import annotations
+
+import pytest
+from synthetic import load
+
+from torchid.robot import Robot
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    """A floating base with a hinge, a slide, a hinge that mimics the slide, and a branch; no axis along x, y or z."""
+    inertia = '<inertia ixx="0.3" ixy="0.01" ixz="-0.02" iyy="0.4" iyz="0.03" izz="0.5"/>'
+    inertial = f'<inertial><origin xyz="0.1 -0.2 0.3" rpy="0.4 0.5 -0.6"/><mass value="2"/>{inertia}</inertial>'
+    origin = '<origin xyz="0.3 0.1 -0.2" rpy="0.3 -0.2 0.1"/>'
+    elements = [f'<link name="{name}">{inertial}</link>' for name in ("base", "a", "b", "c", "d")]
+    mimic = '<mimic joint="slide" multiplier="-1.5" offset="0.2"/>'
+    for name, kind, parent, child, axis, extra in (
+        ("hinge", "revolute", "base", "a", "1 2 3", ""),
+        ("slide", "prismatic", "a", "b", "-1 1 0.5", ""),
+        ("follower", "revolute", "b", "c", "0 1 -1", mimic),
+        ("branch", "continuous", "a", "d", "0 -1 0", ""),
+    ):
+        ends = f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>'
+        elements.append(f'<joint name="{name}" type="{kind}">{origin}{ends}{extra}</joint>')
+    path = tmp_path_factory.mktemp("small") / "small.urdf"
+    path.write_text(f'<robot name="small">{"".join(elements)}</robot>')
+    return load(path)

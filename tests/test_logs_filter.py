@@ -1,0 +1,130 @@
+"""The low-pass filter: phase, gain, what it spoils, and what it costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import tracemalloc
+
+import numpy as np
+import pytest
+from motions import RATE, jittered, moving_log, position, sine_log, uniform, value
+
+from torchid.logs import Log, preprocess
+from torchid.logs.fields import FloatArray
+from torchid.logs.spline import spline_derivatives
+
+
+@pytest.mark.parametrize("hertz", [3.0, 10.0, 20.0, 40.0, 100.0])
+@pytest.mark.parametrize("time", [uniform(), jittered()], ids=["uniform", "jittered"])
+def test_a_sine_keeps_its_phase_and_loses_the_butterworth_share(time: FloatArray, hertz: float) -> None:
+    out = preprocess(sine_log(hertz, time), cutoff_hz=20.0)
+    middle = out.select((out.time > 1.0) & (out.time < 3.0))
+    warp = np.tan(np.pi * hertz / RATE) / np.tan(np.pi * 20.0 / RATE)
+    gain = 1 / (1 + warp**8)  # 1/2 at the cutoff, 3e-6 at five times the cutoff
+    angle = 2 * np.pi * hertz * middle.time + 0.7
+    rate = 2 * np.pi * hertz
+    # up to the quintic spline through 12 samples a period (40 Hz), or 5 (100 Hz) which the jitter spreads
+    accuracy = 1e-5 if hertz <= 20 else 2e-4 if hertz <= 40 else 2e-3
+    np.testing.assert_allclose(middle.joint_position[:, 0], gain * np.sin(angle), atol=accuracy)
+    np.testing.assert_allclose(value(middle.joint_velocity)[:, 0] / rate, gain * np.cos(angle), atol=accuracy)
+
+
+def test_every_channel_passes_the_same_filter() -> None:
+    rng = np.random.default_rng(2)
+    t = jittered(2.0)
+    noise = rng.standard_normal(len(t))
+    three, wrench = np.tile(noise[:, None], 3), np.tile(noise[:, None, None], (1, 1, 6))
+    log = Log(
+        "noise.npz",
+        t,
+        ("a",),
+        noise[:, None],
+        joint_velocity=noise[:, None],
+        joint_acceleration=noise[:, None],
+        joint_torque=noise[:, None],
+        base_position_world=three,
+        base_linear_velocity_world=three,
+        base_linear_acceleration_world=three,
+        base_angular_velocity_base=three,
+        base_angular_acceleration_base=three,
+        contact_names=("foot",),
+        contact_active=np.ones((len(t), 1), bool),
+        contact_wrench_world=wrench,
+    )
+    out = preprocess(log, cutoff_hz=30.0, sample_rate_hz=100.0)
+    for name, array in out.arrays().items():
+        if name not in ("time", "contact_active"):
+            columns = array.reshape(len(out), -1)
+            np.testing.assert_allclose(columns, np.tile(out.joint_position, columns.shape[1]), atol=1e-13, err_msg=name)
+    assert out.arrays().keys() == log.arrays().keys()
+    assert 0.2 < np.std(out.joint_position) < 0.45  # white noise keeps 30 Hz of 250 Hz of its power
+
+
+def test_filters_and_splines_lose_only_the_stated_ends() -> None:
+    t = uniform(2.0)
+    log = sine_log(1.0, t)
+    assert np.array_equal(preprocess(log).time, t[2:-2])
+    np.testing.assert_array_equal(preprocess(log, cutoff_hz=10.0).time, t[100:-100])  # 2 periods of 10 Hz
+    complete = dataclasses.replace(log, joint_velocity=log.joint_position, joint_acceleration=log.joint_position)
+    resampled = preprocess(complete, sample_rate_hz=50.0)
+    np.testing.assert_allclose(resampled.time, np.arange(100) / 50, atol=1e-12)
+    np.testing.assert_allclose(preprocess(log, sample_rate_hz=50.0).time, 0.004 + np.arange(100) / 50, atol=1e-12)
+
+
+def test_what_the_kept_ends_of_a_filtered_log_are_off_by() -> None:
+    rng = np.random.default_rng(1)
+    t = uniform(12.0, 200.0)
+    long = Log("x", t, ("a",), np.sin(9 * t + 0.4)[:, None] + 0.05 * rng.standard_normal((len(t), 1)))
+    whole = preprocess(long, cutoff_hz=6.0)
+    part = preprocess(long.select(slice(800, 1600)), cutoff_hz=6.0)
+    same = whole.select(np.isin(whole.time, part.time))
+    for name, share in (("joint_position", 0.002), ("joint_velocity", 0.003), ("joint_acceleration", 0.01)):
+        error = np.abs(value(getattr(part, name)) - value(getattr(same, name)))
+        scale = np.sqrt(np.mean(value(getattr(same, name)) ** 2))
+        assert np.max(error) < share * scale, name
+        assert np.max(error[100:-100]) < 1e-4 * scale, name
+
+
+def test_noise_at_the_kept_ends_of_an_unfiltered_log_is_that_of_its_inside() -> None:
+    t = uniform(0.2)
+    out = preprocess(Log("x", t, tuple(map(str, range(len(t)))), np.eye(len(t))))
+    for array in (value(out.joint_velocity), value(out.joint_acceleration)):
+        gain = np.linalg.norm(array, axis=1)
+        assert np.max(gain) < 1.4 * gain[len(gain) // 2]
+
+
+def test_a_complete_log_is_returned_as_is() -> None:
+    t = uniform(1.0)
+    log = preprocess(moving_log(t, base_position_world=position(t)))
+    assert preprocess(log) is log
+    bare = dataclasses.replace(log, base_position_world=None, base_linear_velocity_world=None)
+    assert preprocess(bare) is bare
+
+
+def test_deriving_alone_copies_nothing_that_the_log_gives() -> None:
+    t = uniform(1.0)
+    torque = np.where(np.arange(len(t))[:, None] % 7, np.nan, np.ones((len(t), 3)))
+    log = moving_log(t, base_position_world=position(t), joint_torque=torque)
+    out = preprocess(log)
+    for name in ("time", "joint_position", "joint_torque", "base_position_world"):
+        assert np.shares_memory(getattr(out, name), getattr(log, name)), name
+
+
+def test_memory_stays_within_three_times_the_log() -> None:
+    t = jittered(120.0)
+    channels = np.sin(t[:, None] + np.arange(12))
+    log = Log("x", t, tuple("abcdefghijkl"), channels, joint_torque=channels)
+    size = sum(array.nbytes for array in log.arrays().values())
+    tracemalloc.start()
+    preprocess(log, cutoff_hz=20.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 3 * size
+
+
+def test_one_spline_and_a_chain_of_short_ones_are_the_same() -> None:
+    t = jittered(4.0)
+    values, at = position(t), np.linspace(t[0], t[-1], 1234)
+    whole = spline_derivatives(t, values, at, (0, 1, 2), block=10**6)
+    for one, other in zip(whole, spline_derivatives(t, values, at, (0, 1, 2), block=100), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12 * np.max(np.abs(one)))
