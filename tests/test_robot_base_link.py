@@ -10,16 +10,11 @@ import pinocchio as pin
 import pytest
 import torch
 from synthetic import (
-    ANYMAL,
     BAXTER,
-    DRONE,
     G1,
     PANDA,
     ROBOTS,
-    SOLO12,
-    TALOS,
     TIAGO,
-    UR5,
     Array,
     Oracle,
     load,
@@ -29,17 +24,6 @@ from synthetic import (
 from torchid import parameters
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
-
-REAL = (
-    *(ANYMAL, BAXTER, DRONE, G1, PANDA, SOLO12, TALOS, TIAGO, UR5),
-    ROBOTS / "romeo_description/urdf/romeo.urdf",
-    ROBOTS / "pr2_description/urdf/pr2.urdf",
-    ROBOTS / "talos_data/robots/talos_full_v2.urdf",
-    ROBOTS / "tiago_pro_description/robots/tiago_pro.urdf",
-    ROBOTS / "icub_description/robots/icub.urdf",
-)
-
-every_real_robot = pytest.mark.parametrize("urdf", REAL, ids=lambda path: path.stem)
 
 
 def turned_inertias(urdf: Path, folder: Path) -> Path:
