@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import signal
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 import yaml
 
 import torchid
-from torchid.cli import main
+from torchid.cli import _interrupt_held_back, main
 
 DEMO = Path(torchid.__file__).parent / "demo"
 Edit = Callable[[Path], None]
@@ -272,6 +274,24 @@ def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest
     assert main(["evaluate", str(tmp_path), "--log", "x.npz"]) == 2
     assert "config.yaml" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_that_a_loading_module_swallows_still_ends_the_command() -> None:
+    with pytest.raises(KeyboardInterrupt), _interrupt_held_back(), suppress(KeyboardInterrupt):  # noqa: PT012
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_leaves_nothing_behind(
+    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("json.dumps", interrupted)
+    before = tree(experiment.parent)
+    assert main(["identify", str(experiment / "quadruped.yaml")]) == 1
+    assert "interrupted; nothing was written" in capsys.readouterr().err
+    assert tree(experiment.parent) == before
 
 
 def test_a_failure_that_is_no_bad_input_exits_1_without_a_traceback(

@@ -124,6 +124,14 @@ def test_a_jacobian_refuses_coordinates_of_another_robot(small: Robot, columns: 
         FrameJacobian(small, "c")(q[:, columns])
 
 
+def test_another_precision_than_the_modules_is_refused_by_both_names(small: Robot) -> None:
+    state = [x.float() for x in tensors(*random_states(np.random.default_rng(23), small.n, 2))]
+    for module, arguments in ((Regressor(small), state), (FrameJacobian(small, "c"), state[:1])):
+        with pytest.raises(TypeError, match=r"found torch.float32; accepted: torch.float64"):
+            module(*arguments)
+        module.float()(*arguments)
+
+
 def test_a_jacobian_of_no_link_is_refused_by_the_nearest_names() -> None:
     with pytest.raises(UnknownNameError, match="unknown name 'left_anklle_roll_link'; accepted: left_ankle_roll_link"):
         FrameJacobian(load(G1), "left_anklle_roll_link")

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from textwrap import fill
@@ -59,10 +62,27 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@contextmanager
+def _interrupt_held_back() -> Iterator[None]:
+    """Let Ctrl-C act when the block is done: it loads modules, and some of them swallow what happens meanwhile."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: caught.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if caught:
+        raise KeyboardInterrupt
+
+
 def _identify(options: argparse.Namespace) -> None:
-    from torchid.config import load_config
-    from torchid.report.tables import error_tables, print_tables, state_table
-    from torchid.run import identify
+    with _interrupt_held_back():
+        from torchid.config import load_config
+        from torchid.report.tables import error_tables, print_tables, state_table
+        from torchid.run import identify
 
     run = identify(load_config(options.file, options.overrides), options.file)
     estimate, robot = run.estimate, run.experiment.robot
@@ -80,8 +100,9 @@ def _identify(options: argparse.Namespace) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    from torchid.report.tables import error_tables, print_tables
-    from torchid.run import evaluate
+    with _interrupt_held_back():
+        from torchid.report.tables import error_tables, print_tables
+        from torchid.run import evaluate
 
     metrics, output = evaluate(options.run, options.log)
     print_tables(*error_tables(metrics))

@@ -41,7 +41,14 @@ class JointStates:
 
 
 def joint_states(tree: KinematicTree, motion: Motion) -> JointStates:
-    """All joints, mimic joints included, from the independent ones."""
+    """All joints, mimic joints included, from the independent ones.
+
+    Raises:
+        TypeError: the motion's precision is not the module's.
+    """
+    found, own = motion.joint_position.dtype, tree.joint_map.dtype
+    if found != own:
+        raise TypeError(f"motion: found {found}; accepted: {own}, or the module moved with .to({found})")
     position = tree.joint_map @ motion.joint_position.T + tree.joint_constant
     return JointStates(position, tree.joint_map @ motion.joint_velocity.T, tree.joint_map @ motion.joint_acceleration.T)
 
