@@ -72,3 +72,14 @@ def test_a_basis_carries_no_gradient() -> None:
     A = torch.randn(4, 2, 5, dtype=torch.float64, requires_grad=True)
     for _, V in null_space(A):
         assert not V.requires_grad
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_dependent_rows_are_found_in_either_precision(dtype: torch.dtype) -> None:
+    generator = torch.Generator().manual_seed(3)
+    A = torch.randn(20, 12, 9, generator=generator, dtype=dtype) @ torch.randn(
+        20, 9, 18, generator=generator, dtype=dtype
+    )
+    ((_, V),) = null_space(A)
+    assert V.shape == (20, 18, 9)
+    assert (A @ V).abs().max() < 100.0 * torch.finfo(dtype).eps * A.abs().max()

@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import torchid
 from torchid.cli import main
 from torchid.config import load_config
+from torchid.errors import TorchidWarning
 from torchid.parameters import PARAMETERS
 from torchid.problem.states import StateReport
 from torchid.report.tables import print_tables, state_table
@@ -180,6 +181,17 @@ def test_identified_urdf_reads_back_with_its_friction(tmp_path: Path) -> None:
     path = tmp_path / "identified.urdf"
     path.write_bytes(identified_urdf(robot, phi))
     np.testing.assert_allclose(torchid.load_robot(path).nominal, phi, rtol=1e-12, atol=1e-15)
+
+
+def test_a_urdf_that_nothing_can_load_is_warned_of(tmp_path: Path) -> None:
+    robot = torchid.load_robot(DEMO / "quadruped.urdf")
+    phi = robot.nominal.copy()
+    phi[2, 11], phi[3, 0] = -0.1, -1.0
+    with pytest.warns(TorchidWarning) as caught:
+        identified_urdf(robot, phi)
+    mass, friction = (str(warning.message) for warning in caught)
+    assert robot.body_names[3] in mass
+    assert f"negative friction at {robot.joint_names[1]};" in friction
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded human squats (../shared/data) are not here")

@@ -56,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--log", action="append", required=True, metavar="FILE", help="log to evaluate; may be repeated"
     )
+    evaluate.add_argument("--device", help="where to compute, if not where the run did: cpu, cuda, cuda:0, ...")
     evaluate.set_defaults(command=_evaluate)
     for command in (identify, evaluate):
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
@@ -104,7 +105,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         from torchid.report.tables import error_tables, print_tables
         from torchid.run import evaluate
 
-    metrics, output = evaluate(options.run, options.log)
+    metrics, output = evaluate(options.run, options.log, options.device)
     print_tables(*error_tables(metrics))
     print(f"written to    {output}")
 

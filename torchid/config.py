@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, Validation
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, UnknownNameError
+from torchid.sensing.sensors import SensorNoise
 
 _STRICT = ConfigDict(extra="forbid")
 _PATHS = (("robot", "urdf", False), ("logs", "train", True), ("logs", "test", True))  # and whether it is a list
@@ -70,9 +71,9 @@ class PreprocessingConfig:
 class NoiseConfig:
     """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m] (None: one contact's)."""
 
-    joint_torque: Positive = 0.5
-    contact_force: Positive = 2.0
-    contact_moment: Positive = 0.2
+    joint_torque: Positive = SensorNoise.joint_torque
+    contact_force: Positive = SensorNoise.contact_force
+    contact_moment: Positive = SensorNoise.contact_moment
     base_force: Positive | None = None
     base_moment: Positive | None = None
 
@@ -114,7 +115,7 @@ class ExperimentConfig:
     contacts: list[ContactConfig] = dataclasses.field(default_factory=list)
     preprocessing: PreprocessingConfig = dataclasses.field(default_factory=PreprocessingConfig)
     estimator: EstimatorConfig = dataclasses.field(default_factory=EstimatorConfig)
-    device: Annotated[str, Field(pattern=r"^(cpu|mps|cuda(:\d+)?)$")] = "cpu"
+    device: Annotated[str, Field(pattern=r"^(cpu|cuda(:\d+)?)$")] = "cpu"
     overwrite: bool = False
 
 
@@ -227,7 +228,7 @@ def _in_one_line(path: Path, error: ValidationError) -> ConfigError | UnknownNam
         return ConfigError(path, field, f"found {shown}", f"a mapping with {', '.join(_keys_at(place))}")
     if first["type"] == "too_short":
         return ConfigError(path, field, "an empty list", "at least one item")
-    plain = {"path_type": "a path", "string_pattern_mismatch": "cpu, cuda, cuda:0, ..., mps", "list_type": "a list"}
+    plain = {"path_type": "a path", "string_pattern_mismatch": "cpu, cuda, cuda:0, ...", "list_type": "a list"}
     if first["type"] in plain:
         return ConfigError(path, field, f"found {shown}", plain[first["type"]])
     accepted = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")

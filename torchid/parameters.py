@@ -89,6 +89,10 @@ def change_of_frame(T_new_old: Array) -> Array:
     return _from_pseudo_inertia(T_new_old @ pseudo @ T_new_old.T).T
 
 
+POSSIBLE_MARGIN = -1e-9
+"""Least `consistency_margin` of a body that counts as possible: a point mass or a thin plate is 0 but for rounding."""
+
+
 def consistency_margin(phi: Array) -> Array:
     """Smallest eigenvalue of the pseudo-inertia over its largest, (...,); negative means physically impossible."""
     eigenvalues = np.linalg.eigvalsh(pseudo_inertia(phi))

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from torchid.parameters import Array
+from torchid.problem.chunks import by_state
 from torchid.problem.plan import State
 from torchid.problem.rows import ChunkTerms, RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.streaming import by_state
 from torchid.problem.threads import one_thread
 from torchid.regressor.jacobian import generalized_forces, wrench_map, wrenches_at_base
 

@@ -7,7 +7,7 @@ the columns they can touch.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -68,6 +68,11 @@ class RowBuilder(nn.Module):
         self._planner = Planner(robot, self.columns, contacts, sensors)
         self._plans: dict[State, StatePlan] = {}
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
+        self._plans.clear()  # their tensors are where the module was
+        super()._apply(fn, recurse)
+        return self
+
     @property
     def frames(self) -> list[tuple[int, Array]]:
         """Body of each contact, and the pose (4, 4) of the contact frame in the body's joint frame."""
@@ -92,7 +97,7 @@ class RowBuilder(nn.Module):
         directions = joint_directions(self.tree, states)
         layout, out = self.columns.layout, None
         if workspace is not None:
-            out = workspace.zeros("wrenches", None, states.position, 6, layout.count, len(samples))
+            out = workspace.zeros("wrenches", states.position, 6, layout.count, len(samples))
         wrenches = all_wrench_columns(states, layout, out)
         return ChunkTerms(joints, states, directions, wrenches, samples.rotation_world_base)
 
@@ -102,7 +107,8 @@ class RowBuilder(nn.Module):
         """Blocks of rows for samples that share a contact state; no gradient flows through reused buffers.
 
         Yields:
-            (columns, rows): rows are (M, len(columns) + 1), the right-hand side last.
+            (columns, rows): rows are (M, len(columns) + 1), the right-hand side last, valid until the next
+                is asked for.
         """
         workspace = workspace or Workspace()
         plan, terms = self.plan(state), self.terms(samples, workspace)
@@ -161,7 +167,7 @@ class RowBuilder(nn.Module):
         joint row is ever formed. Columns are contiguous, as the factorization wants them.
         """
         tree, layout, inertial = self.tree, self.columns.layout, plan.inertial
-        X = workspace.zeros("projected", None, W, len(plan.support) + 1, *W.shape[1:])
+        X = workspace.zeros("projected", W, len(plan.support) + 1, *W.shape[1:])
         torch.sum(W * f[:, None], dim=0, out=X[-1])
         moved = {body: index for index, (body, _, _) in enumerate(plan.moved)}
         own = W[self._index(tree.base_rows + place for _, place, _ in plan.moved)]
@@ -171,7 +177,7 @@ class RowBuilder(nn.Module):
         torch.mul(own, torch.sign(velocity), out=friction[:, 0])
         torch.mul(own, velocity, out=friction[:, 1])
 
-        carried = workspace.zeros("carried", None, W, 6, tree.bodies, *W.shape[1:])
+        carried = workspace.zeros("carried", W, 6, tree.bodies, *W.shape[1:])
         if tree.base_rows:
             carried[:, 0] = W[:6]
         for body in range(1, tree.bodies):

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import torch
 
 from torchid.errors import BaseLostError, BaseLostWarning
+from torchid.problem.chunks import by_state
 from torchid.problem.plan import State
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.streaming import by_state
 from torchid.problem.threads import one_thread
-from torchid.sensing.projection import BASE_RANK_TOLERANCE, base_singular_values
+from torchid.sensing.projection import base_rank, base_singular_values
 
-_CHECKED = 64  # samples per chunk and state: rank is a generic property, a few postures settle it
+_CHECKED, _CHUNKS_CHECKED = 64, 8  # samples a chunk, chunks a state: rank is generic, a few postures settle it
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,13 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
     counts: dict[State, int] = {}
     values: dict[State, list[torch.Tensor]] = {}
     rows: dict[State, int] = {}
+    checked: dict[State, int] = {}
     for samples in logs:
         for state, index in by_state(samples):
             piece = samples[index]
             counts[state] = counts.get(state, 0) + len(piece)
-            if state not in values or len(values[state]) < 8:
+            checked[state] = checked.get(state, 0) + 1
+            if checked[state] <= _CHUNKS_CHECKED:
                 spread = piece[torch.linspace(0, len(piece) - 1, min(len(piece), _CHECKED)).long()].to(builder.device)
                 for _, V in builder.bases(spread, state):
                     rows[state] = max(rows.get(state, 0), V.shape[2] + len(builder.plan(state).lone_joints))
@@ -58,7 +60,7 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
         rank = smallest = None
         if builder.tree.base_rows:
             found = torch.cat(values[state])
-            rank = int((found > BASE_RANK_TOLERANCE).sum(1).max())
+            rank = int(base_rank(found).max())
             smallest = float(found[:, -1].median())
         reports.append(StateReport(" + ".join(frames) or "none", counts[state], rows[state], rank, smallest))
     return reports

@@ -2,41 +2,20 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-import torch
 
 from torchid import parameters
 from torchid.parameters import Array
+from torchid.problem.chunks import CHUNK, Progress, over_chunks
 from torchid.problem.linear import LinearProblem
 from torchid.problem.plan import State
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.threads import share_out, worker_count
 from torchid.problem.triangular import TriangularFactor
 from torchid.problem.workspace import Workspace
 from torchid.robot import Robot
-
-CHUNK = 2048
-"""Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
-
-Progress = Callable[[int], None]
-
-
-def by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slice | torch.Tensor]]:
-    """Chunks of samples that share a contact state: the state and an index into the samples."""
-    active = samples.active.cpu().numpy()
-    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
-    keys, first, which = np.unique(packed.view(f"V{packed.shape[1]}")[:, 0], return_index=True, return_inverse=True)
-    for number, example in enumerate(first):
-        if len(keys) == 1:
-            pieces: Iterable[slice | torch.Tensor] = (slice(i, i + chunk) for i in range(0, len(active), chunk))
-        else:
-            pieces = torch.from_numpy(np.flatnonzero(which == number)).split(chunk)
-        for piece in pieces:
-            yield tuple(active[example].tolist()), piece
 
 
 def compress(
@@ -48,32 +27,17 @@ def compress(
 ) -> TriangularFactor:
     """Stream all samples of some logs into one triangular factor.
 
-    Args:
-        logs: bound logs; each is moved to the builder's device chunk by chunk.
-        builder: makes the rows.
-        chunk: samples per chunk.
-        threads: worker threads, each with one intra-op thread (small arrays do not profit from more); by default one
-            per intra-op thread torch would use, one if the builder is on a GPU.
-        progress: called with the number of samples done since the last call.
+    Args: as `over_chunks`.
     """
-    device = builder.device
-    work = [(samples, state, index) for samples in logs for state, index in by_state(samples, chunk)]
-    for _, state, _ in work:
-        builder.plan(state)
-    lock = threading.Lock()
 
-    def run(part: Sequence[tuple[Samples, State, slice | torch.Tensor]]) -> TriangularFactor:
+    def fold(chunks: Iterator[tuple[Samples, State]]) -> TriangularFactor:
         factor, workspace = TriangularFactor(builder.columns.count), Workspace()
-        for samples, state, index in part:
-            piece = samples[index].to(device)
-            for support, rows in builder.rows(piece, state, workspace):
+        for samples, state in chunks:
+            for support, rows in builder.rows(samples, state, workspace):
                 factor.add(support, rows)
-            if progress is not None:
-                with lock:
-                    progress(len(piece))
         return factor
 
-    factors = share_out(work, run, threads or worker_count(device))
+    factors = over_chunks(logs, builder, fold, chunk, threads, progress)
     for other in factors[1:]:
         factors[0].merge(other)
     return factors[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -32,16 +33,28 @@ def worker_count(device: torch.device) -> int:
     return torch.get_num_threads() if device.type == "cpu" else 1
 
 
-def share_out(tasks: Sequence[Task], run: Callable[[Sequence[Task]], Result], workers: int) -> list[Result]:
-    """Results of `run`, one per worker, each called without gradients on every n-th task."""
+def share_out(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
+    """Results of `run`, one per worker, each called without gradients on every n-th task.
 
-    def alone(part: Sequence[Task]) -> Result:
-        if workers > 1:
-            torch.set_num_threads(1)
-        with torch.no_grad():
-            return run(part)
+    A failure or an interrupt stops all workers at their next task.
+    """
+    stop = threading.Event()
 
-    if workers == 1:
-        return [alone(tasks)]
-    with one_thread(), ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(alone, [tasks[i::workers] for i in range(workers)]))
+    def alone(first: int) -> Result:
+        torch.set_num_threads(1)
+        with torch.no_grad(), stopping():
+            return run(task for task in tasks[first::workers] if not stop.is_set())
+
+    @contextmanager
+    def stopping() -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            stop.set()
+            raise
+
+    with one_thread():
+        if workers == 1:
+            return [alone(0)]
+        with ThreadPoolExecutor(workers) as pool, stopping():
+            return list(pool.map(alone, range(workers)))

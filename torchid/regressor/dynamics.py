@@ -21,8 +21,8 @@ from torchid.regressor.tree import KinematicTree
 class JointRow:
     """Where the row of an independent joint can differ from zero.
 
-    `moved`: the bodies whose joints follow it (itself first, then mimic joints) with their multipliers; `start` and
-    `end`: the hull of their subtrees' columns.
+    `moved`: the bodies whose joints follow it (its own and mimic joints', in the order of bodies) with their
+    multipliers; `start` and `end`: the hull of their subtrees' columns.
     """
 
     moved: tuple[tuple[int, float], ...]

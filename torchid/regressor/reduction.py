@@ -39,7 +39,7 @@ class ColumnLayout:
 
     def runs(self, bodies: range | None = None) -> Iterator[tuple[tuple[int, ...], range]]:
         """Runs of consecutive bodies that keep the same columns, of all bodies or some: the columns, the bodies."""
-        for kept, run in groupby(bodies or range(len(self.kept)), key=lambda body: self.kept[body]):
+        for kept, run in groupby(range(len(self.kept)) if bodies is None else bodies, key=lambda body: self.kept[body]):
             members = list(run)
             yield kept, range(members[0], members[-1] + 1)
 

@@ -1,4 +1,4 @@
-"""The regressor K(q, v, a) and frame Jacobians as modules for anybody's training loop."""
+"""The regressor K(q, v, a) as a module for anybody's training loop."""
 
 from __future__ import annotations
 

@@ -27,12 +27,6 @@ _STYLE: dict[Any, Any] = {
 
 _MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
 _BASE_ROWS = ("base force x", "base force y", "base force z", "base moment x", "base moment y", "base moment z")
-_GROUP_LABELS = {
-    "joint_torque": "joint torque",
-    "base_force": "base force",
-    "base_moment": "base moment",
-    "nullspace": "projected force",
-}
 
 
 @dataclass(frozen=True)
@@ -93,7 +87,7 @@ def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
             heights = [100.0 * (metrics.relative[group] or 0.0) for group in groups]
             bars = axis.bar(place + shift, heights, 0.38, color=color, label=label)
             axis.bar_label(bars, fmt="%.3g", fontsize=8)
-        axis.set_xticks(place, [_GROUP_LABELS[group].replace(" ", "\n") for group in groups])
+        axis.set_xticks(place, [GROUPS[group].split(" [")[0].replace(" ", "\n") for group in groups])
         axis.set_title(name, loc="left")
     axes[0].set_ylabel("rms of error / rms of measured [%]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)

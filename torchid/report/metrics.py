@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from torchid.parameters import Array
+from torchid.problem.chunks import over_chunks
 from torchid.problem.plan import State
 from torchid.problem.predict import forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.streaming import by_state
-from torchid.problem.threads import share_out, worker_count
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import named_sensors
 
-GROUPS = ("joint_torque", "base_force", "base_moment", "nullspace")
-"""Groups of rows that errors are given for; units [N m], [N], [N m], [N m]."""
+GROUPS = {
+    "joint_torque": "joint torque [N m]",
+    "base_force": "base force [N]",
+    "base_moment": "base moment [N m]",
+    "nullspace": "projected force [N, N m]",
+}
+"""Groups of rows that errors are given for, with a name and unit to show."""
 
 
 @dataclass(frozen=True)
@@ -103,26 +106,18 @@ class Evaluation:
         """One `Metrics` per row of `phi`, (M, 12 L), over all samples of the logs together."""
         builder = self.builder
         columns = torch.from_numpy(phi @ builder.columns.from_parameters().T).to(builder.device)
-        work = [(samples, state, index) for samples in logs for state, index in by_state(samples)]
-        for _, state, _ in work:
-            builder.plan(state)
-        lock = threading.Lock()
 
-        def run(part: Sequence[tuple[Samples, State, slice | torch.Tensor]]) -> list[_Sums]:
+        def fold(chunks: Iterator[tuple[Samples, State]]) -> list[_Sums]:
             sums = [_Sums(self.robot.nv) for _ in range(len(phi) + 1)]
-            for samples, state, index in part:
-                piece = samples[index].to(builder.device)
-                found = forces(builder, piece, state, columns)
+            for samples, state in chunks:
+                found = forces(builder, samples, state, columns)
                 for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
                     total.rows.add(predicted - found.measured)
                 projected = [total.projected for total in sums]
-                self._project(piece, state, [found.torque, *(found.predicted - found.torque)], projected)
-                if progress is not None:
-                    with lock:
-                        progress(len(piece))
+                self._project(samples, state, [found.torque, *(found.predicted - found.torque)], projected)
             return sums
 
-        parts = share_out(work, run, worker_count(builder.device))
+        parts = over_chunks(logs, builder, fold, progress=progress)
         measured, *errors = [_Sums.total(same) for same in zip(*parts, strict=True)]
         return [self._summary(error, measured) for error in errors]
 

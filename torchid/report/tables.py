@@ -10,13 +10,6 @@ from rich.text import Text
 
 from torchid.report.metrics import GROUPS, Metrics
 
-_ROWS = {
-    "joint_torque": "joint torque [N m]",
-    "base_force": "base force [N]",
-    "base_moment": "base moment [N m]",
-    "nullspace": "projected force [N m]",
-}
-
 
 def print_tables(*tables: Table) -> None:
     """Print to standard output, at most 100 columns wide; a file or pipe gets the full 100."""
@@ -41,9 +34,9 @@ def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
     for name in columns:
         for which in ("URDF", "identified"):
             table.add_column(Text(f"{name}\n{which}"), justify="right", overflow="fold")
-    for group in GROUPS:
+    for group, label in GROUPS.items():
         cells = [_cell(m, group) for pair in columns.values() for m in pair]
-        table.add_row(_ROWS[group], *cells)
+        table.add_row(Text(label), *cells)
     return table
 
 

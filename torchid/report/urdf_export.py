@@ -21,29 +21,39 @@ def identified_urdf(robot: Robot, phi: Array) -> bytes:
     they were written.
 
     Warns:
-        TorchidWarning: bodies that no distribution of positive mass can have, which simulators refuse.
+        TorchidWarning: bodies that no distribution of positive mass can have, or negative friction, which simulators
+            (and `load_robot`) refuse.
     """
     tree = parse_xml(robot.path)
     links = {link.get("name"): link for link in tree.getroot().findall("link")}
     joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
-    impossible = []
+    _warn(robot, phi)
     for body, values in zip(robot.bodies, phi, strict=True):
         for name in body.links:
             for inertial in links[name].findall("inertial"):
                 links[name].remove(inertial)
         if body.joint is not None:
             _set_friction(joints[body.joint.name], values)
-        if not values[parameters.INERTIAL].any():
-            continue
-        if values[parameters.MASS] <= 0.0 or parameters.consistency_margin(values) < 0.0:
-            impossible.append(body.name)
         if values[parameters.MASS] != 0.0:
             links[body.name].insert(0, _inertial(values))
-    if impossible:
-        message = f"identified.urdf: no distribution of positive mass has the parameters of {', '.join(impossible)}"
-        warnings.warn(f"{message}; simulators will refuse or misread them", TorchidWarning, stacklevel=2)
     etree.indent(tree)
     return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+
+
+def _warn(robot: Robot, phi: Array) -> None:
+    impossible, driving = [], []
+    for body, values in zip(robot.bodies, phi, strict=True):
+        margin = parameters.consistency_margin(values)
+        if values.any() and (values[parameters.MASS] < 0.0 or margin < parameters.POSSIBLE_MARGIN):
+            impossible.append(body.name)
+        if body.joint is not None and (values[parameters.FRICTION] < 0.0).any():
+            driving.append(body.joint.name)
+    if impossible:
+        message = f"identified.urdf: no distribution of positive mass has the parameters of {', '.join(impossible)}"
+        warnings.warn(f"{message}; simulators will refuse or misread them", TorchidWarning, stacklevel=3)
+    if driving:
+        message = f"identified.urdf: negative friction at {', '.join(driving)}; simulators and torchid refuse it"
+        warnings.warn(message, TorchidWarning, stacklevel=3)
 
 
 def _inertial(values: Array) -> etree._Element:

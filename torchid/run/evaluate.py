@@ -19,7 +19,9 @@ from torchid.run.identify import forces_of
 from torchid.run.progress import progress_bars
 
 
-def evaluate(run: str | Path, logs: Sequence[str | Path]) -> tuple[dict[str, tuple[Metrics, Metrics]], Path]:
+def evaluate(
+    run: str | Path, logs: Sequence[str | Path], device: str | None = None
+) -> tuple[dict[str, tuple[Metrics, Metrics]], Path]:
     """Evaluate nominal and identified parameters.
 
     Results go to `RUN/evaluation/<name of the first log>` and replace an earlier evaluation of that name.
@@ -27,6 +29,7 @@ def evaluate(run: str | Path, logs: Sequence[str | Path]) -> tuple[dict[str, tup
     Args:
         run: folder that `identify` wrote.
         logs: log files, preprocessed as the run's own were.
+        device: where to compute; None: where the run did.
 
     Returns:
         Nominal and identified metrics by log name, and the folder they were written to.
@@ -43,7 +46,7 @@ def evaluate(run: str | Path, logs: Sequence[str | Path]) -> tuple[dict[str, tup
         raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
     output = folder / "evaluation" / names[0]
     check_free(output, overwrite=True)
-    config = load_config(folder / "config.yaml")
+    config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])
     with progress_bars() as bars:
         experiment = set_up(config, folder / "config.yaml")
         robot = experiment.robot

@@ -58,8 +58,13 @@ def new_folder(output: Path, overwrite: bool = False) -> Iterator[Path]:
         if output.exists():
             retired = Path(tempfile.mkdtemp(prefix=f".{output.name}-old-", dir=output.parent))
             output.rename(retired / "run")
-            temporary.rename(output)
-            shutil.rmtree(retired)
+            try:
+                temporary.rename(output)
+            except BaseException:
+                (retired / "run").rename(output)
+                raise
+            finally:
+                shutil.rmtree(retired, ignore_errors=True)
         else:
             temporary.rename(output)
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -166,9 +166,8 @@ def metrics_document(run: Identification) -> dict[str, object]:
 
 
 def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
-    named: Sequence[object] = (config.sensors.set or "by name",)
     return {
-        "sensors": str(named[0]),
+        "sensors": config.sensors.set or "by name",
         "estimator": config.estimator.name,
         "ridge": config.estimator.ridge,
         "friction": config.estimator.friction,

@@ -27,6 +27,17 @@ class Contact:
     kind: str
     line_axis: str = "y"
 
+    def __post_init__(self) -> None:
+        """Refuse what is no contact.
+
+        Raises:
+            SensorError: an unknown kind or line axis.
+        """
+        if self.kind not in CONTACT_TYPES:
+            raise SensorError(f"contact '{self.frame}'", "type", f"'{self.kind}'", ", ".join(CONTACT_TYPES))
+        if self.line_axis not in ("x", "y", "z"):
+            raise SensorError(f"contact '{self.frame}'", "line_axis", f"'{self.line_axis}'", "x, y, z")
+
     @property
     def components(self) -> tuple[int, ...]:
         """Places in `COMPONENTS` that can differ from zero."""
@@ -47,7 +58,7 @@ def check_contacts(robot: Robot, contacts: Sequence[Contact], source: object = "
 
     Raises:
         UnknownNameError: a frame that the URDF does not have.
-        SensorError: a frame named twice, an unknown kind or line axis.
+        SensorError: a frame named twice.
     """
     seen: set[str] = set()
     for index, contact in enumerate(contacts):
@@ -55,9 +66,5 @@ def check_contacts(robot: Robot, contacts: Sequence[Contact], source: object = "
         robot.link(contact.frame, f"{source}: {field}.frame")
         if contact.frame in seen:
             raise SensorError(source, f"{field}.frame", f"'{contact.frame}' named twice", "each frame once")
-        if contact.kind not in CONTACT_TYPES:
-            raise SensorError(source, f"{field}.type", f"'{contact.kind}'", ", ".join(CONTACT_TYPES))
-        if contact.line_axis not in ("x", "y", "z"):
-            raise SensorError(source, f"{field}.line_axis", f"'{contact.line_axis}'", "x, y, z")
         seen.add(contact.frame)
     return tuple(contacts)

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 RANK_TOLERANCE = 1e-9
-"""A singular value of A_x below this share of the largest counts as zero."""
+"""A singular value of A_x below this share of the largest counts as zero (more in single precision)."""
 
-_SUSPECT = 1e-6  # below this share of the largest, the QR path hands the sample to an SVD
+_SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an SVD
 
 
 def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
@@ -31,6 +31,7 @@ def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
     if samples == 0:
         return
     identity = torch.eye(m, dtype=A.dtype, device=A.device)
+    tolerance = max(RANK_TOLERANCE, max(k, m) * torch.finfo(A.dtype).eps)
     if k == 0:
         yield slice(None), identity.expand(samples, m, m)
         return
@@ -40,7 +41,7 @@ def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
         R = reflectors[:, :k].triu()
         inverse = torch.linalg.solve_triangular(R, identity[:k, :k].expand_as(R), upper=True)
         condition = torch.linalg.matrix_norm(R) * torch.linalg.matrix_norm(inverse)
-        suspect = ~(condition < 1.0 / _SUSPECT)  # so written, infinite and undefined ones are suspect too
+        suspect = ~(condition < 1.0 / (_SUSPECT * tolerance))  # so written, infinite and undefined ones are suspect too
         V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
         if not suspect.any():
             yield slice(None), V
@@ -50,7 +51,7 @@ def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
             yield regular, V[regular]
     left = torch.nonzero(suspect)[:, 0]
     _, values, Vh = torch.linalg.svd(A[left], full_matrices=True)
-    rank = (values > RANK_TOLERANCE * values[:, :1].clamp_min(torch.finfo(A.dtype).tiny)).sum(1)
+    rank = (values > tolerance * values[:, :1].clamp_min(torch.finfo(A.dtype).tiny)).sum(1)
     for r in rank.unique().tolist():
         same = rank == r
         yield left[same], Vh[same, r:].mT

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from torchid.sensing.nullspace import null_space, whitened_null_space
 
-BASE_RANK_TOLERANCE = 1e-6
-"""A singular value of S_b V_x below this counts as a lost direction of the base (V_x is orthonormal: at most 1)."""
+_BASE_RANK_TOLERANCE = 1e-6  # V_x is orthonormal: singular values of S_b V_x are at most 1
 
 
 @dataclass(frozen=True)
@@ -34,6 +33,12 @@ def base_singular_values(V: Tensor) -> Tensor:
     """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, nv, r) orthonormal."""
     values = torch.linalg.svdvals(V[:, :6])
     return nn.functional.pad(values, (0, 6 - values.shape[1]))
+
+
+def base_rank(singular_values: Tensor) -> Tensor:
+    """rank(S_b V_x), (B,), from `base_singular_values`."""
+    tolerance = max(_BASE_RANK_TOLERANCE, 100.0 * torch.finfo(singular_values.dtype).eps)
+    return (singular_values > tolerance).sum(1)
 
 
 class Projection(nn.Module):
@@ -73,11 +78,17 @@ class Projection(nn.Module):
         torque = torch.as_tensor(torque_measured, dtype=torch.bool)
         self.base_rows = base_rows
         self.register_buffer("torque_measured", torque, persistent=False)
-        self.register_buffer("wrench_measured", torch.as_tensor(wrench_measured, dtype=torch.bool), persistent=False)
-        self.register_buffer("kept", torch.cat([torch.ones(base_rows, dtype=torch.bool), torque]), persistent=False)
+        self.register_buffer(
+            "wrench_measured",
+            torch.as_tensor(wrench_measured, dtype=torch.bool, device=torque.device),
+            persistent=False,
+        )
+        self.register_buffer("kept", torch.cat([torque.new_ones(base_rows), torque]), persistent=False)
         self._whiten = torque_noise is not None
         if self._whiten:
-            torque_std, wrench_std, base_std = (torch.as_tensor(x, dtype=torch.float64) for x in noises)
+            torque_std, wrench_std, base_std = (
+                torch.as_tensor(x, dtype=torch.float64, device=torque.device) for x in noises
+            )
             rows = torch.cat([base_std.expand(base_rows), torque_std.expand(len(torque))])
             wrench_std = wrench_std.expand(len(self.get_buffer("wrench_measured")))
             if not bool((rows > 0.0).all()) or not bool((wrench_std > 0.0).all()):
@@ -122,11 +133,11 @@ class Projection(nn.Module):
             V[:, kept] = basis
             if self.base_rows:
                 orthonormal = torch.linalg.qr(V).Q if self._whiten else V
-                base_rank = (base_singular_values(orthonormal) > BASE_RANK_TOLERANCE).sum(1)
+                rank = base_rank(base_singular_values(orthonormal))
             else:
-                base_rank = index.new_zeros(V.shape[0])
+                rank = index.new_zeros(V.shape[0])
             groups.append(
-                ProjectedGroup(index[rows], state, V, V.mT @ K[rows], (V.mT @ f[rows, :, None])[..., 0], base_rank)
+                ProjectedGroup(index[rows], state, V, V.mT @ K[rows], (V.mT @ f[rows, :, None])[..., 0], rank)
             )
         return groups
 
