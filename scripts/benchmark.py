@@ -128,12 +128,6 @@ class PerSample:
         friction = np.hstack([V[:, 6:] * np.sign(v[6:]), V[:, 6:] * v[6:]])
         return np.hstack([V @ K, friction]), V @ f
 
-    def residual(self, samples: Samples, phi: Array) -> float:
-        """Root mean square of the whitened residual at parameters in `by_stack`'s order."""
-        q, v, a, f = self.states(samples)
-        blocks = [self.projected(*x) for x in zip(q, v, a, f, samples.active.numpy(), strict=True)]
-        return float(np.sqrt(np.mean(np.concatenate([Y @ phi - y for Y, y in blocks]) ** 2)))
-
     def by_stack(self, samples: Samples) -> Array:
         """All rows stacked, one `numpy.linalg.lstsq`."""
         q, v, a, f = self.states(samples)
@@ -173,11 +167,8 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
         robot = load_robot(urdf)
     contacts = [Contact(foot, case.kind) for foot in case.feet]
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts)))
-    samples, old, regressor = (
-        random_samples(robot, len(contacts), count),
-        PerSample(urdf, robot, case),
-        Regressor(robot),
-    )
+    samples = random_samples(robot, len(contacts), count)
+    old, regressor = PerSample(urdf, robot, case), Regressor(robot)
     few = samples[torch.arange(0, count, 32)]
 
     def pipeline() -> None:

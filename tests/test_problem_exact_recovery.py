@@ -15,9 +15,9 @@ from synthetic import G1, ROBOTS, Array, Oracle, load, make_log, random_states
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
 from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
 from torchid.problem.states import check_base, state_reports
-from torchid.problem.streaming import parameter_scale
 from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors

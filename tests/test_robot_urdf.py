@@ -94,13 +94,25 @@ WRONG_JOINTS = {
 }
 
 UNREADABLE_NUMBERS = {
-    "a word for a mass": (link("base", inertial(mass="heavy")), ARM, HINGE),
-    "a word for an inertia": (link("base", inertial(ixx="big")), ARM, HINGE),
-    "a word for an axis": (BASE, ARM, joint("elbow", "base", "arm", extra='<axis xyz="0 0 up"/>')),
-    "a word for a ratio": (*TREE, link("hand"), joint("w", "arm", "hand", extra=mimic("elbow", 'multiplier="two"'))),
-    "a word for a damping": (BASE, ARM, joint("elbow", "base", "arm", extra='<dynamics damping="some"/>')),
-    "an origin of two numbers": (BASE, ARM, joint("elbow", "base", "arm", extra='<origin xyz="0 1"/>')),
-    "a decimal comma": (link("base", inertial(mass="1,5")), ARM, HINGE),
+    "a word for a mass": ((link("base", inertial(mass="heavy")), ARM, HINGE), "link 'base', <mass value>: 'heavy'"),
+    "a word for an inertia": ((link("base", inertial(ixx="big")), ARM, HINGE), "link 'base', <inertia ixx>: 'big'"),
+    "a word for an axis": (
+        (BASE, ARM, joint("elbow", "base", "arm", extra='<axis xyz="0 0 up"/>')),
+        "joint 'elbow', <axis xyz>: '0 0 up'",
+    ),
+    "a word for a ratio": (
+        (*TREE, link("hand"), joint("w", "arm", "hand", extra=mimic("elbow", 'multiplier="two"'))),
+        "joint 'w', <mimic multiplier>: 'two'",
+    ),
+    "a word for a damping": (
+        (BASE, ARM, joint("elbow", "base", "arm", extra='<dynamics damping="some"/>')),
+        "joint 'elbow', <dynamics damping>: 'some'",
+    ),
+    "an origin of two numbers": (
+        (BASE, ARM, joint("elbow", "base", "arm", extra='<origin xyz="0 1"/>')),
+        "joint 'elbow', <origin xyz>: '0 1'; accepted: 3 decimal numbers",
+    ),
+    "a decimal comma": ((link("base", inertial(mass="1,5")), ARM, HINGE), "link 'base', <mass value>: '1,5'"),
 }
 
 
@@ -134,8 +146,9 @@ def test_a_mimic_joint_with_a_ratio_that_is_no_number_is_refused(attribute: str,
 
 
 @table(UNREADABLE_NUMBERS)
-def test_a_number_that_cannot_be_read_is_refused(case: tuple, tmp_path: Path) -> None:
-    refusal(write(tmp_path, *case))
+def test_a_number_that_cannot_be_read_is_refused_by_its_place(case: tuple, tmp_path: Path) -> None:
+    elements, expected = case
+    assert expected in refusal(write(tmp_path, *elements))
 
 
 def test_an_origin_that_is_not_finite_is_refused_at_a_fixed_joint_too(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchid import parameters
 from torchid.parameters import Array
 
 
@@ -48,3 +49,21 @@ class LinearProblem:
         """Sum of squared whitened residuals over all rows at parameters `phi`, (P,)."""
         misfit = self.A @ phi - self.b
         return float(misfit @ misfit + self.residual)
+
+
+def parameter_scale(nominal: Array) -> Array:
+    """Size of a plausible deviation of each parameter, (L, 12): what the pull to the URDF is measured in.
+
+    Mass m of the body; first moments m r; inertias m r^2, with r the body's radius of gyration about its link origin;
+    friction 1 N m and 1 N m s/rad.
+    """
+    mass = nominal[:, parameters.MASS]
+    typical = mass[mass > 0.0].mean()
+    mass = np.maximum(mass, 1e-3 * typical)
+    gyration = np.trace(parameters.inertia_matrix(nominal), axis1=1, axis2=2) / 2.0 / mass
+    radius = np.sqrt(np.maximum(gyration, 1e-4))  # at least a centimetre
+    scale = np.ones_like(nominal)
+    scale[:, parameters.MASS] = mass
+    scale[:, parameters.FIRST_MOMENT] = (mass * radius)[:, None]
+    scale[:, parameters.INERTIA] = (mass * radius**2)[:, None]
+    return scale

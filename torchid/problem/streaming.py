@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from torchid import parameters
-from torchid.parameters import Array
 from torchid.problem.chunks import CHUNK, Progress, over_chunks
-from torchid.problem.linear import LinearProblem
+from torchid.problem.linear import LinearProblem, parameter_scale
 from torchid.problem.plan import State
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -63,21 +62,3 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
         scale=parameter_scale(robot.nominal).flatten(),
         free=free.flatten(),
     )
-
-
-def parameter_scale(nominal: Array) -> Array:
-    """Size of a plausible deviation of each parameter, (L, 12): what the pull to the URDF is measured in.
-
-    Mass m of the body; first moments m r; inertias m r^2, with r the body's radius of gyration about its link origin;
-    friction 1 N m and 1 N m s/rad.
-    """
-    mass = nominal[:, parameters.MASS]
-    typical = mass[mass > 0.0].mean()
-    mass = np.maximum(mass, 1e-3 * typical)
-    gyration = np.trace(parameters.inertia_matrix(nominal), axis1=1, axis2=2) / 2.0 / mass
-    radius = np.sqrt(np.maximum(gyration, 1e-4))  # at least a centimetre
-    scale = np.ones_like(nominal)
-    scale[:, parameters.MASS] = mass
-    scale[:, parameters.FIRST_MOMENT] = (mass * radius)[:, None]
-    scale[:, parameters.INERTIA] = (mass * radius**2)[:, None]
-    return scale

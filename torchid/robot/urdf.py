@@ -15,9 +15,10 @@ from torchid.errors import UnknownNameError, UrdfError
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING_TYPES, "fixed")
-_NUMBERS = {"xyz": 3, "rpy": 3, "value": 1, "multiplier": 1, "offset": 1, "damping": 1, "friction": 1}
 _KEPT = {"link": {"inertial"}, "joint": {"origin", "parent", "child", "axis", "mimic", "dynamics"}}
 _INERTIA_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_SCALARS = ("value", "multiplier", "offset", "damping", "friction", *_INERTIA_ATTRIBUTES)
+_NUMBERS = {"xyz": 3, "rpy": 3} | dict.fromkeys(_SCALARS, 1)  # how many an attribute holds
 
 
 def parse_xml(path: Path) -> etree._ElementTree:
@@ -96,7 +97,7 @@ def _check_numbers(path: Path, owner: etree._Element) -> None:
     """Refuse what is no decimal number, before a parser that would not say where it stands."""
     for element in owner.iter():
         for name, text in element.attrib.items():
-            count = 1 if name in _INERTIA_ATTRIBUTES else _NUMBERS.get(str(name), 0)
+            count = _NUMBERS.get(str(name), 0)
             if not count:
                 continue
             words = str(text).split()
