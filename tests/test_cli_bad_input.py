@@ -129,7 +129,7 @@ LOGS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "base position missing": (edit_log(base_position_world=None), ("base_linear_acceleration", "base_position_world")),
     "contact not in the URDF": (
         edit_log(contact_names=renamed("rear_left_foot", "rear_left_paw")),
-        ("rear_left_paw", "rear_left_foot"),
+        ("sway_train.npz: contact_names: unknown name 'rear_left_paw'", "rear_left_foot"),
     ),
     "contact activity missing": (
         edit_log(contact_active=None),
@@ -181,7 +181,7 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
     ),
     "unknown contact frame": (
         edit_config(contacts=[{"frame": "front_left_fot", "type": "point"}]),
-        ("front_left_fot", "front_left_foot"),
+        ("quadruped.yaml: contacts[0].frame: unknown name 'front_left_fot'; accepted: front_left_foot",),
     ),
     "active contact left out": (edit_config(contacts=CONTACTS[:3]), ("rear_right_foot", "active")),
     "contact missing in the log": (edit_config(contacts=[*CONTACTS, {"frame": "trunk", "type": "flat"}]), ("trunk",)),

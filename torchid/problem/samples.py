@@ -184,7 +184,7 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
     """Columns of the log's contacts in the experiment's order, and their activity (N, C)."""
     frames = [contact.frame for contact in contacts]
     for column, name in enumerate(log.contact_names):
-        robot.link(name, f"{log.source}: contact_names")
+        robot.link(name, "contact_names", log.source)
         if name not in frames and log.contact_active is not None and log.contact_active[:, column].any():
             raise LogError(log.source, f"contact_names '{name}'", "active, but not among the experiment's contacts",
                            f"contacts: [{{frame: {name}, type: ...}}, ...]")  # fmt: skip

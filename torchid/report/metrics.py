@@ -22,7 +22,7 @@ GROUPS = {
     "joint_torque": "joint torque [N m]",
     "base_force": "base force [N]",
     "base_moment": "base moment [N m]",
-    "nullspace": "projected force [N, N m]",
+    "nullspace": "projected [N, N m]",
 }
 """Groups of rows that errors are given for, with a name and unit to show."""
 

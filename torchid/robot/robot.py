@@ -110,14 +110,19 @@ class Robot:
         columns = [order[name] for name in self.chain.get_joint_parameter_names()]
         return link_poses(self.chain, in_depth_first_order[:, columns])
 
-    def link(self, name: str, field: str = "link") -> tuple[int, Array]:
+    def link(self, name: str, field: str = "link", source: object = None) -> tuple[int, Array]:
         """Body index and pose in that body, (4, 4) [m], of a URDF link.
+
+        Args:
+            name: the link.
+            field: what named it, for the error.
+            source: the file that is in; the URDF if None.
 
         Raises:
             UnknownNameError: the URDF has no such link.
         """
         if name not in self.links:
-            raise UnknownNameError(self.path, field, name, self.links)
+            raise UnknownNameError(source or self.path, field, name, self.links)
         return self.links[name]
 
 

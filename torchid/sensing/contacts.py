@@ -63,7 +63,7 @@ def check_contacts(robot: Robot, contacts: Sequence[Contact], source: object = "
     seen: set[str] = set()
     for index, contact in enumerate(contacts):
         field = f"contacts[{index}]"
-        robot.link(contact.frame, f"{source}: {field}.frame")
+        robot.link(contact.frame, f"{field}.frame", source)
         if contact.frame in seen:
             raise SensorError(source, f"{field}.frame", f"'{contact.frame}' named twice", "each frame once")
         seen.add(contact.frame)
