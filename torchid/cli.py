@@ -18,6 +18,7 @@ from torchid.errors import BaseLostError, InputError, TorchidWarning
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
+_SIMULATE = "let a robot move in simulation and write the logs of its sensors (needs the extra [sim])"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,7 +59,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument("--device", help="where to compute, if not where the run did: cpu, cuda, cuda:0, ...")
     evaluate.set_defaults(command=_evaluate)
-    for command in (identify, evaluate):
+    simulate = commands.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
+    simulate.add_argument("file", help="simulation file (YAML)")
+    simulate.add_argument("overrides", nargs="*", help="key.subkey=value, for example sensors.bias.enabled=true")
+    simulate.set_defaults(command=_simulate)
+    for command in (identify, evaluate, simulate):
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
     return parser
 
@@ -108,6 +113,18 @@ def _evaluate(options: argparse.Namespace) -> None:
     metrics, output = evaluate(options.run, options.log, options.device)
     print_tables(*error_tables(metrics))
     print(f"written to    {output}")
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    with _interrupt_held_back():
+        from torchid.config import load_simulation
+        from torchid.report.tables import print_tables, stability_table
+        from torchid.run.simulate import simulate
+
+    config = load_simulation(options.file, options.overrides)
+    found = simulate(config, options.file)
+    print_tables(stability_table({name: asdict(stability) for name, stability in found.items()}))
+    print(f"written to    {config.output}")
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:

@@ -22,6 +22,10 @@ class InputError(TorchidError, ValueError):
         message = f"{source}: {field}: {found}; accepted: {accepted}"
         super().__init__(" ".join(message.split()))
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Errors of worker processes reach their parent."""
+        return type(self), (self.source, self.field, self.found, self.accepted)
+
 
 class UrdfError(InputError):
     """A URDF that does not describe a tree of rigid bodies torchid can use."""
@@ -45,6 +49,9 @@ class UnknownNameError(InputError, KeyError):
     def __init__(self, source: object, field: str, name: str, valid: Iterable[str]) -> None:
         self.name, self.valid = name, tuple(valid)
         super().__init__(source, field, f"unknown name '{name}'", nearest(name, self.valid))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), (self.source, self.field, self.name, self.valid)
 
     __str__ = Exception.__str__  # KeyError would show the repr of the message
 

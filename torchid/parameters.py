@@ -97,3 +97,17 @@ def consistency_margin(phi: Array) -> Array:
     """Smallest eigenvalue of the pseudo-inertia over its largest, (...,); negative means physically impossible."""
     eigenvalues = np.linalg.eigvalsh(pseudo_inertia(phi))
     return eigenvalues[..., 0] / np.maximum(eigenvalues[..., -1], np.finfo(float).tiny)
+
+
+def perturbed(phi: Array, error: float, rng: np.random.Generator) -> Array:
+    """Parameters (L, 12) of bodies that differ from `phi` by up to a share `error`, yet could exist as well as those.
+
+    Mass, each coordinate of the centre of mass, and the inertia about it are multiplied by factors from 1 - error to
+    1 + error, independently and uniformly; friction stays.
+    """
+    out = phi.copy()
+    for body in np.flatnonzero(phi[:, MASS] > 0.0):
+        mass, com, inertia = mass_com_inertia(phi[body])
+        factors = 1.0 + error * rng.uniform(-1.0, 1.0, 5)
+        out[body, INERTIAL] = inertial_vector(factors[0] * mass, factors[1:4] * com, factors[4] * inertia)
+    return out

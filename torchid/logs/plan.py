@@ -20,6 +20,9 @@ FILTER_ORDER = 4
 #: its error on an acceleration is 5 % of that signal's rms after 1 period, 2 to 3 % after 1.5, under 1 % after 2
 #: (3 % for a base that spins once a second, whose quaternion has a large second derivative even at constant rate).
 DROPPED_PERIODS = 2.0
+#: Periods of the cutoff over which the filter smears a force: 2 % of a step are left beyond, 0.05 % of one that takes
+#: two periods.
+REACH_PERIODS = 1.0
 #: Samples dropped at each end where an unfiltered log is differentiated: the spline multiplies noise 8.5 times more at
 #: the first sample than inside the log, 2.4 times more at the second and 1.3 times at the third.
 DROPPED_SAMPLES = 2
@@ -78,7 +81,8 @@ def plan(
             found = f"{sample_rate_hz:g}, which leaves one sample"
             accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
             raise InputError(source, "preprocessing.sample_rate_hz", found, accepted)
-    return Timeline(native, grid, kept, output, low_pass)
+    reach = 0.0 if cutoff_hz is None else REACH_PERIODS / cutoff_hz
+    return Timeline(native, grid, kept, output, low_pass, reach)
 
 
 def _median_step(source: str, native: FloatArray) -> float:

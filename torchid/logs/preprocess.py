@@ -42,6 +42,8 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
 
     Where a log is filtered or resampled, `contact_active` is held from the previous sample, a wrench counts as 0
     while its contact is inactive, and a torque or wrench channel that is NaN in some samples becomes NaN throughout.
+    In a filtered log a contact is active from 1/cutoff_hz before it truly is until 1/cutoff_hz after, for the filter
+    spreads its force that far: to project out a force that is 0 costs data, to overlook one that is not costs truth.
 
     Args:
         log: the log.
@@ -73,7 +75,7 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
         if getattr(log, name) is not None:
             fields[name] = carry_measured(log, name, timeline)
     if log.contact_active is not None:
-        fields["contact_active"] = timeline.hold(log.contact_active)
+        fields["contact_active"] = timeline.active(log.contact_active)
     return dataclasses.replace(log, **fields)
 
 

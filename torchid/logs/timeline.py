@@ -41,6 +41,7 @@ class Timeline:
         kept: the samples of `grid` that neither filter nor spline spoils.
         output: (K,) stamps of the preprocessed log, None for those of `kept`.
         low_pass: the filter, None without one.
+        reach: how far the filter smears what it filters [s], 0 without one.
     """
 
     native: FloatArray
@@ -48,6 +49,7 @@ class Timeline:
     kept: slice
     output: FloatArray | None
     low_pass: LowPass | None
+    reach: float
 
     @property
     def at(self) -> FloatArray:
@@ -72,9 +74,17 @@ class Timeline:
             return [smoothed[self.kept], *rest]
         return spline_derivatives(self.grid, smoothed, self.at, orders)
 
-    def hold(self, flags: BoolArray) -> BoolArray:
-        """Flags (N, ...) at the output's stamps (K, ...): each is that of the last sample not after it."""
-        if self.keeps_stamps:
+    def active(self, flags: BoolArray) -> BoolArray:
+        """Flags (N, ...) at the output's stamps (K, ...): true where they are within `reach` of the stamp.
+
+        A flag holds until the next sample.
+        """
+        if self.keeps_stamps and not self.reach:
             return flags[self.kept]
-        late = self.at + JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
-        return flags[np.searchsorted(self.native, late, side="right") - 1]
+        slack = JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
+        first, last = (
+            np.searchsorted(self.native, self.at + slack + reach, side="right") - 1
+            for reach in (-self.reach, self.reach)
+        )
+        count = np.concatenate([np.zeros((1, *flags.shape[1:]), dtype=np.intp), np.cumsum(flags, axis=0)])
+        return np.asarray(count[last + 1] > count[np.maximum(first, 0)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -60,5 +61,22 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
             str(state["rows"]),
             "fixed base" if rank is None else f"{rank} of 6",
             "" if smallest is None else f"{smallest:.2g}",
+        )
+    return table
+
+
+def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
+    """How a simulated robot stood: fields of `Stability` by motion."""
+    table = Table(title="Standing", title_justify="left")
+    for heading in ("motion", "base height [m]", "slip [mm]", "zero-moment point inside by [mm]", "feet up [%]"):
+        table.add_column(heading, justify="left" if heading == "motion" else "right")
+    for name, found in motions.items():
+        low, high = found["base_height"]
+        table.add_row(
+            Text(name),
+            f"{low:.3f} to {high:.3f}",
+            f"{1e3 * found['slip']:.1f}",
+            f"{1e3 * found['zmp_margin']:.0f}",
+            ", ".join(f"{100 * share:.0f}" for share in found["unloaded"]),
         )
     return table

@@ -6,19 +6,38 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 
 from torchid.errors import ConfigError
 
-_FILES = ("config.yaml", "parameters.json", "metrics.json", "identified.urdf")
-_OWN = {*_FILES, "forces.png", "errors.png", "parameters.png", "hparams", "evaluation"}
+
+@dataclass(frozen=True)
+class FolderKind:
+    """What a folder that may be overwritten holds: a file that tells its kind, and patterns of the other names."""
+
+    name: str
+    mark: str
+    others: tuple[str, ...]
+
+    def foreign(self, names: Sequence[str]) -> list[str]:
+        """Those of the names that are no part of such a folder."""
+        own = (self.mark, *self.others)
+        return sorted(name for name in names if not any(fnmatch(name, pattern) for pattern in own))
+
+
+_RESULTS = ("parameters.json", "metrics.json", "identified.urdf", "forces.png", "errors.png", "parameters.png")
+RUN = FolderKind("run", "config.yaml", (*_RESULTS, "hparams", "evaluation", "events.out.tfevents*"))
+SIMULATION = FolderKind("simulation", "simulation.yaml", ("logs", "exact", "nominal.urdf", "stability.json"))
+
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer
 
 
-def check_free(output: Path, overwrite: bool) -> None:
-    """Make sure, before any work, that a run may be written.
+def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN) -> None:
+    """Make sure, before any work, that a folder of a kind may be written.
 
     Raises:
         ConfigError: `output` exists and may not be replaced, or is no place for a folder.
@@ -35,10 +54,11 @@ def check_free(output: Path, overwrite: bool) -> None:
         raise ConfigError(output, "output", f"no folder can be made there, in {above}", "a place that can be written")
     if names and not overwrite:
         raise ConfigError(output, "output", "not empty", "a new folder, or overwrite=true")
-    foreign = sorted(name for name in names if name not in _OWN and not name.startswith("events.out.tfevents"))
-    if names and (foreign or "config.yaml" not in names):
-        found = f"holds {', '.join(foreign[:3])}, no part of a run" if foreign else "not empty and not a run folder"
-        raise ConfigError(output, "output", found, "a new folder, or a run to overwrite")
+    foreign = kind.foreign(names)
+    if names and (foreign or kind.mark not in names):
+        what = f"no part of a {kind.name}" if foreign else f"not a {kind.name} folder"
+        found = f"holds {', '.join(foreign[:3])}, {what}" if foreign else f"not empty and {what}"
+        raise ConfigError(output, "output", found, f"a new folder, or a {kind.name} to overwrite")
 
 
 def write_json(path: Path, document: object) -> None:
@@ -47,9 +67,9 @@ def write_json(path: Path, document: object) -> None:
 
 
 @contextmanager
-def new_folder(output: Path, overwrite: bool = False) -> Iterator[Path]:
+def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) -> Iterator[Path]:
     """A temporary folder beside `output` that takes its place when the block ends without an error."""
-    check_free(output, overwrite)
+    check_free(output, overwrite, kind)
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
     temporary.chmod(0o755)

@@ -1,0 +1,8 @@
+"""Write the demo biped's URDF, which ships with the package, from its description: `python scripts/make_biped.py`."""
+
+from pathlib import Path
+
+from torchid.simulation.biped import biped_urdf
+
+if __name__ == "__main__":
+    (Path(__file__).resolve().parents[1] / "torchid" / "demo" / "biped.urdf").write_bytes(biped_urdf())

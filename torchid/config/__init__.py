@@ -1,0 +1,25 @@
+"""Settings files: typed dataclasses, YAML, and overrides from the command line."""
+
+from torchid.config.experiment import ExperimentConfig, dump_config, load_config
+from torchid.config.simulation import (
+    BoundsConfig,
+    FootConfig,
+    MotionConfig,
+    SensorImperfectionsConfig,
+    SimulationConfig,
+    StepsConfig,
+    load_simulation,
+)
+
+__all__ = [
+    "BoundsConfig",
+    "ExperimentConfig",
+    "FootConfig",
+    "MotionConfig",
+    "SensorImperfectionsConfig",
+    "SimulationConfig",
+    "StepsConfig",
+    "dump_config",
+    "load_config",
+    "load_simulation",
+]

@@ -1,0 +1,171 @@
+"""The experiment file of `torchid identify`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field
+from pydantic.dataclasses import dataclass
+
+from torchid.config.reading import FileKind, Settings, dump, load
+from torchid.config.types import STRICT, Device, NotNegative, Number, Positive
+from torchid.errors import ConfigError
+from torchid.sensing.sensors import SensorNoise
+
+Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
+
+
+@dataclass(config=STRICT, frozen=True)
+class RobotConfig:
+    """Which robot: `base_link` defaults to the URDF's root."""
+
+    urdf: Path
+    base_link: str | None = None
+    fixed_base: bool = False
+
+
+@dataclass(config=STRICT, frozen=True)
+class ContactConfig:
+    """A contact at a URDF frame: `line_axis` is the frame's axis that a line contact runs along."""
+
+    frame: str
+    type: Literal["point", "line", "flat"]
+    line_axis: Literal["x", "y", "z"] = "y"
+
+
+@dataclass(config=STRICT, frozen=True)
+class LogsConfig:
+    """Logs to fit on, and logs the fit never sees; `*` and `?` in a name stand for all files that match."""
+
+    train: Annotated[list[Path], Field(min_length=1)]
+    test: list[Path] = dataclasses.field(default_factory=list)
+
+
+@dataclass(config=STRICT, frozen=True)
+class PreprocessingConfig:
+    """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are."""
+
+    cutoff_hz: Positive | None = None
+    sample_rate_hz: Positive | None = None
+
+
+@dataclass(config=STRICT, frozen=True)
+class NoiseConfig:
+    """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m] (None: one contact's)."""
+
+    joint_torque: Positive = SensorNoise.joint_torque
+    contact_force: Positive = SensorNoise.contact_force
+    contact_moment: Positive = SensorNoise.contact_moment
+    base_force: Positive | None = None
+    base_moment: Positive | None = None
+
+
+@dataclass(config=STRICT, frozen=True)
+class SensorsConfig:
+    """A named set, or sensors by name; `sensors: full` is short for `sensors: {set: full}`."""
+
+    set: Literal["full", "contacts", "joints"] | None = None
+    joint_torques: list[str] = dataclasses.field(default_factory=list)
+    contact_wrenches: dict[str, list[Component]] = dataclasses.field(default_factory=dict)
+    ft_sensors: Annotated[list[str], Field(max_length=0)] = dataclasses.field(default_factory=list)
+    noise: NoiseConfig = dataclasses.field(default_factory=NoiseConfig)
+    on_base_lost: Literal["error", "warn"] = "error"
+
+
+@dataclass(config=STRICT, frozen=True)
+class EstimatorConfig:
+    """Batch least squares: `ridge` pulls to the URDF, `friction: false` leaves friction at the URDF's values."""
+
+    name: Literal["least_squares"] = "least_squares"
+    ridge: NotNegative = 0.0
+    rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
+    friction: bool = True
+
+
+def _spelled_out(value: object) -> object:
+    return {"set": value} if isinstance(value, str) else value
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class ExperimentConfig:
+    """One identification run."""
+
+    robot: RobotConfig
+    logs: LogsConfig
+    output: Path
+    sensors: Annotated[SensorsConfig, BeforeValidator(_spelled_out)]
+    contacts: list[ContactConfig] = dataclasses.field(default_factory=list)
+    preprocessing: PreprocessingConfig = dataclasses.field(default_factory=PreprocessingConfig)
+    estimator: EstimatorConfig = dataclasses.field(default_factory=EstimatorConfig)
+    device: Device = "cpu"
+    overwrite: bool = False
+
+
+def _with_sensors_spelled_out(settings: Settings, overriding: Settings) -> Settings:
+    """Sensors as a mapping, so that an override of one of its keys joins it; a named set replaces sensors by name."""
+    if "sensors" not in settings:
+        return settings
+    sensors = settings["sensors"]
+    if isinstance(overriding.get("sensors"), str) and isinstance(sensors, dict):
+        sensors = {key: x for key, x in sensors.items() if key in ("noise", "on_base_lost")}
+    return settings | {"sensors": _spelled_out(sensors)}
+
+
+_EXPERIMENT = FileKind(
+    settings=ExperimentConfig,
+    name="experiment",
+    keys="robot, logs, sensors, output",
+    list_example="contacts=[{frame: l_sole, type: flat}]",
+    paths=("robot.urdf", "logs.train.*", "logs.test.*", "output"),
+    prepare=_with_sensors_spelled_out,
+    refusals={"sensors.ft_sensors": ("limb-mounted sensors, which are not supported yet", "an empty list")},
+)
+
+
+def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentConfig:
+    """Read and check an experiment file.
+
+    Args:
+        path: the YAML file; paths in it are relative to it.
+        overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory.
+
+    Raises:
+        ConfigError: unreadable file, a value of the wrong kind, a missing key.
+        UnknownNameError: a key that does not exist; the message names the nearest that do.
+    """
+    path = Path(path)
+    config = load(_EXPERIMENT, path, overrides)
+    _check_sensors(path, config.sensors)
+    train, test = (_matching(path, f"logs.{key}", getattr(config.logs, key)) for key in ("train", "test"))
+    return dataclasses.replace(config, logs=LogsConfig(train, test))
+
+
+def dump_config(config: ExperimentConfig) -> str:
+    """The resolved configuration as YAML; `load_config` reads it back."""
+    return dump(config)
+
+
+def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
+    """The paths, with every file that matches in place of a name with * or ? in it."""
+    out: list[Path] = []
+    for path in paths:
+        if path.exists() or not {"*", "?"} & set(path.name):
+            out.append(path)
+            continue
+        found = sorted(path.parent.glob(path.name))
+        if not found:
+            raise ConfigError(source, field, f"no file matches {path}", "a log, or a pattern of several")
+        out += found
+    return out
+
+
+def _check_sensors(path: Path, sensors: SensorsConfig) -> None:
+    chosen = bool(sensors.joint_torques or sensors.contact_wrenches)
+    if sensors.set is not None and chosen:
+        raise ConfigError(path, "sensors", f"set: {sensors.set} together with sensors by name", "one of the two")
+    if sensors.set is None and not chosen:
+        accepted = "full, contacts, joints, or joint_torques and contact_wrenches by name"
+        raise ConfigError(path, "sensors", "no sensor", accepted)

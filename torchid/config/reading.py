@@ -1,0 +1,166 @@
+"""Any kind of settings file: YAML and overrides into a checked dataclass, and every slip into one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pydantic import TypeAdapter, ValidationError
+
+from torchid.errors import ConfigError, UnknownNameError
+
+T = TypeVar("T")
+Settings = dict[str, Any]
+
+
+def _as_is(settings: Settings, _: Settings) -> Settings:
+    return settings
+
+
+@dataclasses.dataclass(frozen=True)
+class FileKind(Generic[T]):
+    """One kind of settings file: what it holds, and how messages speak of it.
+
+    Attributes:
+        settings: the pydantic dataclass of the whole file. Those inside it may lie in lists, in mappings and in
+            `X | None`, but in no other union: a message could not tell which keys are accepted.
+        name: of the kind, as in "a YAML experiment file".
+        keys: the chief keys, as in "a mapping with robot, logs, ...".
+        list_example: an override that gives a list as a whole.
+        paths: places that hold a path, such as `robot.urdf`; `logs.train.*` is every item of the list `logs.train`.
+        prepare: takes the settings and those that will override them, and returns the settings to merge; it is called
+            for the file and the overrides, then for the overrides and nothing.
+        refusals: what a message says was found and is accepted, by place, where the type alone says too little.
+    """
+
+    settings: type[T]
+    name: str
+    keys: str
+    list_example: str
+    paths: Sequence[str] = ()
+    prepare: Callable[[Settings, Settings], Settings] = _as_is
+    refusals: Mapping[str, tuple[str, str]] = dataclasses.field(default_factory=dict)
+
+
+def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
+    """Read and check a settings file.
+
+    Args:
+        kind: of the file.
+        path: the YAML file; paths in it are relative to it.
+        overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory.
+
+    Raises:
+        ConfigError: unreadable file, a value of the wrong kind, a missing key.
+        UnknownNameError: a key that does not exist; the message names the nearest that do.
+    """
+    settings = _absolute(_read(kind, path), kind.paths, path.resolve().parent)
+    given = _absolute(_parsed(overrides), kind.paths, Path.cwd())
+    layers = [kind.prepare(settings, given), kind.prepare(given, {})]
+    try:
+        merged = _container(OmegaConf.merge(*layers))
+    except (OmegaConfBaseException, TypeError) as error:
+        accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
+        raise ConfigError("command line", " ".join(overrides), "does not fit the file", accepted) from error
+    try:
+        return TypeAdapter(kind.settings).validate_python(merged)
+    except ValidationError as error:
+        raise _in_one_line(kind, path, error) from error
+
+
+def dump(settings: object) -> str:
+    """The resolved settings, a dataclass of any kind, as YAML; `load` reads it back."""
+    return yaml.safe_dump(TypeAdapter(type(settings)).dump_python(settings, mode="json"), sort_keys=False)
+
+
+def _read(kind: FileKind[T], path: Path) -> Settings:
+    try:
+        loaded = _container(OmegaConf.load(path))
+    except OSError as error:
+        raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
+        raise ConfigError(path, "YAML", f"not readable: {error}", "a YAML mapping") from error
+    if not isinstance(loaded, dict):
+        raise ConfigError(path, "YAML", f"a {type(loaded).__name__}", f"a mapping with {kind.keys}")
+    return loaded
+
+
+def _parsed(overrides: Sequence[str]) -> Settings:
+    for text in overrides:
+        if "=" not in text:
+            raise ConfigError("command line", text, "not an override", "key.subkey=value")
+    try:
+        return _container(OmegaConf.from_dotlist(list(overrides)))
+    except (OmegaConfBaseException, yaml.YAMLError) as error:
+        raise ConfigError("command line", " ".join(overrides), str(error), "key.subkey=value, in YAML") from error
+
+
+def _container(config: Any) -> Any:
+    return OmegaConf.to_container(config, resolve=True)
+
+
+def _absolute(settings: Settings, places: Sequence[str], folder: Path) -> Settings:
+    for place in places:
+        settings = _absolute_at(settings, place.split("."), folder)
+    return settings
+
+
+def _absolute_at(value: Any, place: Sequence[str], folder: Path) -> Any:
+    """The value with the path at a place made absolute; what is no path where one belongs is left to the checks."""
+    if not place:
+        return os.path.normpath(folder / Path(value).expanduser()) if isinstance(value, str) else value
+    key, *rest = place
+    if key == "*":
+        return [_absolute_at(item, rest, folder) for item in value] if isinstance(value, list) else value
+    if isinstance(value, Mapping) and key in value:
+        return {**value, key: _absolute_at(value[key], rest, folder)}
+    return value
+
+
+def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> ConfigError | UnknownNameError:
+    """The first complaint, an unknown key before others: it is the likeliest cause of the rest."""
+    complaints = sorted(error.errors(), key=lambda e: e["type"] != "unexpected_keyword_argument")
+    first = complaints[0]
+    place = [str(part) for part in first["loc"]]
+    field = ".".join(place)
+    if first["type"] == "unexpected_keyword_argument":
+        keys = _keys_at(kind.settings, place[:-1])
+        return UnknownNameError(path, ".".join(place[:-1]) or "key", place[-1], keys)
+    missing = [".".join(map(str, e["loc"])) for e in complaints if e["type"] == "missing"]
+    if missing:
+        return ConfigError(path, ", ".join(missing), "missing", "a value")
+    if field in kind.refusals:
+        return ConfigError(path, field, *kind.refusals[field])
+    if first["type"] == "too_short":
+        return ConfigError(path, field, "an empty list", "at least one item")
+    found = first["input"]
+    shown = "a mapping" if isinstance(found, Mapping) else "a list" if isinstance(found, list) else repr(found)
+    if first["type"] == "dataclass_type":
+        accepted = f"a mapping with {', '.join(_keys_at(kind.settings, place))}"
+    else:
+        plain = {"path_type": "a path", "list_type": "a list"}
+        described = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+        accepted = plain.get(first["type"], described)
+    return ConfigError(path, field, f"found {shown}", accepted)
+
+
+def _keys_at(settings: Any, place: Sequence[str]) -> list[str]:
+    """Names of the keys accepted at a place in a dataclass, through `list[X]`, `dict[str, X]` and `X | None`."""
+    hint = settings
+    for part in place:
+        hint = _not_none(get_type_hints(hint)[part] if dataclasses.is_dataclass(hint) else get_args(hint)[-1])
+    return [field.name for field in dataclasses.fields(hint)]
+
+
+def _not_none(hint: Any) -> Any:
+    """X, of `X | None`."""
+    if get_origin(hint) not in (Union, UnionType):
+        return hint
+    return next(inner for inner in get_args(hint) if inner is not NoneType)

@@ -1,0 +1,191 @@
+"""The settings file of `torchid simulate`: a robot, its feet, motions, and what is wrong with its sensors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from torchid.config.reading import FileKind, load
+from torchid.config.types import STRICT, NotNegative, Number, Positive
+from torchid.errors import ConfigError
+
+Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+
+@dataclass(config=STRICT, frozen=True)
+class SimulatedRobotConfig:
+    """The true robot: its base is the URDF's root."""
+
+    urdf: Path
+
+
+@dataclass(config=STRICT, frozen=True)
+class FootConfig:
+    """A URDF frame that touches the floor at `points` [m], by default its link's collision spheres."""
+
+    frame: str
+    points: list[Point] = dataclasses.field(default_factory=list)
+
+
+@dataclass(config=STRICT, frozen=True)
+class WaveConfig:
+    """A sine: `what` is com_x, com_y, com_z [m], base_roll, base_pitch, base_yaw [rad] or a joint [rad or m].
+
+    `phase` is in turns.
+    """
+
+    what: str
+    hz: Positive
+    amplitude: Number
+    phase: Number = 0.0
+
+
+@dataclass(config=STRICT, frozen=True)
+class StepsConfig:
+    """Feet lifted in turn: foot i of k in `order` is highest at (i + 1/2)/k of every period of 1/hz.
+
+    `swing_s` is the time in the air, `transfer_s` that in which the load leaves the foot before, or comes back after.
+    """
+
+    hz: Positive
+    order: Annotated[list[str], Field(min_length=1)]
+    height_m: Positive = 0.05
+    swing_s: Positive = 1.4
+    transfer_s: Positive = 0.25
+
+
+@dataclass(config=STRICT, frozen=True)
+class MotionConfig:
+    """One log: waves about the stance, and steps. `name` becomes the name of the file."""
+
+    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
+    duration_s: Positive
+    waves: list[WaveConfig] = dataclasses.field(default_factory=list)
+    steps: StepsConfig | None = None
+
+
+@dataclass(config=STRICT, frozen=True)
+class WhiteNoiseConfig:
+    """White noise of every sample, standard deviations [rad or m, m, rad, N m or N, N, N m]."""
+
+    enabled: bool = False
+    joint_position: NotNegative = 1e-4
+    base_position: NotNegative = 1e-4
+    base_orientation: NotNegative = 1e-4
+    joint_torque: NotNegative = 1.0
+    contact_force: NotNegative = 5.0
+    contact_moment: NotNegative = 0.5
+
+
+@dataclass(config=STRICT, frozen=True)
+class BiasConfig:
+    """An offset [N m, N, N m] and a gain error of every force channel, the same in all logs: standard deviations."""
+
+    enabled: bool = False
+    joint_torque: NotNegative = 1.0
+    contact_force: NotNegative = 10.0
+    contact_moment: NotNegative = 1.0
+    gain: NotNegative = 0.02
+
+
+@dataclass(config=STRICT, frozen=True)
+class DelayConfig:
+    """How late the foot sensors are [s]."""
+
+    enabled: bool = False
+    feet_s: NotNegative = 0.01
+
+
+@dataclass(config=STRICT, frozen=True)
+class FrictionConfig:
+    """Friction of every joint [N m, N m s/rad]; when off, the URDF's."""
+
+    enabled: bool = False
+    coulomb: NotNegative = 1.0
+    viscous: NotNegative = 0.5
+
+
+@dataclass(config=STRICT, frozen=True)
+class SensorImperfectionsConfig:
+    """What the log has that the robot had not; a contact is active while its measured load exceeds a threshold [N]."""
+
+    noise: WhiteNoiseConfig = dataclasses.field(default_factory=WhiteNoiseConfig)
+    bias: BiasConfig = dataclasses.field(default_factory=BiasConfig)
+    delay: DelayConfig = dataclasses.field(default_factory=DelayConfig)
+    contact_threshold: Positive = 30.0
+
+
+@dataclass(config=STRICT, frozen=True)
+class BoundsConfig:
+    """What a run must keep [m]: base height near the stance's, feet that do not slip, a zero-moment point inside.
+
+    `zmp_m` is the least distance from the zero-moment point to the border of the support polygon.
+    """
+
+    height_m: Positive = 0.2
+    slip_m: Positive = 0.01
+    zmp_m: Number = 0.005
+
+
+@dataclass(config=STRICT, frozen=True)
+class NominalConfig:
+    """The nominal robot: mass, centre of mass and inertia of every body off by up to `error`, as a share."""
+
+    error: Annotated[Number, Field(ge=0.0, lt=1.0)] = 0.2
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class SimulationConfig:
+    """One simulation: every motion becomes a log."""
+
+    robot: SimulatedRobotConfig
+    feet: Annotated[list[FootConfig], Field(min_length=1)]
+    motions: Annotated[list[MotionConfig], Field(min_length=1)]
+    output: Path
+    posture: dict[str, Number] = dataclasses.field(default_factory=dict)
+    friction: FrictionConfig = dataclasses.field(default_factory=FrictionConfig)
+    sensors: SensorImperfectionsConfig = dataclasses.field(default_factory=SensorImperfectionsConfig)
+    nominal: NominalConfig = dataclasses.field(default_factory=NominalConfig)
+    bounds: BoundsConfig = dataclasses.field(default_factory=BoundsConfig)
+    physics_hz: Positive = 1000.0
+    control_hz: Positive = 500.0
+    seed: Annotated[int, Field(ge=0)] = 0
+    overwrite: bool = False
+
+
+_FILE = FileKind(
+    SimulationConfig,
+    "simulation",
+    "robot, feet, motions, output",
+    "feet=[{frame: l_sole}, {frame: r_sole}]",
+    ("robot.urdf", "output"),
+)
+
+
+def load_simulation(path: str | Path, overrides: Sequence[str] = ()) -> SimulationConfig:
+    """Read and check a simulation file.
+
+    Args:
+        path: the YAML file; paths in it are relative to it.
+        overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory.
+
+    Raises:
+        ConfigError: unreadable file, a value of the wrong kind, a missing key, rates or names that do not go together.
+        UnknownNameError: a key that does not exist; the message names the nearest that do.
+    """
+    path = Path(path)
+    config = load(_FILE, path, overrides)
+    ratio = config.physics_hz / config.control_hz
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-9:
+        raise ConfigError(path, "control_hz", f"{config.control_hz:g}", f"{config.physics_hz:g} over a whole number")
+    names = [motion.name for motion in config.motions]
+    again = [name for name in names if names.count(name) > 1]
+    if again:
+        raise ConfigError(path, "motions", f"several named '{again[0]}'", "a name of its own for every motion")
+    return config

@@ -1,0 +1,239 @@
+"""The simulated robot on the floor (the only module that imports MuJoCo)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+try:
+    import mujoco
+except ImportError as error:
+    raise ImportError("torchid simulate needs MuJoCo: pip install 'torchid[sim]'") from error
+import numpy as np
+from lxml import etree
+
+from torchid.errors import UnknownNameError, UrdfError
+from torchid.parameters import Array
+from torchid.robot.urdf import parse_xml
+
+_DISCARDED = ("transmission", "gazebo", "material", "mujoco")
+_SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
+_FRICTION = (1.0, 0.005, 0.0001)
+_SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction creeps
+
+
+@dataclass(frozen=True)
+class Foot:
+    """A link that touches the floor at points, (k, 3) [m] in its frame, with spheres of radius `radius` [m]."""
+
+    frame: str
+    points: tuple[tuple[float, float, float], ...]
+    radius: float
+
+
+@dataclass(frozen=True)
+class FootMotion:
+    """Where a foot is: position (3,), rotation (3, 3) to world, velocity (6,), Jacobian (6, nv), bias (6,)."""
+
+    position: Array
+    rotation: Array
+    velocity: Array
+    J: Array
+    bias: Array
+
+
+class Plant:
+    """A URDF robot with a free base on a soft floor, in MuJoCo's coordinates.
+
+    Generalized velocity: base origin's velocity along world axes (3), base angular velocity along base axes (3),
+    joints (n) in the order of `joint_names`. Each step is `observe`, `push`: what a recorder reads in between and
+    after belongs to the same instant, the one before the integration.
+    """
+
+    def __init__(
+        self, urdf: Path, feet: Sequence[Foot], physics_hz: float, friction: tuple[float, float] | None = None
+    ) -> None:
+        """Compile the model.
+
+        Args:
+            urdf: the robot; its shapes are not used.
+            feet: what touches the floor.
+            physics_hz: integration rate [Hz].
+            friction: Coulomb [N m] and viscous [N m s/rad] friction of every joint; None: the URDF's.
+
+        Raises:
+            UrdfError: MuJoCo does not take it, or it has mimic joints.
+            UnknownNameError: there is no link of a foot's name.
+        """
+        spec = _spec(urdf)
+        spec.option.timestep = 1.0 / physics_hz
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = _SLIP_RATIO
+        spec.option.tolerance, spec.option.iterations = 1e-15, 100
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=_FRICTION, solref=_SPRING)
+        for foot in feet:
+            _add_foot(spec, foot, urdf)
+        try:
+            self.model = spec.compile()
+        except ValueError as error:
+            raise UrdfError(urdf, "URDF", f"MuJoCo refuses it: {error}", "a robot that MuJoCo can simulate") from error
+        mujoco.set_mju_user_warning(lambda _: None)  # `unstable` tells; MuJoCo would write a log file
+        self.data = mujoco.MjData(self.model)
+        model = self.model
+        if friction is not None:
+            model.dof_frictionloss[6:], model.dof_damping[6:] = friction
+        self.nv, self.n = model.nv, model.nv - 6
+        self.joint_names = tuple(model.joint(i).name for i in range(1, model.njnt))
+        self.mass = float(model.body_subtreemass[1])
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT  # a stop's force would be in no sensor
+        self.limits = np.where(model.jnt_limited[1:, None], model.jnt_range[1:], [-np.inf, np.inf])
+        self.weight = -self.mass * model.opt.gravity  # force that holds the robot up (3,) [N]
+        self.foot_frames = tuple(foot.frame for foot in feet)
+        self._sites = [model.site(_sensor(foot)).id for foot in feet]
+        self._bodies = [int(model.site_bodyid[site]) for site in self._sites]
+        self._M = np.zeros((self.nv, self.nv))
+
+    # ---------------------------------------------------------------------------------------------------- stepping
+
+    def place(self, position: Array) -> None:
+        """Set the configuration, (7 + n,): base position, quaternion w x y z, joints; everything at rest."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = position
+        mujoco.mj_forward(self.model, self.data)
+
+    def shift(self, step: Array) -> Array:
+        """The configuration a tangent step (nv,) away."""
+        position = self.data.qpos.copy()
+        mujoco.mj_integratePos(self.model, position, step, 1.0)
+        return position
+
+    def observe(self) -> None:
+        """Update everything that depends on position and velocity."""
+        mujoco.mj_step1(self.model, self.data)
+
+    def push(self, torque: Array) -> None:
+        """Apply joint torques (n,) [N m], work out accelerations and contact forces, and integrate one step."""
+        self.data.qfrc_applied[6:] = torque
+        mujoco.mj_step2(self.model, self.data)
+
+    # --------------------------------------------------------------------------------------------------- reading
+
+    @property
+    def position(self) -> Array:
+        """Configuration (7 + n,)."""
+        return self.data.qpos
+
+    @property
+    def velocity(self) -> Array:
+        """Generalized velocity (nv,)."""
+        return self.data.qvel
+
+    @property
+    def acceleration(self) -> Array:
+        """Generalized acceleration (nv,) of the last `push`."""
+        return self.data.qacc
+
+    @property
+    def unstable(self) -> bool:
+        """Whether the integration has diverged (MuJoCo then starts afresh)."""
+        return any(warning.number for warning in self.data.warning)
+
+    @property
+    def wrenches(self) -> Array:
+        """Force and moment of the floor on every foot, (F, 6) [N, N m], in the foot's frame, of the last `push`."""
+        return -self.data.sensordata.reshape(-1, 6)
+
+    @property
+    def inertia(self) -> Array:
+        """Joint-space inertia matrix (nv, nv)."""
+        mujoco.mj_fullM(self.model, self.data, self._M)
+        return self._M
+
+    @property
+    def bias(self) -> Array:
+        """Coriolis, centrifugal and gravity forces (nv,)."""
+        return self.data.qfrc_bias
+
+    @property
+    def com(self) -> Array:
+        """Centre of mass (3,) [m]."""
+        return self.data.subtree_com[1]
+
+    @property
+    def base_rotation(self) -> Array:
+        """Base to world, (3, 3)."""
+        return self.data.xmat[1].reshape(3, 3)
+
+    @property
+    def feet_positions(self) -> Array:
+        """Origins of the feet's frames (F, 3) [m]."""
+        return self.data.site_xpos[self._sites]
+
+    def foot(self, index: int) -> FootMotion:
+        """Where the foot is and how it moves, world axes, linear part first."""
+        model, data, body, site = self.model, self.data, self._bodies[index], self._sites[index]
+        J, J_dot = np.zeros((6, self.nv)), np.zeros((6, self.nv))
+        mujoco.mj_jacSite(model, data, J[:3], J[3:], site)
+        mujoco.mj_jacDot(model, data, J_dot[:3], J_dot[3:], data.site_xpos[site], body)
+        rotation = data.site_xmat[site].reshape(3, 3)
+        return FootMotion(data.site_xpos[site], rotation, J @ data.qvel, J, J_dot @ data.qvel)
+
+
+def sphere_points(urdf: Path, frame: str) -> tuple[tuple[tuple[float, float, float], ...], float]:
+    """Centres (k, 3) [m] and radius [m] of the collision spheres of a link; no points if it has none."""
+    root = parse_xml(urdf).getroot()
+    points, radius = [], 0.0
+    for shape in root.findall(f"link[@name='{frame}']/collision"):
+        sphere, origin = shape.find("geometry/sphere"), shape.find("origin")
+        if sphere is not None:
+            radius = float(sphere.get("radius", "0"))
+            x, y, z = map(float, ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split())
+            points.append((x, y, z))
+    return tuple(points), radius
+
+
+def _spec(urdf: Path) -> mujoco.MjSpec:
+    """The URDF without shapes, free to move."""
+    root = parse_xml(urdf).getroot()
+    mimic = root.find("joint/mimic/..")
+    if mimic is not None:
+        raise UrdfError(urdf, f"joint '{mimic.get('name')}'", "a mimic joint", "independent joints, for a simulation")
+    for tag in _DISCARDED:
+        for element in root.findall(tag):
+            root.remove(element)
+    for link in root.findall("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)
+    try:
+        spec = mujoco.MjSpec.from_string(etree.tostring(root, encoding="unicode"))
+    except ValueError as error:
+        raise UrdfError(urdf, "URDF", f"MuJoCo refuses it: {error}", "a robot that MuJoCo can simulate") from error
+    spec.compiler.fusestatic = False
+    spec.compiler.balanceinertia = False
+    spec.worldbody.first_body().add_freejoint()
+    return spec
+
+
+def _add_foot(spec: mujoco.MjSpec, foot: Foot, urdf: Path) -> None:
+    """A massless plate welded to the link: all that touches the floor, and a six-axis sensor in the weld."""
+    link = spec.body(foot.frame)
+    if link is None:
+        raise UnknownNameError(urdf, "feet", foot.frame, [body.name for body in spec.bodies[1:]])
+    plate = link.add_body(name=_sensor(foot))
+    plate.add_site(name=_sensor(foot))
+    for point in foot.points:
+        plate.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=point,
+            size=[foot.radius, 0, 0],
+            mass=0.0,
+            friction=_FRICTION,
+            solref=_SPRING,
+        )
+    for kind in (mujoco.mjtSensor.mjSENS_FORCE, mujoco.mjtSensor.mjSENS_TORQUE):
+        spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=_sensor(foot))
+
+
+def _sensor(foot: Foot) -> str:
+    return f"{foot.frame} sensor"

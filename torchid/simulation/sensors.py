@@ -1,0 +1,77 @@
+"""What the sensors make of a motion: noise, bias and gain, delay; and which feet seem to stand."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from torchid.config import SensorImperfectionsConfig
+from torchid.logs import Log
+from torchid.logs.fields import BoolArray
+from torchid.parameters import Array
+from torchid.simulation.recording import exact
+
+
+def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int) -> Log:
+    """The log that a robot with imperfect sensors would have written.
+
+    Positions, torques and wrenches only: velocities and accelerations are for the preprocessing to derive. A contact
+    is active while the measured force, along its mean over the log, exceeds the threshold.
+
+    Args:
+        truth: exact log, of a `Recording`.
+        sensors: which imperfections, and how large.
+        seed: of the noise, together with the log's name; biases and gains depend on the seed alone.
+    """
+    torque, wrench = exact(truth, "joint_torque"), exact(truth, "contact_wrench_local")
+    if sensors.delay.enabled:
+        late = round(sensors.delay.feet_s / float(np.median(np.diff(truth.time))))
+        wrench = wrench[np.maximum(np.arange(len(truth)) - late, 0)]  # the first reading is held
+    if sensors.bias.enabled:
+        torque, wrench = _biased(torque, wrench, sensors, np.random.default_rng([seed, 0]))
+    position, base, turn = (exact(truth, f) for f in ("joint_position", "base_position_world", "base_quat_xyzw"))
+    if sensors.noise.enabled:
+        rng, noise = np.random.default_rng([seed, 1, zlib.crc32(truth.source.encode())]), sensors.noise
+
+        def noisy(values: Array, deviation: float | Array) -> Array:
+            return values + deviation * rng.normal(size=values.shape)
+
+        position, base = noisy(position, noise.joint_position), noisy(base, noise.base_position)
+        turns = Rotation.from_rotvec(noise.base_orientation * rng.normal(size=(len(truth), 3)))
+        turn = (Rotation.from_quat(turn) * turns).as_quat()
+        torque = noisy(torque, noise.joint_torque)
+        wrench = noisy(wrench, np.repeat([noise.contact_force, noise.contact_moment], 3))
+    return Log(
+        truth.source,
+        time=truth.time,
+        joint_names=truth.joint_names,
+        joint_position=position,
+        joint_torque=torque,
+        base_position_world=base,
+        base_quat_xyzw=turn,
+        contact_names=truth.contact_names,
+        contact_active=_loaded(wrench, sensors.contact_threshold),
+        contact_wrench_local=wrench,
+    )
+
+
+def _biased(
+    torque: Array, wrench: Array, sensors: SensorImperfectionsConfig, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    levels = sensors.bias
+    offset = np.repeat([levels.contact_force, levels.contact_moment], 3)
+    return (
+        torque * (1.0 + levels.gain * rng.normal(size=torque.shape[1]))
+        + levels.joint_torque * rng.normal(size=torque.shape[1]),
+        wrench * (1.0 + levels.gain * rng.normal(size=wrench.shape[1:])) + offset * rng.normal(size=wrench.shape[1:]),
+    )
+
+
+def _loaded(wrench: Array, threshold: float) -> BoolArray:
+    """Which feet stand, (N, F): force along its mean direction above the threshold."""
+    force = wrench[..., :3]
+    mean = force.mean(axis=0)
+    direction = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    return np.einsum("nfi,fi->nf", force, direction) > threshold

@@ -1,0 +1,105 @@
+"""How a robot stands: a configuration with every foot on the floor and the centre of mass above them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from torchid.errors import InputError, UnknownNameError
+from torchid.parameters import Array
+from torchid.simulation.controller import turn_between
+from torchid.simulation.plant import Foot, Plant
+
+_ITERATIONS, _LARGEST_STEP = 300, 0.2
+_POSTURE_WEIGHT = 1e-3
+_TOLERANCE = 1e-3  # m or rad
+_STEEPEST = np.radians(40.0)  # that a sole may be off the horizontal in the given posture
+
+
+@dataclass(frozen=True)
+class Stance:
+    """A standing robot: configuration (7 + n,), centre of mass (3,), poses of the feet (F, 3) and (F, 3, 3)."""
+
+    position: Array
+    com: Array
+    feet: Array
+    rotations: Array
+
+
+def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float], source: object) -> Stance:
+    """Put the robot on its feet, its base level and its centre of mass over their middle, close to a posture.
+
+    Args:
+        plant: the robot; left in the stance.
+        feet: what it stands on.
+        posture: joint positions by name [rad or m]; others are 0, or the end of their range nearest to it.
+        source: named in errors.
+
+    Raises:
+        UnknownNameError: a joint that the robot does not have.
+        InputError: there is no such configuration near the posture.
+    """
+    for name in posture:
+        if name not in plant.joint_names:
+            raise UnknownNameError(source, "posture", name, plant.joint_names)
+    low, high = plant.limits.T
+    joints = np.clip([posture.get(name, 0.0) for name in plant.joint_names], low, high)
+    plant.place(np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 0.0], joints]))
+    rotations = np.stack([_flattened(plant.foot(i).rotation, foot, source) for i, foot in enumerate(feet)])
+    targets = np.stack([plant.foot(i).position for i in range(len(feet))])
+    for target, R, foot in zip(targets, rotations, feet, strict=True):
+        target[2] = foot.radius - np.min(np.array(foot.points) @ R[2])
+    plant.place(plant.shift(np.eye(plant.nv)[2] * np.mean(targets[:, 2] - plant.feet_positions[:, 2])))
+
+    pull = np.concatenate([np.zeros(6), np.ones(plant.n)])
+    damping = np.diag(_POSTURE_WEIGHT * pull + 1e-9)
+    for _ in range(_ITERATIONS):
+        A, off = _tasks(plant, feet, targets, rotations)
+        home = np.concatenate([np.zeros(6), joints - plant.position[7:]])
+        step = np.linalg.solve(A.T @ A + damping, A.T @ off + _POSTURE_WEIGHT * pull * home)
+        step *= min(1.0, _LARGEST_STEP / np.abs(step).max())
+        moved = plant.shift(step)
+        moved[7:] = np.clip(moved[7:], low, high)
+        plant.place(moved)
+        if np.abs(step).max() < 1e-9:
+            break
+    _, off = _tasks(plant, feet, targets, rotations)
+    if not np.abs(off).max() < _TOLERANCE:
+        worst = np.abs(off).max()
+        found = f"no stance near it with all feet on the floor and the base level: off by {worst:.2g} m or rad"
+        raise InputError(source, "posture", found, "joint positions, by name, in which the robot nearly stands")
+    return Stance(plant.position.copy(), plant.com.copy(), targets, rotations)
+
+
+def _tasks(plant: Plant, feet: Sequence[Foot], targets: Array, rotations: Array) -> tuple[Array, Array]:
+    """What should be zero: Jacobian (rows, nv), and how far off it is (rows,) [m, rad]."""
+    jacobians, off, centres = [], [], []
+    for i, (foot, target, R) in enumerate(zip(feet, targets, rotations, strict=True)):
+        now = plant.foot(i)
+        rows = 6 if len(foot.points) > 2 else 3
+        jacobians.append(now.J[:rows])
+        off.append(np.concatenate([target - now.position, turn_between(now.rotation, R)])[:rows])
+        centres.append(target + R @ np.mean(foot.points, axis=0))
+    level = np.zeros((3, plant.nv))
+    level[:, 3:6] = np.eye(3)
+    A = np.vstack([*jacobians, plant.inertia[:2] / plant.mass, level])
+    above = (np.mean(centres, axis=0) - plant.com)[:2]
+    return A, np.concatenate([*off, above, turn_between(plant.base_rotation, np.eye(3))])
+
+
+def _flattened(R: Array, foot: Foot, source: object) -> Array:
+    """The rotation nearest to R that puts all points of the foot at one height."""
+    points = np.array(foot.points)
+    if len(points) < 3:
+        return R.copy()
+    normal = np.linalg.svd((points - points.mean(axis=0)) @ R.T)[2][2]
+    normal *= np.copysign(1.0, normal[2])
+    axis = np.cross(normal, [0.0, 0.0, 1.0])
+    angle = np.arctan2(np.linalg.norm(axis), normal[2])
+    if angle > _STEEPEST:
+        found = f"{foot.frame} is {np.degrees(angle):.0f} degrees off the horizontal"
+        raise InputError(source, "posture", found, f"joint positions that put it within {np.degrees(_STEEPEST):.0f}")
+    return Rotation.from_rotvec(angle * axis / max(float(np.linalg.norm(axis)), 1e-12)).as_matrix() @ R
