@@ -88,3 +88,18 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
             measured[where] = found.measured.cpu().numpy()
             predicted[:, where] = found.predicted.cpu().numpy()
     return measured, predicted
+
+
+def in_null_space(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
+    """V_x V_x^T f of generalized forces (M, N, nv): what is left of each row inside the builder's null space."""
+    out, base = forces.copy(), builder.tree.base_rows
+    with torch.no_grad(), one_thread():
+        for state, index in by_state(samples):
+            where = np.arange(len(samples))[index if isinstance(index, slice) else index.numpy()]
+            mixed = [*range(base), *(base + joint for joint in builder.plan(state).mixed_joints)]
+            for part, V in builder.bases(samples[index].to(builder.device), state):
+                chosen = where[part if isinstance(part, slice) else part.cpu().numpy()]
+                place = np.ix_(np.arange(len(forces)), chosen, mixed)
+                inside = V @ (V.mT @ torch.from_numpy(forces[place]).to(V)[..., None])
+                out[place] = inside[..., 0].cpu().numpy()
+    return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -28,18 +28,38 @@ def compress(
 
     Args: as `over_chunks`.
     """
+    return merged(compress_by_state(logs, builder, chunk, threads, progress).values(), builder)
 
-    def fold(chunks: Iterator[tuple[Samples, State]]) -> TriangularFactor:
-        factor, workspace = TriangularFactor(builder.columns.count), Workspace()
+
+def compress_by_state(
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    chunk: int = CHUNK,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> dict[State, TriangularFactor]:
+    """As `compress`, but with a factor for every contact state in the logs."""
+
+    def fold(chunks: Iterator[tuple[Samples, State]]) -> dict[State, TriangularFactor]:
+        factors: dict[State, TriangularFactor] = {}
+        workspace = Workspace()
         for samples, state in chunks:
+            factor = factors.setdefault(state, TriangularFactor(builder.columns.count))
             for support, rows in builder.rows(samples, state, workspace):
                 factor.add(support, rows)
-        return factor
+        return factors
 
-    factors = over_chunks(logs, builder, fold, chunk, threads, progress)
-    for other in factors[1:]:
-        factors[0].merge(other)
-    return factors[0]
+    parts = over_chunks(logs, builder, fold, chunk, threads, progress)
+    states = dict.fromkeys(state for part in parts for state in part)
+    return {state: merged((part[state] for part in parts if state in part), builder) for state in states}
+
+
+def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
+    """The factor of all that some factors have seen."""
+    out = TriangularFactor(builder.columns.count)
+    for factor in factors:
+        out.merge(factor)
+    return out
 
 
 def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:

@@ -14,7 +14,7 @@ from torchid import parameters
 from torchid.parameters import Array
 from torchid.report.metrics import GROUPS, Metrics
 
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": 9,
     "text.parse_math": False,  # names may hold dollar signs
     "axes.grid": True,
@@ -40,7 +40,7 @@ class ForceSeries:
     identified: Array
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def force_figure(series: ForceSeries, joint_names: Sequence[str], base_rows: int, most: int = 6) -> Figure:
     """Measured and predicted forces over time: the largest base force and moment, then the joints with most torque."""
     rows = _rows_to_show(series, base_rows, most)
@@ -72,7 +72,7 @@ def _rows_to_show(series: ForceSeries, base_rows: int, most: int) -> list[int]:
     return base + sorted(joints[: most - len(base)])
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
     """Relative error by group of rows, URDF against identified, one panel per set of logs."""
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
@@ -94,7 +94,7 @@ def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
     return figure
 
 
-@matplotlib.rc_context(_STYLE)
+@matplotlib.rc_context(STYLE)
 def parameter_figure(body_names: Sequence[str], nominal: Array, identified: Array, standard_error: Array) -> Figure:
     """Mass, first moment and inertia of every body with mass; bars on the masses the data determine: standard error."""
     shown = np.flatnonzero(nominal[:, parameters.INERTIAL].any(axis=1))

@@ -33,13 +33,15 @@ class Metrics:
 
     `rms` and `relative` by group; `by_joint_rms` and `by_joint_relative` by joint. Relative means rms of the error over
     rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
-    the measured.
+    the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
+    mostly weight.
     """
 
     rms: dict[str, float | None]
     relative: dict[str, float | None]
     by_joint_rms: dict[str, float | None]
     by_joint_relative: dict[str, float | None]
+    base_force_of_variation: float | None
 
     def as_dict(self) -> dict[str, object]:
         """As `metrics.json` has it."""
@@ -52,19 +54,22 @@ class Metrics:
                 out[f"{group}_{suffix}"] = groups[group]
                 if group == "joint_torque":
                     out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
+        out["base_force_rms_of_variation"] = self.base_force_of_variation
         return out
 
 
 class _Squares:
-    """Sums of squares by row, over the samples where the row is known."""
+    """Sums and sums of squares by row, over the samples where the row is known."""
 
     def __init__(self, rows: int) -> None:
-        self.sum, self.count = np.zeros(rows), np.zeros(rows)
+        self.plain, self.sum, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
 
     def add(self, x: torch.Tensor) -> None:
         values = x.cpu().numpy()
         known = np.isfinite(values)
-        self.sum += np.square(np.where(known, values, 0.0)).sum(0)
+        values = np.where(known, values, 0.0)
+        self.plain += values.sum(0)
+        self.sum += np.square(values).sum(0)
         self.count += known.sum(0)
 
     def rms(self, rows: slice = slice(None)) -> Array:
@@ -74,6 +79,19 @@ class _Squares:
     def pooled(self, rows: slice) -> float:
         count = self.count[rows].sum()
         return float(np.sqrt(self.sum[rows].sum() / count)) if count else np.nan
+
+    def deviation(self, rows: slice) -> float:
+        """Rms about the mean of each row, over all of them."""
+        known = self.count[rows] > 0
+        count, plain = self.count[rows][known], self.plain[rows][known]
+        if not len(count):
+            return np.nan
+        return float(np.sqrt(max((self.sum[rows][known] - plain**2 / count).sum(), 0.0) / count.sum()))
+
+    def merge(self, other: _Squares) -> None:
+        self.plain += other.plain
+        self.sum += other.sum
+        self.count += other.count
 
 
 class _Sums:
@@ -86,9 +104,8 @@ class _Sums:
     def total(cls, parts: Sequence[_Sums]) -> _Sums:
         out = cls(len(parts[0].rows.sum))
         for part in parts:
-            for mine, other in ((out.rows, part.rows), (out.projected, part.projected)):
-                mine.sum += other.sum
-                mine.count += other.count
+            out.rows.merge(part.rows)
+            out.projected.merge(part.projected)
         return out
 
 
@@ -151,6 +168,7 @@ class Evaluation:
             {group: _ratio(rms[group], size[group]) for group in GROUPS},
             {name: _figure(x) for name, x in zip(names, by_joint, strict=True)},
             {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
+            _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,6 +19,14 @@ def print_tables(*tables: Table) -> None:
     console.width = min(console.width, 100) if console.is_terminal else 100
     for table in tables:
         console.print(table)
+
+
+def table_text(table: Table) -> str:
+    """A table as plain text, 100 columns wide."""
+    console = Console(width=100, file=io.StringIO(), force_terminal=False)
+    with console.capture() as captured:
+        console.print(table)
+    return captured.get()
 
 
 def error_tables(columns: Mapping[str, tuple[Metrics, Metrics]]) -> list[Table]:
@@ -38,6 +47,9 @@ def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
     for group, label in GROUPS.items():
         cells = [_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *cells)
+        if group == "base_force":
+            shares = [m.base_force_of_variation for pair in columns.values() for m in pair]
+            table.add_row("  of its variation", *("-" if x is None else f"({100 * x:.3g} %)" for x in shares))
     return table
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -63,3 +63,29 @@ def write_events(
             if value is not None
         }
         writer.add_hparams(dict(hyperparameters), final or {"final/rank": estimate.rank}, run_name="hparams")
+
+
+def write_comparison(
+    folder: Path,
+    scalars: Mapping[tuple[str, str], Sequence[float]],
+    texts: Mapping[str, str],
+    figures: Mapping[str, Figure],
+) -> None:
+    """Write charts that compare runs.
+
+    Args:
+        folder: where the event files go, those of every run in a folder of its own.
+        scalars: values of steps 0, 1, ... by run and tag.
+        texts: Markdown by tag.
+        figures: by tag.
+    """
+    for run in dict.fromkeys(run for run, _ in scalars):
+        with SummaryWriter(str(folder / run)) as writer:
+            for (of, tag), values in scalars.items():
+                for step, value in enumerate(values if of == run else ()):
+                    writer.add_scalar(tag, value, step)
+    with SummaryWriter(str(folder)) as writer:
+        for tag, text in texts.items():
+            writer.add_text(tag, text)
+        for tag, figure in figures.items():
+            writer.add_figure(tag, figure, close=False)

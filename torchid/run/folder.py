@@ -33,6 +33,8 @@ _RESULTS = ("parameters.json", "metrics.json", "identified.urdf", "forces.png", 
 RUN = FolderKind("run", "config.yaml", (*_RESULTS, "hparams", "evaluation", "events.out.tfevents*"))
 SIMULATION = FolderKind("simulation", "simulation.yaml", ("logs", "exact", "nominal.urdf", "stability.json"))
 
+STUDY = FolderKind("study", "results.json", ("tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard"))
+
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer
 
 

@@ -1,0 +1,75 @@
+"""The paper's three findings, put to the numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchid.report.metrics import GROUPS
+from torchid.study.results import NOMINAL, TRUE, Results
+
+GOOD = 0.2
+"""A set is good on a group of rows if its error is at most this share of the nominal parameters' ..."""
+FLOOR = 2.0
+"""... or at most this many times that of the true parameters, which is what filter and friction model leave."""
+POOR = 2.0
+"""A set is poor on a group of rows if its error is at least this many times that of full sensing."""
+
+_SETS = ("full", "contacts", "joints")
+_BASE, _INSIDE = ("base_force", "base_moment"), "nullspace"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Whether a finding of the paper holds, and the figures that say so."""
+
+    number: int
+    holds: bool
+    why: str
+
+
+def findings(results: Results, condition: str, training: str) -> tuple[Finding, Finding, Finding]:
+    """Examine the findings of section V, on medians of the errors against what truly happened.
+
+    (1) Full sensing is adequate everywhere: good on every group of rows. (2) Contacts only is good on the base rows and
+    poor on joint torques. (3) Joints only is the best of the three sets inside the projected space, and poor outside,
+    on joint torques, base force or base moment. What good and poor mean is stated beside `GOOD` and `POOR`.
+    """
+
+    def error(sensors: str, group: str) -> float:
+        return results.spread(condition, training, sensors, group).median
+
+    def share(sensors: str, group: str) -> float:
+        return error(sensors, group) / error(NOMINAL, group)
+
+    def times(sensors: str, group: str) -> float:
+        return error(sensors, group) / error("full", group)
+
+    def good(sensors: str, group: str) -> bool:
+        return share(sensors, group) <= GOOD or error(sensors, group) <= FLOOR * error(TRUE, group)
+
+    worst = max(GROUPS, key=lambda group: share("full", group))
+    base = max(_BASE, key=lambda group: share("contacts", group))
+    torque = times("contacts", "joint_torque")
+    best = min(_SETS, key=lambda sensors: error(sensors, _INSIDE))
+    outside = max((group for group in GROUPS if group != _INSIDE), key=lambda group: times("joints", group))
+    return (
+        Finding(
+            1,
+            all(good("full", group) for group in GROUPS),
+            f"worst, {_name(worst)}: {share('full', worst):.2g} x nominal",
+        ),
+        Finding(
+            2,
+            all(good("contacts", group) for group in _BASE) and torque >= POOR,
+            f"{_name(base)} {share('contacts', base):.2g} x nominal, joint torque {torque:.2g} x full",
+        ),
+        Finding(
+            3,
+            best == "joints" and times("joints", outside) >= POOR,
+            f"inside best: {best}; outside, {_name(outside)} {times('joints', outside):.2g} x full",
+        ),
+    )
+
+
+def _name(group: str) -> str:
+    return GROUPS[group].split(" [")[0]

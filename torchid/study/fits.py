@@ -1,0 +1,72 @@
+"""Compress the logs of one condition once per sensor set, and fit any nominal parameters on what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from torchid.estimators import Estimate, LeastSquares
+from torchid.parameters import Array
+from torchid.problem import RowBuilder, Samples, linear_problem
+from torchid.problem.chunks import by_state
+from torchid.problem.plan import State
+from torchid.problem.streaming import compress_by_state, merged
+from torchid.problem.triangular import TriangularFactor
+from torchid.run.experiment import Experiment
+
+
+@dataclass(frozen=True)
+class StateRank:
+    """A contact state of the training logs: samples in it, and independent combinations that they determine."""
+
+    name: str
+    samples: int
+    rank: int
+
+
+@dataclass(frozen=True)
+class CompressedLogs:
+    """What a sensor set keeps of some groups of logs: a factor per group and contact state."""
+
+    experiment: Experiment
+    builder: RowBuilder
+    factors: Mapping[str, Mapping[State, TriangularFactor]]
+    counts: Mapping[str, Mapping[State, int]]
+
+    def fit(self, groups: Sequence[str], nominal: Array, friction: bool) -> Estimate:
+        """Parameters from some groups of logs, near nominal ones (L, 12)."""
+        return self._solve([factor for group in groups for factor in self.factors[group].values()], nominal, friction)
+
+    def ranks(self, groups: Sequence[str], friction: bool) -> list[StateRank]:
+        """What each contact state of some groups determines on its own, and all together, most frequent first."""
+        nominal = self.experiment.robot.nominal
+        together = StateRank("together", 0, self.fit(groups, nominal, friction).rank)
+        out = []
+        for state in {state for group in groups for state in self.factors[group]}:
+            factors = [self.factors[group][state] for group in groups if state in self.factors[group]]
+            frames = [c.frame for c, active in zip(self.builder.contacts, state, strict=True) if active]
+            samples = sum(self.counts[group].get(state, 0) for group in groups)
+            rank = self._solve(factors, nominal, friction).rank
+            out.append(StateRank(" + ".join(frames) or "none", samples, rank))
+        out.sort(key=lambda found: -found.samples)
+        return [*out, replace(together, samples=sum(found.samples for found in out))]
+
+    def _solve(self, factors: Sequence[TriangularFactor], nominal: Array, friction: bool) -> Estimate:
+        settings = self.experiment.config.estimator
+        robot = replace(self.experiment.robot, nominal=nominal)
+        problem = linear_problem(merged(factors, self.builder), self.builder, robot, friction)
+        return LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
+
+
+def compressed(
+    experiment: Experiment, groups: Mapping[str, Sequence[Samples]], progress: Callable[[int], None] | None = None
+) -> CompressedLogs:
+    """Compress groups of logs with an experiment's sensors; `progress` gets samples done since the last call."""
+    builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(experiment.config.device)
+    factors = {name: compress_by_state(logs, builder, progress=progress) for name, logs in groups.items()}
+    counts: dict[str, dict[State, int]] = {name: {} for name in groups}
+    for name, logs in groups.items():
+        for samples in logs:
+            for state, index in by_state(samples):
+                counts[name][state] = counts[name].get(state, 0) + len(samples[index])
+    return CompressedLogs(experiment, builder, factors, counts)

@@ -1,0 +1,41 @@
+"""The settings of a study, and how motions are told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from torchid.config import SimulationConfig
+
+SHOWN = ("white noise", "all runs")  # condition and training set of the figures
+SQUATS, UNSEEN = "squat_", "unseen_"  # how the names of the squats, and of the motion that no fit sees, begin
+TRAINING = {"all runs": ("squats", "others"), "squats alone": ("squats",)}
+
+_QUICK_S = {"squat_1.0hz": 3.4, "squat_2.0hz": 3.4, "squat_3.0hz": 3.4, "sway_0.5hz": 6.4, "unseen_1.5hz": 3.4}
+
+
+@dataclass(frozen=True)
+class Study:
+    """The settings of a study.
+
+    Attributes:
+        simulation: the motions; the study switches the imperfections, at the levels given there.
+        experiments: experiment files by name of the sensor set; robot and logs in them are the study's.
+        noise_draws: draws of white noise, and of biases and gains.
+        nominal_draws: draws of the nominal parameters.
+    """
+
+    simulation: SimulationConfig
+    experiments: Mapping[str, Path]
+    noise_draws: int = 5
+    nominal_draws: int = 5
+
+    def quick(self) -> Study:
+        """The same in a minute: fewer and shorter motions, fewer draws."""
+        motions = [
+            replace(motion, duration_s=_QUICK_S[motion.name])
+            for motion in self.simulation.motions
+            if motion.name in _QUICK_S
+        ]
+        return replace(self, simulation=replace(self.simulation, motions=motions), noise_draws=1, nominal_draws=2)
