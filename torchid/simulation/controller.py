@@ -45,14 +45,14 @@ class Controller:
     def __init__(self, plant: Plant, feet: tuple[Foot, ...], rotations: Array) -> None:
         """Fix the feet and their rotations to world, (F, 3, 3), which they keep."""
         self._plant = plant
-        self._points = [np.array(foot.points) for foot in feet]
+        self._feet = feet
         self._rotations = rotations
 
     def torque(self, goal: Goal) -> Array:
         """Torques (n,) [N m] for the plant as last observed."""
         plant = self._plant
         M, bias = plant.inertia, plant.bias
-        feet = [plant.foot(i) for i in range(len(self._points))]
+        feet = [plant.foot(i) for i in range(len(self._feet))]
         acceleration = self._acceleration(goal, M, bias, feet)
         needed = M @ acceleration + bias
         return (needed - self._contact_forces(needed[:6], goal.load, feet))[6:]
@@ -78,10 +78,12 @@ class Controller:
             off = np.concatenate([p - foot.position, turn_between(foot.rotation, self._rotations[i])])
             if goal.load[i] > _ALOFT:
                 off[2] = 0.0  # the floor gives way
-                tasks.append((_STANDING, foot.J, _CREEP * off - _FOOT_DAMPING * foot.velocity - foot.bias))
+                weight, wanted = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
             else:
                 rate = np.concatenate([v, np.zeros(3)]) - foot.velocity
-                tasks.append((_SWING, foot.J, _servo(off, rate, np.concatenate([a, np.zeros(3)])) - foot.bias))
+                weight, wanted = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
+            rows = slice(self._feet[i].held)
+            tasks.append((weight, foot.J[rows], (wanted - foot.bias)[rows]))
 
         joints = np.zeros((plant.n, nv))
         joints[:, 6:] = np.diag(np.where(goal.driven, _JOINT, _POSTURE))
@@ -98,11 +100,11 @@ class Controller:
         Points that would have to pull are left out, as far as enough others remain.
         """
         maps, shares = [], []
-        for points, share, foot in zip(self._points, load, feet, strict=True):
+        for foot, share, motion in zip(self._feet, load, feet, strict=True):
             if share <= _ALOFT:
                 continue
-            for arm in points @ foot.rotation.T:
-                maps.append(foot.J[:3] - _cross(arm) @ foot.J[3:])
+            for arm in foot.arms @ motion.rotation.T:
+                maps.append(motion.J[:3] - _cross(arm) @ motion.J[3:])
                 shares.append(share)
         J, S = np.vstack(maps), np.array(shares)
         at_base = J[:, :6].T

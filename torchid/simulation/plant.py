@@ -19,6 +19,7 @@ from torchid.robot.urdf import parse_xml
 
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
 _SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
+_STICTION = (0.002, 1.0)  # the same of dry friction in a joint; MuJoCo's own lets joints creep at 0.1 rad/s
 _FRICTION = (1.0, 0.005, 0.0001)
 _SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction creeps
 
@@ -31,10 +32,28 @@ class Foot:
     points: tuple[tuple[float, float, float], ...]
     radius: float
 
+    @property
+    def middle(self) -> Array:
+        """Mean of the points (3,) [m], in the foot's frame."""
+        return np.mean(self.points, axis=0)
+
+    @property
+    def arms(self) -> Array:
+        """The points from their middle, (k, 3) [m]."""
+        return np.array(self.points) - self.middle
+
+    @property
+    def held(self) -> int:
+        """How many of its six velocities the floor can hold: the linear three, and the rest if it stands flat."""
+        return 6 if len(self.points) > 2 else 3
+
 
 @dataclass(frozen=True)
 class FootMotion:
-    """Where a foot is: position (3,), rotation (3, 3) to world, velocity (6,), Jacobian (6, nv), bias (6,)."""
+    """Where the middle of a foot's points is: position (3,), velocity (6,), Jacobian (6, nv), bias acceleration (6,).
+
+    World axes, linear part first; `rotation`, (3, 3), is that of the foot's frame to world.
+    """
 
     position: Array
     rotation: Array
@@ -87,11 +106,14 @@ class Plant:
         self.joint_names = tuple(model.joint(i).name for i in range(1, model.njnt))
         self.mass = float(model.body_subtreemass[1])
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT  # a stop's force would be in no sensor
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it integrates another acceleration than qacc
+        model.dof_solref[:], model.dof_solimp[:, :2] = _STICTION, (0.99, 0.999)
         self.limits = np.where(model.jnt_limited[1:, None], model.jnt_range[1:], [-np.inf, np.inf])
         self.weight = -self.mass * model.opt.gravity  # force that holds the robot up (3,) [N]
         self.foot_frames = tuple(foot.frame for foot in feet)
-        self._sites = [model.site(_sensor(foot)).id for foot in feet]
-        self._bodies = [int(model.site_bodyid[site]) for site in self._sites]
+        self._sensors = [model.site(_sensor(foot)).id for foot in feet]
+        self._middles = [model.site(_middle(foot)).id for foot in feet]
+        self._bodies = [int(model.site_bodyid[site]) for site in self._middles]
         self._M = np.zeros((self.nv, self.nv))
 
     # ---------------------------------------------------------------------------------------------------- stepping
@@ -168,11 +190,11 @@ class Plant:
     @property
     def feet_positions(self) -> Array:
         """Origins of the feet's frames (F, 3) [m]."""
-        return self.data.site_xpos[self._sites]
+        return self.data.site_xpos[self._sensors]
 
     def foot(self, index: int) -> FootMotion:
-        """Where the foot is and how it moves, world axes, linear part first."""
-        model, data, body, site = self.model, self.data, self._bodies[index], self._sites[index]
+        """Where a foot is and how it moves."""
+        model, data, body, site = self.model, self.data, self._bodies[index], self._middles[index]
         J, J_dot = np.zeros((6, self.nv)), np.zeros((6, self.nv))
         mujoco.mj_jacSite(model, data, J[:3], J[3:], site)
         mujoco.mj_jacDot(model, data, J_dot[:3], J_dot[3:], data.site_xpos[site], body)
@@ -222,6 +244,7 @@ def _add_foot(spec: mujoco.MjSpec, foot: Foot, urdf: Path) -> None:
         raise UnknownNameError(urdf, "feet", foot.frame, [body.name for body in spec.bodies[1:]])
     plate = link.add_body(name=_sensor(foot))
     plate.add_site(name=_sensor(foot))
+    plate.add_site(name=_middle(foot), pos=foot.middle)
     for point in foot.points:
         plate.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -237,3 +260,7 @@ def _add_foot(spec: mujoco.MjSpec, foot: Foot, urdf: Path) -> None:
 
 def _sensor(foot: Foot) -> str:
     return f"{foot.frame} sensor"
+
+
+def _middle(foot: Foot) -> str:
+    return f"{foot.frame} middle"

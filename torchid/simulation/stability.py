@@ -88,7 +88,7 @@ def _zmp_margin(place: Array, force: Array, moment: Array, stance: Stance, feet:
     aloft = total[:, 2] < 1.0
     zmp = np.stack([-turning[:, 1], turning[:, 0]], axis=1) / np.where(aloft, np.nan, total[:, 2])[:, None]
     corners = [
-        target[:2] + (np.array(foot.points) @ R.T)[:, :2]
+        target[:2] + (foot.arms @ R.T)[:, :2]
         for target, R, foot in zip(stance.feet, stance.rotations, feet, strict=True)
     ]
     margin = np.inf if not aloft.any() else -np.inf

@@ -14,14 +14,14 @@ from torchid.simulation.controller import turn_between
 from torchid.simulation.plant import Foot, Plant
 
 _ITERATIONS, _LARGEST_STEP = 300, 0.2
-_POSTURE_WEIGHT = 1e-3
+_SINGULAR = 1e-4  # share of the largest singular value
 _TOLERANCE = 1e-3  # m or rad
 _STEEPEST = np.radians(40.0)  # that a sole may be off the horizontal in the given posture
 
 
 @dataclass(frozen=True)
 class Stance:
-    """A standing robot: configuration (7 + n,), centre of mass (3,), poses of the feet (F, 3) and (F, 3, 3)."""
+    """A standing robot: configuration (7 + n,) and centre of mass (3,); feet's middles (F, 3), rotations (F, 3, 3)."""
 
     position: Array
     com: Array
@@ -51,16 +51,15 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
     rotations = np.stack([_flattened(plant.foot(i).rotation, foot, source) for i, foot in enumerate(feet)])
     targets = np.stack([plant.foot(i).position for i in range(len(feet))])
     for target, R, foot in zip(targets, rotations, feet, strict=True):
-        target[2] = foot.radius - np.min(np.array(foot.points) @ R[2])
-    plant.place(plant.shift(np.eye(plant.nv)[2] * np.mean(targets[:, 2] - plant.feet_positions[:, 2])))
+        target[2] = foot.radius - np.min(foot.arms @ R[2])
+    lift = np.mean([target[2] - plant.foot(i).position[2] for i, target in enumerate(targets)])
+    plant.place(plant.shift(lift * np.eye(plant.nv)[2]))
 
-    pull = np.concatenate([np.zeros(6), np.ones(plant.n)])
-    damping = np.diag(_POSTURE_WEIGHT * pull + 1e-9)
     for _ in range(_ITERATIONS):
         A, off = _tasks(plant, feet, targets, rotations)
         home = np.concatenate([np.zeros(6), joints - plant.position[7:]])
-        step = np.linalg.solve(A.T @ A + damping, A.T @ off + _POSTURE_WEIGHT * pull * home)
-        step *= min(1.0, _LARGEST_STEP / np.abs(step).max())
+        step = home + np.linalg.pinv(A, rcond=_SINGULAR) @ (off - A @ home)  # the posture yields to everything else
+        step *= min(1.0, _LARGEST_STEP / max(np.abs(step).max(), _LARGEST_STEP))
         moved = plant.shift(step)
         moved[7:] = np.clip(moved[7:], low, high)
         plant.place(moved)
@@ -76,26 +75,23 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
 
 def _tasks(plant: Plant, feet: Sequence[Foot], targets: Array, rotations: Array) -> tuple[Array, Array]:
     """What should be zero: Jacobian (rows, nv), and how far off it is (rows,) [m, rad]."""
-    jacobians, off, centres = [], [], []
+    jacobians, off = [], []
     for i, (foot, target, R) in enumerate(zip(feet, targets, rotations, strict=True)):
         now = plant.foot(i)
-        rows = 6 if len(foot.points) > 2 else 3
-        jacobians.append(now.J[:rows])
-        off.append(np.concatenate([target - now.position, turn_between(now.rotation, R)])[:rows])
-        centres.append(target + R @ np.mean(foot.points, axis=0))
+        jacobians.append(now.J[: foot.held])
+        off.append(np.concatenate([target - now.position, turn_between(now.rotation, R)])[: foot.held])
     level = np.zeros((3, plant.nv))
     level[:, 3:6] = np.eye(3)
     A = np.vstack([*jacobians, plant.inertia[:2] / plant.mass, level])
-    above = (np.mean(centres, axis=0) - plant.com)[:2]
+    above = (targets.mean(axis=0) - plant.com)[:2]
     return A, np.concatenate([*off, above, turn_between(plant.base_rotation, np.eye(3))])
 
 
 def _flattened(R: Array, foot: Foot, source: object) -> Array:
     """The rotation nearest to R that puts all points of the foot at one height."""
-    points = np.array(foot.points)
-    if len(points) < 3:
+    if foot.held < 6:
         return R.copy()
-    normal = np.linalg.svd((points - points.mean(axis=0)) @ R.T)[2][2]
+    normal = np.linalg.svd(foot.arms @ R.T)[2][2]
     normal *= np.copysign(1.0, normal[2])
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     angle = np.arctan2(np.linalg.norm(axis), normal[2])
