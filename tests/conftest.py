@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from synthetic import load
 
@@ -27,3 +29,15 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Robot:
     path = tmp_path_factory.mktemp("small") / "small.urdf"
     path.write_text(f'<robot name="small">{"".join(elements)}</robot>')
     return load(path)
+
+
+@pytest.fixture(scope="session")
+def biped_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `torchid simulate` writes of the shipped biped, every motion cut to seconds."""
+    from simulated import short
+
+    from torchid.run.simulate import simulate
+
+    output = tmp_path_factory.mktemp("simulations") / "biped"
+    simulate(short(output))
+    return output

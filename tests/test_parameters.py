@@ -1,9 +1,10 @@
-"""The ten inertial numbers: order, frames, pseudo-inertia."""
+"""The ten inertial numbers: order, frames, pseudo-inertia, perturbation."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -92,3 +93,67 @@ def test_a_body_that_breaks_the_triangle_inequality_has_a_negative_margin() -> N
     phi = np.stack([parameters.inertial_vector(1.0, np.ones(3), np.diag(x)) for x in ([1, 1, 1.9], [1, 1, 2.1])])
     assert (parameters.consistency_margin(phi) > 0.0).tolist() == [True, False]
     assert (parameters.consistency_margin(np.pad(phi, ((0, 0), (0, 2)))) > 0.0).tolist() == [True, False]
+
+
+# -------------------------------------------------------------------------------------------------------- perturbation
+
+
+def many(count: int = 400) -> Array:
+    """Parameters (count, 12) of real bodies with friction."""
+    rng = np.random.default_rng(1)
+    rows = []
+    for _ in range(count):
+        moments, R = rng.uniform(0.05, 5.0, 3), Rotation.random(random_state=rng).as_matrix()
+        inertia = R @ np.diag(moments.sum() - moments) @ R.T
+        body = parameters.inertial_vector(rng.uniform(0.1, 9.0), rng.uniform(-1.0, 1.0, 3), inertia)
+        rows.append(np.concatenate([body, rng.uniform(0.0, 1.0, 2)]))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.2, 0.99])
+def test_a_perturbed_body_differs_by_factors_within_the_bounds(error: float) -> None:
+    true = many()
+    factors = []
+    for phi, other in zip(true, parameters.perturbed(true, error, np.random.default_rng(0)), strict=True):
+        (mass, com, inertia), (m, c, I) = (parameters.mass_com_inertia(x) for x in (phi, other))  # noqa: E741
+        scale = np.trace(I) / np.trace(inertia)
+        np.testing.assert_allclose(I, scale * inertia, rtol=0.0, atol=1e-9 * np.trace(inertia))
+        factors.append([m / mass, *(c / com), scale])
+    found = np.array(factors)
+    assert np.abs(found - 1.0).max() <= error + 1e-9
+    if error:
+        assert (np.ptp(found, axis=0) > 1.9 * error).all()  # both ends are reached
+        together = np.corrcoef(found.T) - np.eye(5)
+        assert np.abs(together).max() < 0.25  # independent of each other: 5 standard deviations of 400 draws
+
+
+@pytest.mark.parametrize("error", [0.2, 0.99])
+def test_a_perturbed_body_could_exist_as_well_as_the_true_one(error: float) -> None:
+    for seed in range(5):
+        other = parameters.perturbed(many(), error, np.random.default_rng(seed))
+        assert np.linalg.eigvalsh(parameters.pseudo_inertia(other)).min() > 0.0
+
+
+def test_a_plate_stays_a_plate_and_no_body_becomes_impossible() -> None:
+    plate = np.pad(parameters.inertial_vector(2.0, np.zeros(3), np.diag([1.0, 2.0, 3.0])), (0, 2))[None]
+    other = parameters.perturbed(plate, 0.5, np.random.default_rng(0))
+    assert abs(parameters.consistency_margin(other)[0]) < 1e-12
+    assert (other[0, parameters.FIRST_MOMENT] == 0.0).all()
+
+
+def test_massless_bodies_and_friction_are_not_perturbed() -> None:
+    true = many(20)
+    true[3:6, parameters.INERTIAL] = 0.0
+    before = true.copy()
+    other = parameters.perturbed(true, 0.3, np.random.default_rng(0))
+    np.testing.assert_array_equal(other[3:6], true[3:6])
+    np.testing.assert_array_equal(other[:, parameters.FRICTION], true[:, parameters.FRICTION])
+    np.testing.assert_array_equal(true, before)
+    assert (other[[0, 1, 2, 6], 0] != true[[0, 1, 2, 6], 0]).all()
+
+
+def test_the_same_draw_perturbs_alike_and_another_differently() -> None:
+    true = many(5)
+    first, again, other = (parameters.perturbed(true, 0.2, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert (first[:, 0] != other[:, 0]).all()

@@ -28,7 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.simplefilter("always", TorchidWarning)
         warnings.showwarning = _show_warning
         try:
-            options.command(options)
+            with _termination_interrupts():
+                options.command(options)
         except (InputError, BaseLostError) as error:
             print(f"torchid: {error}", file=sys.stderr)
             return 2
@@ -66,6 +67,19 @@ def _parser() -> argparse.ArgumentParser:
     for command in (identify, evaluate, simulate):
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
     return parser
+
+
+@contextmanager
+def _termination_interrupts() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does, which leaves nothing behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.types import STRICT, Device, NotNegative, Number, Positive
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, TorchidWarning
 from torchid.sensing.sensors import SensorNoise
 
 Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
@@ -135,11 +136,18 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     Raises:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
         UnknownNameError: a key that does not exist; the message names the nearest that do.
+
+    Warns:
+        TorchidWarning: a log is both fitted and tested on.
     """
     path = Path(path)
     config = load(_EXPERIMENT, path, overrides)
     _check_sensors(path, config.sensors)
     train, test = (_matching(path, f"logs.{key}", getattr(config.logs, key)) for key in ("train", "test"))
+    both = sorted(set(train) & set(test))
+    if both:
+        message = f"{path}: logs.test: {both[0]} is fitted on as well; its errors say nothing of unseen motion"
+        warnings.warn(message, TorchidWarning, stacklevel=2)
     return dataclasses.replace(config, logs=LogsConfig(train, test))
 
 
@@ -155,10 +163,13 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
         if path.exists() or not {"*", "?"} & set(path.name):
             out.append(path)
             continue
-        found = sorted(path.parent.glob(path.name))
+        found = sorted(file for file in path.parent.glob(path.name.replace("[", "[[]")) if file.is_file())
         if not found:
             raise ConfigError(source, field, f"no file matches {path}", "a log, or a pattern of several")
         out += found
+    again = [path for path in out if out.count(path) > 1]
+    if again:
+        raise ConfigError(source, field, f"{again[0]} is given twice", "every log once")
     return out
 
 

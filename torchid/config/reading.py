@@ -138,7 +138,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
         return ConfigError(path, ", ".join(missing), "missing", "a value")
     if field in kind.refusals:
         return ConfigError(path, field, *kind.refusals[field])
-    if first["type"] == "too_short":
+    if first["type"] == "too_short" and not first["input"]:
         return ConfigError(path, field, "an empty list", "at least one item")
     found = first["input"]
     shown = "a mapping" if isinstance(found, Mapping) else "a list" if isinstance(found, list) else repr(found)

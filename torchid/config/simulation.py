@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
-from torchid.config.types import STRICT, NotNegative, Number, Positive
+from torchid.config.types import STRICT, FileName, NotNegative, Number, Positive
 from torchid.errors import ConfigError
 
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -63,7 +63,7 @@ class StepsConfig:
 class MotionConfig:
     """One log: waves about the stance, and steps. `name` becomes the name of the file."""
 
-    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
+    name: FileName
     duration_s: Positive
     waves: list[WaveConfig] = dataclasses.field(default_factory=list)
     steps: StepsConfig | None = None

@@ -80,7 +80,14 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
 def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
     """How a simulated robot stood: fields of `Stability` by motion."""
     table = Table(title="Standing", title_justify="left")
-    for heading in ("motion", "base height [m]", "slip [mm]", "zero-moment point inside by [mm]", "feet up [%]"):
+    for heading in (
+        "motion",
+        "base height [m]",
+        "slip [mm]",
+        "zero-moment point inside by [mm]",
+        "effort [%]",
+        "feet up [%]",
+    ):
         table.add_column(heading, justify="left" if heading == "motion" else "right")
     for name, found in motions.items():
         low, high = found["base_height"]
@@ -89,6 +96,7 @@ def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
             f"{low:.3f} to {high:.3f}",
             f"{1e3 * found['slip']:.1f}",
             f"{1e3 * found['zmp_margin']:.0f}",
+            f"{100 * found['effort']:.0f}",
             ", ".join(f"{100 * share:.0f}" for share in found["unloaded"]),
         )
     return table

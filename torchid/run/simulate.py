@@ -99,5 +99,6 @@ def _simulate_motion(config: SimulationConfig, motion: MotionConfig, source: obj
 
     recording, stability = set_up_simulation(config, source).run(motion, progress)
     write_log(recording.log, folder / "exact" / f"{motion.name}.npz")
-    write_log(sensor_log(recording.log, config.sensors, config.seed), folder / "logs" / f"{motion.name}.npz")
+    log = sensor_log(recording.log, config.sensors, config.seed)
+    write_log(log, folder / "logs" / f"{motion.name}.npz")
     return stability

@@ -12,7 +12,8 @@ from torchid.simulation.plant import Foot, FootMotion, Plant
 _STIFFNESS, _DAMPING = 100.0, 20.0  # 1/s^2, 1/s: errors decay within half a second, without overshoot
 _CREEP, _FOOT_DAMPING = 100.0, 20.0  # 1/s^2, 1/s, of a foot that stands: friction holds it, but lets it creep
 _STANDING, _CENTRE, _TURN, _SWING, _JOINT, _POSTURE = 100.0, 10.0, 10.0, 10.0, 3.0, 0.05  # weights of the tasks
-_ALOFT = 1e-3  # a foot that carries a smaller share than this is off the floor
+ALOFT = 1e-3  # a foot that carries a smaller share than this is off the floor
+_PREVIEW, _SMOOTH = 0.02, 0.05  # s, rad/s: friction is that of the velocity to come, and smooth where it turns
 _TRIES, _LEAST_POINTS = 3, 3
 
 
@@ -42,9 +43,12 @@ class Goal:
 class Controller:
     """Joint torques from the state of the plant and a goal."""
 
-    def __init__(self, plant: Plant, feet: tuple[Foot, ...], rotations: Array) -> None:
-        """Fix the feet and their rotations to world, (F, 3, 3), which they keep."""
+    def __init__(
+        self, plant: Plant, feet: tuple[Foot, ...], rotations: Array, friction: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Fix the feet, their rotations to world, (F, 3, 3), which they keep, and the joint friction to make up for."""
         self._plant = plant
+        self._coulomb, self._viscous = friction
         self._feet = feet
         self._rotations = rotations
 
@@ -55,7 +59,9 @@ class Controller:
         feet = [plant.foot(i) for i in range(len(self._feet))]
         acceleration = self._acceleration(goal, M, bias, feet)
         needed = M @ acceleration + bias
-        return (needed - self._contact_forces(needed[:6], goal.load, feet))[6:]
+        velocity = plant.velocity[6:] + _PREVIEW * acceleration[6:]
+        lost = self._coulomb * np.tanh(velocity / _SMOOTH) + self._viscous * velocity
+        return (needed - self._contact_forces(needed[:6], goal.load, feet))[6:] + lost
 
     def _acceleration(self, goal: Goal, M: Array, bias: Array, feet: list[FootMotion]) -> Array:
         """The generalized acceleration (nv,) that meets all tasks best, by weighted least squares."""
@@ -76,7 +82,7 @@ class Controller:
         for i, foot in enumerate(feet):
             p, v, a = goal.feet[i]
             off = np.concatenate([p - foot.position, turn_between(foot.rotation, self._rotations[i])])
-            if goal.load[i] > _ALOFT:
+            if goal.load[i] > ALOFT:
                 off[2] = 0.0  # the floor gives way
                 weight, wanted = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
             else:
@@ -101,7 +107,7 @@ class Controller:
         """
         maps, shares = [], []
         for foot, share, motion in zip(self._feet, load, feet, strict=True):
-            if share <= _ALOFT:
+            if share <= ALOFT:
                 continue
             for arm in foot.arms @ motion.rotation.T:
                 maps.append(motion.J[:3] - _cross(arm) @ motion.J[3:])

@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torchid.config import MotionConfig, StepsConfig
-from torchid.errors import UnknownNameError
+from torchid.errors import InputError, UnknownNameError
+from torchid.logs.fields import BoolArray
 from torchid.parameters import Array
-from torchid.simulation.controller import Goal
+from torchid.simulation.controller import ALOFT, Goal
 from torchid.simulation.stance import Stance
 
 BODY = ("com_x", "com_y", "com_z", "base_roll", "base_pitch", "base_yaw")  # what waves move, besides joints
@@ -30,6 +31,7 @@ class Motion:
 
     Raises:
         UnknownNameError: a wave moves something that the robot does not have.
+        InputError: it is too short.
     """
 
     def __init__(
@@ -44,6 +46,9 @@ class Motion:
         self.name = config.name
         self._stance = stance
         names = (*BODY, *joint_names)
+        if config.duration_s * control_hz < 2.0:
+            found, wanted = f"{config.duration_s:g}", f"at least two control steps, {2.0 / control_hz:g} s"
+            raise InputError(source, f"motions.{config.name}.duration_s", found, wanted)
         steps = round((LEAD_S + config.duration_s) * control_hz)
         self.time = np.arange(steps) / control_hz - LEAD_S
         grown = _smooth((self.time + LEAD_S) / LEAD_S)
@@ -63,6 +68,11 @@ class Motion:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def supports(self) -> BoolArray:
+        """The sets of feet, (S, F), that carry the robot at one time or another."""
+        return np.unique(self._load > ALOFT, axis=0)
 
     def __iter__(self) -> Iterator[Goal]:
         """The goals, one per control step."""
@@ -101,7 +111,7 @@ def _steps(steps: StepsConfig | None, feet: Sequence[str], time: Array) -> tuple
         stepping = time - off > 0.5 * steps.swing_s + steps.transfer_s  # not if it had to begin before time 0
         height[:, foot] += np.where(stepping & (inside > 0.0), steps.height_m * _bump(inside), 0.0)
         unloaded = (np.abs(off) - 0.5 * steps.swing_s) / steps.transfer_s
-        load[:, foot] = np.where(stepping, _smooth(unloaded), 1.0)
+        load[:, foot] = np.minimum(load[:, foot], np.where(stepping, _smooth(unloaded), 1.0))
     return height, load
 
 

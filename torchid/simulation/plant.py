@@ -13,7 +13,7 @@ except ImportError as error:
 import numpy as np
 from lxml import etree
 
-from torchid.errors import UnknownNameError, UrdfError
+from torchid.errors import UrdfError
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
 
@@ -26,11 +26,11 @@ _SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction 
 
 @dataclass(frozen=True)
 class Foot:
-    """A link that touches the floor at points, (k, 3) [m] in its frame, with spheres of radius `radius` [m]."""
+    """A link that touches the floor with spheres about points, (k, 3) [m] in its frame, of radii (k,) [m]."""
 
     frame: str
     points: tuple[tuple[float, float, float], ...]
-    radius: float
+    radii: tuple[float, ...]
 
     @property
     def middle(self) -> Array:
@@ -83,7 +83,6 @@ class Plant:
 
         Raises:
             UrdfError: MuJoCo does not take it, or it has mimic joints.
-            UnknownNameError: there is no link of a foot's name.
         """
         spec = _spec(urdf)
         spec.option.timestep = 1.0 / physics_hz
@@ -92,7 +91,7 @@ class Plant:
         spec.option.tolerance, spec.option.iterations = 1e-15, 100
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=_FRICTION, solref=_SPRING)
         for foot in feet:
-            _add_foot(spec, foot, urdf)
+            _add_foot(spec, foot)
         try:
             self.model = spec.compile()
         except ValueError as error:
@@ -109,6 +108,8 @@ class Plant:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP  # it integrates another acceleration than qacc
         model.dof_solref[:], model.dof_solimp[:, :2] = _STICTION, (0.99, 0.999)
         self.limits = np.where(model.jnt_limited[1:, None], model.jnt_range[1:], [-np.inf, np.inf])
+        limited = model.jnt_actfrclimited[1:].astype(bool)
+        self.efforts = np.where(limited, model.jnt_actfrcrange[1:, 1], np.inf)
         self.weight = -self.mass * model.opt.gravity  # force that holds the robot up (3,) [N]
         self.foot_frames = tuple(foot.frame for foot in feet)
         self._sensors = [model.site(_sensor(foot)).id for foot in feet]
@@ -202,19 +203,6 @@ class Plant:
         return FootMotion(data.site_xpos[site], rotation, J @ data.qvel, J, J_dot @ data.qvel)
 
 
-def sphere_points(urdf: Path, frame: str) -> tuple[tuple[tuple[float, float, float], ...], float]:
-    """Centres (k, 3) [m] and radius [m] of the collision spheres of a link; no points if it has none."""
-    root = parse_xml(urdf).getroot()
-    points, radius = [], 0.0
-    for shape in root.findall(f"link[@name='{frame}']/collision"):
-        sphere, origin = shape.find("geometry/sphere"), shape.find("origin")
-        if sphere is not None:
-            radius = float(sphere.get("radius", "0"))
-            x, y, z = map(float, ("0 0 0" if origin is None else origin.get("xyz", "0 0 0")).split())
-            points.append((x, y, z))
-    return tuple(points), radius
-
-
 def _spec(urdf: Path) -> mujoco.MjSpec:
     """The URDF without shapes, free to move."""
     root = parse_xml(urdf).getroot()
@@ -237,19 +225,16 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
     return spec
 
 
-def _add_foot(spec: mujoco.MjSpec, foot: Foot, urdf: Path) -> None:
+def _add_foot(spec: mujoco.MjSpec, foot: Foot) -> None:
     """A massless plate welded to the link: all that touches the floor, and a six-axis sensor in the weld."""
-    link = spec.body(foot.frame)
-    if link is None:
-        raise UnknownNameError(urdf, "feet", foot.frame, [body.name for body in spec.bodies[1:]])
-    plate = link.add_body(name=_sensor(foot))
+    plate = spec.body(foot.frame).add_body(name=_sensor(foot))
     plate.add_site(name=_sensor(foot))
     plate.add_site(name=_middle(foot), pos=foot.middle)
-    for point in foot.points:
+    for point, radius in zip(foot.points, foot.radii, strict=True):
         plate.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
             pos=point,
-            size=[foot.radius, 0, 0],
+            size=[radius, 0, 0],
             mass=0.0,
             friction=_FRICTION,
             solref=_SPRING,

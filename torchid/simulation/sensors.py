@@ -14,7 +14,7 @@ from torchid.parameters import Array
 from torchid.simulation.recording import exact
 
 
-def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int) -> Log:
+def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: str | None = None) -> Log:
     """The log that a robot with imperfect sensors would have written.
 
     Positions, torques and wrenches only: velocities and accelerations are for the preprocessing to derive. A contact
@@ -23,8 +23,10 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int) -> Log
     Args:
         truth: exact log, of a `Recording`.
         sensors: which imperfections, and how large.
-        seed: of the noise, together with the log's name; biases and gains depend on the seed alone.
+        seed: of the noise, together with `name`; biases and gains depend on the seed alone.
+        name: of the motion, by default the log's source; becomes the source.
     """
+    name = name or truth.source
     torque, wrench = exact(truth, "joint_torque"), exact(truth, "contact_wrench_local")
     if sensors.delay.enabled:
         late = round(sensors.delay.feet_s / float(np.median(np.diff(truth.time))))
@@ -33,7 +35,7 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int) -> Log
         torque, wrench = _biased(torque, wrench, sensors, np.random.default_rng([seed, 0]))
     position, base, turn = (exact(truth, f) for f in ("joint_position", "base_position_world", "base_quat_xyzw"))
     if sensors.noise.enabled:
-        rng, noise = np.random.default_rng([seed, 1, zlib.crc32(truth.source.encode())]), sensors.noise
+        rng, noise = np.random.default_rng([seed, 1, zlib.crc32(name.encode())]), sensors.noise
 
         def noisy(values: Array, deviation: float | Array) -> Array:
             return values + deviation * rng.normal(size=values.shape)
@@ -44,7 +46,7 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int) -> Log
         torque = noisy(torque, noise.joint_torque)
         wrench = noisy(wrench, np.repeat([noise.contact_force, noise.contact_moment], 3))
     return Log(
-        truth.source,
+        name,
         time=truth.time,
         joint_names=truth.joint_names,
         joint_position=position,

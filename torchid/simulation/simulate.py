@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from torchid.config import FootConfig, MotionConfig, SimulationConfig
-from torchid.errors import ConfigError
+import numpy as np
+
+from torchid.config import MotionConfig, SimulationConfig
+from torchid.errors import InputError
+from torchid.logs.fields import BoolArray
 from torchid.simulation.controller import Controller
+from torchid.simulation.feet import can_hold, find_feet
 from torchid.simulation.motion import Motion
-from torchid.simulation.plant import Foot, Plant, sphere_points
+from torchid.simulation.plant import Foot, Plant
 from torchid.simulation.recording import Recording, record
 from torchid.simulation.stability import Stability, stability
 from torchid.simulation.stance import Stance, find_stance
-
-_DEFAULT_RADIUS = 0.01  # m, of contact points that the file gives
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,26 @@ class Simulation:
 
         Raises:
             UnknownNameError: it moves what the robot does not have.
+            InputError: it is too short, or lifts feet that the robot cannot do without.
         """
         frames = self.plant.foot_frames
-        return Motion(config, self.stance, self.plant.joint_names, frames, self.config.control_hz, self.source)
+        motion = Motion(config, self.stance, self.plant.joint_names, frames, self.config.control_hz, self.source)
+        for support in motion.supports:
+            self.check_support(support, f"motions.{config.name}.steps")
+        return motion
+
+    def check_support(self, support: BoolArray, field: str) -> None:
+        """Refuse to stand on feet, (F,) bool, that cannot hold a robot.
+
+        Raises:
+            InputError: their contact points lie on a line.
+        """
+        standing = zip(self.feet, self.stance.feet, self.stance.rotations, support, strict=True)
+        points = [middle + foot.arms @ R.T for foot, middle, R, on in standing if on]
+        if not points or not can_hold(np.concatenate(points)):
+            names = ", ".join(foot.frame for foot, on in zip(self.feet, support, strict=True) if on)
+            found = f"stands on {names or 'no foot'} alone, whose contact points lie on a line"
+            raise InputError(self.source, field, found, "three points on the floor that do not, at any time")
 
     def run(self, config: MotionConfig, progress: Callable[[float], None] | None = None) -> tuple[Recording, Stability]:
         """Simulate a motion.
@@ -46,9 +65,13 @@ class Simulation:
         Raises:
             InputError: the robot falls, slips, or its zero-moment point leaves the bounds.
         """
-        controller = Controller(self.plant, self.feet, self.stance.rotations)
+        levels = self.config.friction
+        friction = (levels.coulomb, levels.viscous) if levels.enabled else (0.0, 0.0)
+        controller = Controller(self.plant, self.feet, self.stance.rotations, friction)
         recording = record(self.plant, controller, self.stance, self.motion(config), self.config, self.source, progress)
-        found = stability(recording, self.stance, self.feet, self.config.sensors.contact_threshold)
+        found = stability(
+            recording, self.plant, self.stance, self.feet, self.config.sensors.contact_threshold, self.source
+        )
         found.check(self.config.bounds, config.name, self.source)
         return recording, found
 
@@ -59,17 +82,9 @@ def set_up_simulation(config: SimulationConfig, source: object = "simulation") -
     Raises:
         InputError: the URDF, the feet or the posture are of no use.
     """
-    feet = tuple(_foot(foot, config, source) for foot in config.feet)
+    feet = find_feet(config.feet, config.robot.urdf, source)
     friction = (config.friction.coulomb, config.friction.viscous) if config.friction.enabled else None
     plant = Plant(config.robot.urdf, feet, config.physics_hz, friction)
-    return Simulation(config, source, plant, feet, find_stance(plant, feet, config.posture, source))
-
-
-def _foot(foot: FootConfig, config: SimulationConfig, source: object) -> Foot:
-    if foot.points:
-        return Foot(foot.frame, tuple((x, y, z) for x, y, z in foot.points), _DEFAULT_RADIUS)
-    points, radius = sphere_points(config.robot.urdf, foot.frame)
-    if not points:
-        found = f"no points, and {config.robot.urdf.name} has no collision spheres at {foot.frame}"
-        raise ConfigError(source, "feet", found, "points: [[x, y, z], ...] in the frame of the foot")
-    return Foot(foot.frame, points, radius)
+    simulation = Simulation(config, source, plant, feet, find_stance(plant, feet, config.posture, source))
+    simulation.check_support(np.ones(len(feet), dtype=bool), "feet")
+    return simulation

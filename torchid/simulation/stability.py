@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from torchid.config import BoundsConfig
 from torchid.errors import InputError
 from torchid.parameters import Array
-from torchid.simulation.plant import Foot
+from torchid.simulation.plant import Foot, Plant
 from torchid.simulation.recording import Recording, exact
 from torchid.simulation.stance import Stance
 
@@ -24,6 +24,8 @@ class Stability:
         height_change: most that it differed from the stance's [m].
         slip: most that a foot moved along the floor between touching it and leaving it [m].
         zmp_margin: least distance from the zero-moment point to the border of the support polygon [m].
+        beyond_limits: most that a joint was outside its range [rad or m].
+        effort: greatest torque as a share of what the URDF allows, 0 if it sets no limit.
         unloaded: share of the time in which each foot did not stand, (F,).
     """
 
@@ -31,6 +33,8 @@ class Stability:
     height_change: float
     slip: float
     zmp_margin: float
+    beyond_limits: float
+    effort: float
     unloaded: tuple[float, ...]
 
     def check(self, bounds: BoundsConfig, motion: str, source: object) -> None:
@@ -43,31 +47,48 @@ class Stability:
             (f"base height changes by {self.height_change:.3g} m", self.height_change <= bounds.height_m),
             (f"a foot slips by {1e3 * self.slip:.3g} mm", self.slip <= bounds.slip_m),
             (f"zero-moment point {1e3 * self.zmp_margin:.3g} mm inside the support", self.zmp_margin >= bounds.zmp_m),
+            (f"a joint passes its limits by {self.beyond_limits:.3g}", self.beyond_limits <= 0.0),
+            (f"a joint needs {100 * self.effort:.0f} % of its effort limit", self.effort <= 1.0),
         ):
             if not allowed:
                 wanted = "a gentler motion, another posture or wider bounds"
                 raise InputError(source, f"motions.{motion}", found, wanted)
 
 
-def stability(recording: Recording, stance: Stance, feet: tuple[Foot, ...], load: float) -> Stability:
+def stability(
+    recording: Recording, plant: Plant, stance: Stance, feet: tuple[Foot, ...], load: float, source: object
+) -> Stability:
     """Measure how a robot stood.
 
     Args:
         recording: what it did.
+        plant: the robot.
         stance: where it started.
         feet: what it stood on.
         load: vertical force [N] from which on a foot counts as standing.
+        source: named in errors.
+
+    Raises:
+        InputError: a foot never bears that much.
     """
     log = recording.log
     wrench = exact(log, "contact_wrench_local")
     force, moment = (np.einsum("fij,nfj->nfi", stance.rotations, part) for part in (wrench[..., :3], wrench[..., 3:]))
     standing = force[..., 2] > load
+    bearing = np.linalg.norm(force, axis=2).max(axis=0)
+    for foot, most in zip(feet, bearing, strict=True):
+        if most <= load:
+            found = f"{load:g} N, but {foot.frame} never bears more than {most:.3g} N"
+            raise InputError(source, "sensors.contact_threshold", found, "a fraction of what a standing foot bears")
+    low, high = plant.limits.T
     height = exact(log, "base_position_world")[:, 2]
     return Stability(
         (float(height.min()), float(height.max())),
         float(np.abs(height - stance.position[2]).max()),
         max(_slip(recording.feet[:, i, :2], standing[:, i]) for i in range(len(feet))),
         _zmp_margin(recording.feet, force, moment, stance, feet),
+        max(float((log.joint_position - high).max()), float((low - log.joint_position).max()), 0.0),
+        float(np.max(np.abs(exact(log, "joint_torque")) / plant.efforts)),
         tuple(map(float, 1.0 - standing.mean(axis=0))),
     )
 

@@ -51,7 +51,7 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
     rotations = np.stack([_flattened(plant.foot(i).rotation, foot, source) for i, foot in enumerate(feet)])
     targets = np.stack([plant.foot(i).position for i in range(len(feet))])
     for target, R, foot in zip(targets, rotations, feet, strict=True):
-        target[2] = foot.radius - np.min(foot.arms @ R[2])
+        target[2] = -np.min(foot.arms @ R[2] - foot.radii)
     lift = np.mean([target[2] - plant.foot(i).position[2] for i, target in enumerate(targets)])
     plant.place(plant.shift(lift * np.eye(plant.nv)[2]))
 

@@ -100,16 +100,16 @@ class Reproduction:
         """Corrupt, filter and bind all logs of a condition."""
         clean = conditions(self.study.simulation)[0]
 
-        def samples(log: Log, of: Condition) -> Samples:
-            log = sensor_log(log, of.sensors, self.study.simulation.seed + number)
+        def samples(name: str, of: Condition) -> Samples:
+            log = sensor_log(exact[name], of.sensors, self.study.simulation.seed + number, name)
             log = preprocess(log, self._filter.cutoff_hz, self._filter.sample_rate_hz)
             return bind(log, self._robot, self._contacts)
 
         groups: dict[str, list[Samples]] = {"squats": [], "others": []}
-        for name, log in exact.items():
+        for name in exact:
             if not name.startswith(UNSEEN):
-                groups["squats" if name.startswith(SQUATS) else "others"].append(samples(log, condition))
-        unseen = next(log for name, log in exact.items() if name.startswith(UNSEEN))
+                groups["squats" if name.startswith(SQUATS) else "others"].append(samples(name, condition))
+        unseen = next(name for name in exact if name.startswith(UNSEEN))
         return _Draw(condition, number, groups, samples(unseen, condition), samples(unseen, clean))
 
     def _examine(self, draw: _Draw, done: Callable[[], None]) -> None:

@@ -28,7 +28,7 @@ class Study:
 
     simulation: SimulationConfig
     experiments: Mapping[str, Path]
-    noise_draws: int = 5
+    noise_draws: int = 3
     nominal_draws: int = 5
 
     def quick(self) -> Study:

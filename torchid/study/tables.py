@@ -18,7 +18,7 @@ _COLUMNS = {
 
 
 def error_table(results: Results, condition: str, training: str, against: str = "exact") -> Table:
-    """Errors on the unseen log, Fig. 6: rms, share of the measured (medians over draws), and that share's range."""
+    """Errors on the unseen log, Fig. 6: medians of rms and share of the measured, and that share's range in %."""
     compared = "what truly happened" if against == "exact" else "what its sensors say"
     title = f"Unseen squat; sensors: {condition}; fitted on {training}; compared with {compared}"
     table = Table(title=title, title_justify="left")
@@ -34,7 +34,7 @@ def error_table(results: Results, condition: str, training: str, against: str = 
             share = results.spread(condition, training, sensors, relative, against)
             lines.append(f"{100 * share.median:.2g} %")
             if share.greatest > share.least:
-                lines.append(f"{100 * share.least:.2g} to {100 * share.greatest:.2g} %")
+                lines.append(f"{100 * share.least:.2g}–{100 * share.greatest:.2g}")
             cells.append("\n".join(lines))
         table.add_row(sensors, *cells, end_section=True)
     return table

@@ -1,0 +1,41 @@
+"""Errors cross from one process to another as they are."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from torchid.errors import (
+    BaseLostError,
+    ConfigError,
+    InputError,
+    LogError,
+    SensorError,
+    TorchidError,
+    UnknownNameError,
+    UrdfError,
+)
+from torchid.logs.read import UnknownFieldError
+
+PLAIN = [kind("a.yaml", "field", "a\nb", "c") for kind in (InputError, UrdfError, LogError, ConfigError, SensorError)]
+NAMED = [kind("a.yaml", "field", "l_nee", ("l_knee", "r_knee")) for kind in (UnknownNameError, UnknownFieldError)]
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@pytest.mark.parametrize("error", [*PLAIN, *NAMED, BaseLostError("rank 3")], ids=lambda error: type(error).__name__)
+def test_an_error_that_was_pickled_is_the_same_error(error: TorchidError, protocol: int) -> None:
+    back = pickle.loads(pickle.dumps(error, protocol))
+    assert type(back) is type(error)
+    assert str(back) == str(error)
+    assert vars(back) == vars(error)
+
+
+def test_an_unknown_name_keeps_the_names_that_are_known() -> None:
+    back = pickle.loads(pickle.dumps(UnknownNameError("a.yaml", "joint", "l_nee", ["l_knee", "x"])))
+    assert (back.name, back.valid) == ("l_nee", ("l_knee", "x"))
+    assert str(back) == "a.yaml: joint: unknown name 'l_nee'; accepted: l_knee"
+
+
+def test_a_message_is_one_line_whatever_was_found() -> None:
+    assert str(PLAIN[0]) == "a.yaml: field: a b; accepted: c"
