@@ -122,7 +122,7 @@ URDFS = {
         ("biped.urdf: joint 'torso_pitch': a mimic joint; accepted: independent joints",),
     ),
     "negative mass": ('<mass value="11"', '<mass value="-11"', ("pelvis", "-11 kg")),
-    "spheres of no size": ('<sphere radius="0.01"', '<sphere radius="0"', ("biped.urdf: link 'l_sole', <sphere>: radius 0",)),
+    "spheres of no size": ('<sphere radius="0.01"', '<sphere radius="0"', ("'l_sole', <sphere>: radius 0",)),
     "planar joint": ('type="revolute"', 'type="planar"', ("torso_roll", "planar")),
 }  # fmt: skip
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchid.parameters import Array
-from torchid.simulation.plant import Foot, FootMotion, Plant
+from torchid.simulation.feet import Foot
+from torchid.simulation.plant import FootMotion, Plant
 
 _STIFFNESS, _DAMPING = 100.0, 20.0  # 1/s^2, 1/s: errors decay within half a second, without overshoot
 _CREEP, _FOOT_DAMPING = 100.0, 20.0  # 1/s^2, 1/s, of a foot that stands: friction holds it, but lets it creep

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,33 @@ from torchid.config import FootConfig
 from torchid.errors import ConfigError, UnknownNameError, UrdfError
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
-from torchid.simulation.plant import Foot
 
 _RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
 _NARROWEST = 1e-3  # m, of a support polygon
+
+
+@dataclass(frozen=True)
+class Foot:
+    """A link that touches the floor with spheres about points, (k, 3) [m] in its frame, of radii (k,) [m]."""
+
+    frame: str
+    points: tuple[tuple[float, float, float], ...]
+    radii: tuple[float, ...]
+
+    @property
+    def middle(self) -> Array:
+        """Mean of the points (3,) [m], in the foot's frame."""
+        return np.mean(self.points, axis=0)
+
+    @property
+    def arms(self) -> Array:
+        """The points from their middle, (k, 3) [m]."""
+        return np.array(self.points) - self.middle
+
+    @property
+    def held(self) -> int:
+        """How many of its six velocities the floor can hold: the linear three, and the rest if it stands flat."""
+        return 6 if len(self.points) > 2 else 3
 
 
 def find_feet(settings: list[FootConfig], urdf: Path, source: object) -> tuple[Foot, ...]:

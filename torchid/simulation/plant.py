@@ -16,36 +16,13 @@ from lxml import etree
 from torchid.errors import UrdfError
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
+from torchid.simulation.feet import Foot
 
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
 _SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
 _STICTION = (0.002, 1.0)  # the same of dry friction in a joint; MuJoCo's own lets joints creep at 0.1 rad/s
 _FRICTION = (1.0, 0.005, 0.0001)
 _SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction creeps
-
-
-@dataclass(frozen=True)
-class Foot:
-    """A link that touches the floor with spheres about points, (k, 3) [m] in its frame, of radii (k,) [m]."""
-
-    frame: str
-    points: tuple[tuple[float, float, float], ...]
-    radii: tuple[float, ...]
-
-    @property
-    def middle(self) -> Array:
-        """Mean of the points (3,) [m], in the foot's frame."""
-        return np.mean(self.points, axis=0)
-
-    @property
-    def arms(self) -> Array:
-        """The points from their middle, (k, 3) [m]."""
-        return np.array(self.points) - self.middle
-
-    @property
-    def held(self) -> int:
-        """How many of its six velocities the floor can hold: the linear three, and the rest if it stands flat."""
-        return 6 if len(self.points) > 2 else 3
 
 
 @dataclass(frozen=True)

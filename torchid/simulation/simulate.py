@@ -11,9 +11,9 @@ from torchid.config import MotionConfig, SimulationConfig
 from torchid.errors import InputError
 from torchid.logs.fields import BoolArray
 from torchid.simulation.controller import Controller
-from torchid.simulation.feet import can_hold, find_feet
+from torchid.simulation.feet import Foot, can_hold, find_feet
 from torchid.simulation.motion import Motion
-from torchid.simulation.plant import Foot, Plant
+from torchid.simulation.plant import Plant
 from torchid.simulation.recording import Recording, record
 from torchid.simulation.stability import Stability, stability
 from torchid.simulation.stance import Stance, find_stance

@@ -10,7 +10,8 @@ from scipy.spatial import ConvexHull
 from torchid.config import BoundsConfig
 from torchid.errors import InputError
 from torchid.parameters import Array
-from torchid.simulation.plant import Foot, Plant
+from torchid.simulation.feet import Foot
+from torchid.simulation.plant import Plant
 from torchid.simulation.recording import Recording, exact
 from torchid.simulation.stance import Stance
 

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from torchid.errors import InputError, UnknownNameError
 from torchid.parameters import Array
 from torchid.simulation.controller import turn_between
-from torchid.simulation.plant import Foot, Plant
+from torchid.simulation.feet import Foot
+from torchid.simulation.plant import Plant
 
 _ITERATIONS, _LARGEST_STEP = 300, 0.2
 _SINGULAR = 1e-4  # share of the largest singular value

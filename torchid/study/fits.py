@@ -33,28 +33,29 @@ class CompressedLogs:
     factors: Mapping[str, Mapping[State, TriangularFactor]]
     counts: Mapping[str, Mapping[State, int]]
 
-    def fit(self, groups: Sequence[str], nominal: Array, friction: bool) -> Estimate:
-        """Parameters from some groups of logs, near nominal ones (L, 12)."""
-        return self._solve([factor for group in groups for factor in self.factors[group].values()], nominal, friction)
+    def fit(self, groups: Sequence[str], nominals: Sequence[Array], friction: bool) -> list[Estimate]:
+        """Parameters from some groups of logs, near each of some nominal ones (L, 12)."""
+        factor = merged((factor for group in groups for factor in self.factors[group].values()), self.builder)
+        return [self._solve(factor, nominal, friction) for nominal in nominals]
 
     def ranks(self, groups: Sequence[str], friction: bool) -> list[StateRank]:
         """What each contact state of some groups determines on its own, and all together, most frequent first."""
         nominal = self.experiment.robot.nominal
-        together = StateRank("together", 0, self.fit(groups, nominal, friction).rank)
+        (together,) = self.fit(groups, [nominal], friction)
         out = []
         for state in {state for group in groups for state in self.factors[group]}:
-            factors = [self.factors[group][state] for group in groups if state in self.factors[group]]
+            factors = (self.factors[group][state] for group in groups if state in self.factors[group])
             frames = [c.frame for c, active in zip(self.builder.contacts, state, strict=True) if active]
             samples = sum(self.counts[group].get(state, 0) for group in groups)
-            rank = self._solve(factors, nominal, friction).rank
+            rank = self._solve(merged(factors, self.builder), nominal, friction).rank
             out.append(StateRank(" + ".join(frames) or "none", samples, rank))
         out.sort(key=lambda found: -found.samples)
-        return [*out, replace(together, samples=sum(found.samples for found in out))]
+        return [*out, StateRank("together", sum(found.samples for found in out), together.rank)]
 
-    def _solve(self, factors: Sequence[TriangularFactor], nominal: Array, friction: bool) -> Estimate:
+    def _solve(self, factor: TriangularFactor, nominal: Array, friction: bool) -> Estimate:
         settings = self.experiment.config.estimator
         robot = replace(self.experiment.robot, nominal=nominal)
-        problem = linear_problem(merged(factors, self.builder), self.builder, robot, friction)
+        problem = linear_problem(factor, self.builder, robot, friction)
         return LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
 
 

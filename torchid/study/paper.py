@@ -119,8 +119,7 @@ class Reproduction:
         for sensors, experiment in self._experiments.items():
             logs = compressed(experiment, draw.groups)
             for training, groups in TRAINING.items():
-                fits = [logs.fit(groups, nominal, friction).phi for nominal in nominals]
-                vectors[training][sensors] = fits
+                vectors[training][sensors] = [fit.phi for fit in logs.fit(groups, nominals, friction)]
                 if draw.condition.name == SHOWN[0] and draw.number == 0:
                     self.ranks.append(Ranks(training, sensors, logs.ranks(groups, friction)))
             done()

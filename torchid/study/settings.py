@@ -12,7 +12,7 @@ SHOWN = ("white noise", "all runs")  # condition and training set of the figures
 SQUATS, UNSEEN = "squat_", "unseen_"  # how the names of the squats, and of the motion that no fit sees, begin
 TRAINING = {"all runs": ("squats", "others"), "squats alone": ("squats",)}
 
-_QUICK_S = {"squat_1.0hz": 3.4, "squat_2.0hz": 3.4, "squat_3.0hz": 3.4, "sway_0.5hz": 6.4, "unseen_1.5hz": 3.4}
+_QUICK_S = {"squat_1.0hz": 2.9, "squat_2.5hz": 2.9, "sway_0.5hz": 6.4, "unseen_1.5hz": 2.9}
 
 
 @dataclass(frozen=True)

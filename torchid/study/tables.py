@@ -19,8 +19,8 @@ _COLUMNS = {
 
 def error_table(results: Results, condition: str, training: str, against: str = "exact") -> Table:
     """Errors on the unseen log, Fig. 6: medians of rms and share of the measured, and that share's range in %."""
-    compared = "what truly happened" if against == "exact" else "what its sensors say"
-    title = f"Unseen squat; sensors: {condition}; fitted on {training}; compared with {compared}"
+    compared = "the truth" if against == "exact" else "what its sensors say"
+    title = f"Unseen squat against {compared}; sensors: {condition}; fitted on {training}"
     table = Table(title=title, title_justify="left")
     table.add_column("", no_wrap=True)
     for heading in _COLUMNS:
@@ -42,7 +42,7 @@ def error_table(results: Results, condition: str, training: str, against: str = 
 
 def summary_table(results: Results, training: str) -> Table:
     """Median error of every sensor set under every condition, as a share of the measured."""
-    title = f"Error on the unseen squat, % (joint torque / base force / base moment / projected); fitted on {training}"
+    title = f"Error [%] of joint torque, base force, base moment, projected force; fitted on {training}"
     table = Table(title=title, title_justify="left")
     table.add_column("")
     for condition in results.conditions:
