@@ -65,7 +65,7 @@ def error(study: tuple[Path, str]) -> Callable[..., float]:
     def median(condition: str, training: str, sensors: str, group: str, against: str = "exact") -> float:
         key = (condition, training, sensors)
         chosen = [r for r in records if (r["condition"], r["training"], r["sensors"]) == key]
-        return float(np.median([r[against][f"{group}_rms_relative"] for r in chosen]))
+        return float(np.median([r[against][f"{group}/relative"] for r in chosen]))
 
     return median
 

@@ -54,7 +54,6 @@ class Metrics:
                 out[f"{group}_{suffix}"] = groups[group]
                 if group == "joint_torque":
                     out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
-        out["base_force_rms_of_variation"] = self.base_force_of_variation
         return out
 
 

@@ -151,7 +151,9 @@ def metrics_document(run: Identification) -> dict[str, object]:
         pair = run.metrics.get(name)
         document[name] = None if pair is None else pair[1].as_dict()
         document[f"{name}_nominal"] = None if pair is None else pair[0].as_dict()
+    variation = {name: pair[1].base_force_of_variation for name, pair in run.metrics.items()}
     return document | {
+        "base_force_rms_of_variation": variation,
         "rank": estimate.rank,
         "parameters": int(estimate.phi.size),
         "condition_number": estimate.condition_number if estimate.rank else None,

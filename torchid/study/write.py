@@ -13,7 +13,7 @@ from torchid.report.metrics import GROUPS
 from torchid.report.tables import table_text
 from torchid.report.tensorboard import write_comparison
 from torchid.run.folder import write_json
-from torchid.study.results import TRUE, Results
+from torchid.study.results import TRUE, Results, figures
 from torchid.study.series import Series
 from torchid.study.settings import SHOWN
 from torchid.study.tables import error_table, findings_table, rank_table, summary_table
@@ -112,8 +112,8 @@ def _document(results: Results) -> dict[str, object]:
                 "sensors": record.sensors,
                 "noise_draw": record.noise_draw,
                 "nominal_draw": record.nominal_draw,
-                "measured": record.measured.as_dict(),
-                "exact": record.exact.as_dict(),
+                "measured": figures(record.measured),
+                "exact": figures(record.exact),
             }
             for record in results.records
         ],
