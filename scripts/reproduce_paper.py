@@ -3,24 +3,24 @@
 A biped squats and steps in simulation; sensor sets are compared on a squat that no fit has seen, with exact sensors
 and under every imperfection.
 
-    python scripts/reproduce_paper.py             # ten minutes on two cores
+    python scripts/reproduce_paper.py             # eight minutes on two cores
     python scripts/reproduce_paper.py --quick     # one minute: fewer and shorter motions
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
+from torchid.cli import guarded
 from torchid.config import load_simulation
-from torchid.errors import InputError
 from torchid.report.tables import print_tables
 from torchid.run.folder import STUDY, check_free, new_folder
 from torchid.study import Reproduction, Study
 from torchid.study.write import study_tables, write_study
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+SIMULATION = CONFIGS / "biped_simulation.yaml"
 SENSOR_SETS = ("full", "contacts", "joints", "reduced")
 
 
@@ -30,20 +30,21 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="fewer and shorter motions, fewer draws")
     parser.add_argument("--output", type=Path, default=Path("runs/paper"), help="folder for tables and figures")
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier study in that folder")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
     options = parser.parse_args()
-    try:
-        check_free(options.output, options.overwrite, STUDY)
-        simulation = load_simulation(CONFIGS / "biped_simulation.yaml")
-        study = Study(simulation, {name: CONFIGS / f"biped_{name}.yaml" for name in SENSOR_SETS})
-        with new_folder(options.output, options.overwrite, STUDY) as folder:
-            results, series = Reproduction(study.quick() if options.quick else study).run(folder)
-            write_study(folder, results, series)
-    except InputError as error:
-        print(f"reproduce_paper: {error}", file=sys.stderr)
-        return 2
+    return guarded("reproduce_paper", lambda: reproduce(options), options.debug)
+
+
+def reproduce(options: argparse.Namespace) -> None:
+    """Run the study as asked."""
+    check_free(options.output, options.overwrite, STUDY)
+    experiments = {name: CONFIGS / f"biped_{name}.yaml" for name in SENSOR_SETS}
+    study = Study(load_simulation(SIMULATION), experiments, SIMULATION)
+    with new_folder(options.output, options.overwrite, STUDY) as folder:
+        results, series = Reproduction(study.quick() if options.quick else study).run(folder)
+        write_study(folder, results, series)
     print_tables(*study_tables(results).values())
     print(f"written to {options.output}")
-    return 0
 
 
 if __name__ == "__main__":

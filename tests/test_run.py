@@ -67,6 +67,7 @@ def test_metrics_json_has_the_documented_fields(run: Path) -> None:
     groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")
     for name in ("train", "test"):
         assert set(metrics[name]) == {*groups, *(f"{group}_relative" for group in groups)}
+        assert metrics["base_force_rms_of_variation"][name] > metrics[name]["base_force_rms_relative"]
         assert len(metrics[name]["joint_torque_rms_by_joint"]) == 12
         joints = list(metrics[name]["joint_torque_rms_by_joint"].values())
         assert metrics[name]["joint_torque_rms"] == pytest.approx(np.mean(joints))

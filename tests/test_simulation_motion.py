@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -178,10 +179,20 @@ def test_a_posture_with_one_leg_bent_is_met_halfway_with_both_feet_on_the_floor(
     np.testing.assert_allclose(simulation.stance.position[7:][knees], 0.55, atol=0.01)
 
 
-def test_a_posture_beyond_a_joints_range_is_taken_back_to_its_end() -> None:
-    simulation = set_up_simulation(shipped(Path("nowhere"), "posture.torso_pitch=3.0"))
-    index = simulation.plant.joint_names.index("torso_pitch")
-    assert simulation.stance.position[7 + index] <= 1.2
+def test_a_posture_beyond_a_joints_range_is_refused() -> None:
+    config = replace(shipped(Path("nowhere")), posture={"torso_pitch": 3.0})
+    with pytest.raises(InputError, match=r"posture.torso_pitch: 3; accepted: -0.6 to 1.2"):
+        set_up_simulation(config)
+
+
+def test_a_wave_faster_than_half_the_control_rate_is_refused(biped: Simulation) -> None:
+    with pytest.raises(InputError, match=r"motions.m.waves.0.hz: 499; accepted: below 250"):
+        biped.motion(MotionConfig("m", 1.0, [wave("com_x", 499.0, 0.01)]))
+
+
+def test_a_swing_longer_than_its_period_is_refused(biped: Simulation) -> None:
+    with pytest.raises(InputError, match=r"motions.stepping.steps.swing_s: 3 in the air"):
+        biped.motion(stepping("r_sole", "l_sole", hz=0.5, swing_s=3.0))
 
 
 @pytest.mark.parametrize(

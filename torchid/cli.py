@@ -8,9 +8,10 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
 from textwrap import fill
 
@@ -24,23 +25,32 @@ _SIMULATE = "let a robot move in simulation and write the logs of its sensors (n
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
     options = _parser().parse_args(arguments)
+    return guarded("torchid", lambda: options.command(options), options.debug)
+
+
+def guarded(program: str, command: Callable[[], None], debug: bool = False) -> int:
+    """Run a command so that whatever stops it is told in one line.
+
+    Returns:
+        The exit status: 0 on success, 2 on bad input, 1 on anything else.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("always", TorchidWarning)
-        warnings.showwarning = _show_warning
+        warnings.showwarning = partial(_show_warning, program)
         try:
             with _termination_interrupts():
-                options.command(options)
+                command()
         except (InputError, BaseLostError) as error:
-            print(f"torchid: {error}", file=sys.stderr)
+            print(f"{program}: {error}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
-            print("torchid: interrupted; nothing was written", file=sys.stderr)
+            print(f"{program}: interrupted; nothing was written", file=sys.stderr)
             return 1
         except Exception as error:  # a bug or a full disk: still no wall of text unless asked for
-            if options.debug:
+            if debug:
                 traceback.print_exc()
             what = " ".join(str(error).split())
-            print(f"torchid: {type(error).__name__}: {what} (--debug shows where)", file=sys.stderr)
+            print(f"{program}: {type(error).__name__}: {what} (--debug shows where)", file=sys.stderr)
             return 1
     return 0
 
@@ -141,5 +151,5 @@ def _simulate(options: argparse.Namespace) -> None:
     print(f"written to    {config.output}")
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-    print(f"torchid: {category.__name__}: {message}", file=sys.stderr)
+def _show_warning(program: str, message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+    print(f"{program}: {category.__name__}: {message}", file=sys.stderr)

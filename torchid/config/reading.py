@@ -145,7 +145,8 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
     if first["type"] == "dataclass_type":
         accepted = f"a mapping with {', '.join(_keys_at(kind.settings, place))}"
     else:
-        plain = {"path_type": "a path", "list_type": "a list"}
+        count = first.get("ctx", {}).get("min_length", 1)
+        plain = {"path_type": "a path", "list_type": "a list", "too_short": f"at least {count} items"}
         described = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
         accepted = plain.get(first["type"], described)
     return ConfigError(path, field, f"found {shown}", accepted)

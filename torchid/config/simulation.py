@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
-from torchid.config.types import STRICT, FileName, NotNegative, Number, Positive
+from torchid.config.types import STRICT, FileName, NotNegative, Number, Positive, Seed
 from torchid.errors import ConfigError
 
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -64,7 +64,7 @@ class MotionConfig:
     """One log: waves about the stance, and steps. `name` becomes the name of the file."""
 
     name: FileName
-    duration_s: Positive
+    duration_s: Annotated[Positive, Field(le=3600.0)]
     waves: list[WaveConfig] = dataclasses.field(default_factory=list)
     steps: StepsConfig | None = None
 
@@ -137,7 +137,7 @@ class NominalConfig:
     """The nominal robot: mass, centre of mass and inertia of every body off by up to `error`, as a share."""
 
     error: Annotated[Number, Field(ge=0.0, lt=1.0)] = 0.2
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
@@ -155,7 +155,7 @@ class SimulationConfig:
     bounds: BoundsConfig = dataclasses.field(default_factory=BoundsConfig)
     physics_hz: Positive = 1000.0
     control_hz: Positive = 500.0
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     overwrite: bool = False
 
 

@@ -31,5 +31,6 @@ def _file_name(value: str) -> str:
 Number = Annotated[float, BeforeValidator(_no_flag), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
+Seed = Annotated[int, BeforeValidator(_no_flag), Field(ge=0)]
 FileName = Annotated[str, AfterValidator(_file_name)]
 Device = Annotated[str, AfterValidator(_torch_device)]

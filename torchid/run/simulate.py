@@ -51,7 +51,7 @@ def simulate(config: SimulationConfig, source: object = "simulation") -> dict[st
         found = _in_processes(config, source, folder, lambda seconds: bars.update(bar, completed=seconds))
         (folder / "simulation.yaml").write_text(dump(config))
         write_json(folder / "stability.json", {name: asdict(stability) for name, stability in found.items()})
-        rng = np.random.default_rng(config.nominal.seed)
+        rng = np.random.default_rng([config.nominal.seed, 0])  # the first of the study's draws
         nominal = parameters.perturbed(robot.nominal, config.nominal.error, rng)
         (folder / "nominal.urdf").write_bytes(identified_urdf(robot, nominal))
     return found

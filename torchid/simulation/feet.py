@@ -37,7 +37,7 @@ class Foot:
     @property
     def held(self) -> int:
         """How many of its six velocities the floor can hold: the linear three, and the rest if it stands flat."""
-        return 6 if len(self.points) > 2 else 3
+        return 6 if can_hold(np.array(self.points)) else 3
 
 
 def find_feet(settings: list[FootConfig], urdf: Path, source: object) -> tuple[Foot, ...]:

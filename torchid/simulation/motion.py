@@ -31,7 +31,7 @@ class Motion:
 
     Raises:
         UnknownNameError: a wave moves something that the robot does not have.
-        InputError: it is too short.
+        InputError: it is too short, or faster than can be controlled.
     """
 
     def __init__(
@@ -56,10 +56,17 @@ class Motion:
         for index, wave in enumerate(config.waves):
             if wave.what not in names:
                 raise UnknownNameError(source, f"motions.{config.name}.waves.{index}.what", wave.what, names)
+            if wave.hz >= 0.5 * control_hz:
+                accepted = f"below {0.5 * control_hz:g}, half of control_hz"
+                raise InputError(source, f"motions.{config.name}.waves.{index}.hz", f"{wave.hz:g}", accepted)
             sine = np.sin(2.0 * np.pi * (wave.hz * self.time + wave.phase))
             moved[:, names.index(wave.what)] += wave.amplitude * grown * sine
         self._moved = _with_derivatives(moved, control_hz)
         self._driven = np.array([any(wave.what == name for wave in config.waves) for name in joint_names])
+        if config.steps and config.steps.swing_s + 2.0 * config.steps.transfer_s > 1.0 / config.steps.hz:
+            found = f"{config.steps.swing_s:g} in the air and twice {config.steps.transfer_s:g} to transfer the load"
+            accepted = f"at most the period of {1.0 / config.steps.hz:g} s together"
+            raise InputError(source, f"motions.{config.name}.steps.swing_s", found, accepted)
         for frame in config.steps.order if config.steps else ():
             if frame not in feet:
                 raise UnknownNameError(source, f"motions.{config.name}.steps.order", frame, feet)

@@ -18,6 +18,7 @@ from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
 from torchid.simulation.feet import Foot
 
+_WORLD = "world link"
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
 _SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
 _STICTION = (0.002, 1.0)  # the same of dry friction in a joint; MuJoCo's own lets joints creep at 0.1 rad/s
@@ -170,6 +171,11 @@ class Plant:
         """Origins of the feet's frames (F, 3) [m]."""
         return self.data.site_xpos[self._sensors]
 
+    @property
+    def feet_rotations(self) -> Array:
+        """Rotations of the feet's frames to world, (F, 3, 3)."""
+        return self.data.site_xmat[self._sensors].reshape(-1, 3, 3)
+
     def foot(self, index: int) -> FootMotion:
         """Where a foot is and how it moves."""
         model, data, body, site = self.model, self.data, self._bodies[index], self._middles[index]
@@ -192,6 +198,10 @@ def _spec(urdf: Path) -> mujoco.MjSpec:
     for link in root.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shape)
+    for link in root.iterfind("link[@name='world']"):
+        link.set("name", _WORLD)  # MuJoCo has a world of its own, and would drop this link
+    for end in (*root.iterfind("joint/parent[@link='world']"), *root.iterfind("joint/child[@link='world']")):
+        end.set("link", _WORLD)
     try:
         spec = mujoco.MjSpec.from_string(etree.tostring(root, encoding="unicode"))
     except ValueError as error:

@@ -24,11 +24,13 @@ class Recording:
     """One motion as it truly was, sampled at the physics rate from time 0 on.
 
     `log` holds exact states, the simulator's accelerations, torques and wrenches, and a contact as active while
-    the floor acts on the foot at all. `feet`, (N, F, 3) [m], are the positions of the feet's frames.
+    the floor acts on the foot at all. `feet`, (N, F, 3) [m], and `rotations`, (N, F, 3, 3), are the poses of the feet's
+    frames.
     """
 
     log: Log
     feet: Array
+    rotations: Array
 
 
 def exact(log: Log, name: str) -> Array:
@@ -75,25 +77,33 @@ def record(
             plant.observe()
             if substep == 0:
                 torque = controller.torque(goal)
-            before = plant.position.copy(), plant.velocity.copy(), plant.feet_positions.copy()
+            before = [x.copy() for x in (plant.position, plant.velocity, plant.feet_positions, plant.feet_rotations)]
             plant.push(torque)
             if time >= 0.0:
                 frames.append((*before, plant.acceleration.copy(), torque, plant.wrenches))
         if step % report_every == 0:
             if plant.unstable or not abs(plant.position[2] - stance.position[2]) <= config.bounds.height_m:
-                found, wanted = f"the robot falls at {time:.2f} s", "a gentler motion, or another posture"
+                when = f"at {time:.2f} s" if time >= 0.0 else f"{-time:.2f} s before the log begins"
+                found, wanted = f"the robot falls {when}", "a gentler motion, or another posture"
                 raise InputError(source, f"motions.{motion.name}", found, wanted)
             if progress is not None:
                 progress(report_every / config.control_hz)
-    position, velocity, feet, acceleration, torques, wrench = (np.array(x) for x in zip(*frames, strict=True))
-    log = Log(
-        motion.name,
-        time=np.arange(len(position)) / config.physics_hz,
+    position, velocity, feet, rotations, *pushed = (np.array(x) for x in zip(*frames, strict=True))
+    log = _exact_log(plant, motion.name, config.physics_hz, position, velocity, *pushed)
+    return Recording(log, feet, rotations)
+
+
+def _exact_log(plant: Plant, name: str, hz: float, position: Array, velocity: Array, *pushed: Array) -> Log:
+    """The log of samples in the plant's coordinates; `pushed`: accelerations, torques, wrenches."""
+    acceleration, torque, wrench = pushed
+    return Log(
+        name,
+        time=np.arange(len(position)) / hz,
         joint_names=plant.joint_names,
         joint_position=position[:, 7:],
         joint_velocity=velocity[:, 6:],
         joint_acceleration=acceleration[:, 6:],
-        joint_torque=torques,
+        joint_torque=torque,
         base_position_world=position[:, :3],
         base_quat_xyzw=position[:, [4, 5, 6, 3]],
         base_linear_velocity_world=velocity[:, :3],
@@ -104,4 +114,3 @@ def record(
         contact_active=np.any(wrench != 0.0, axis=2),
         contact_wrench_local=wrench,
     )
-    return Recording(log, feet)

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torchid.config import SensorImperfectionsConfig
+from torchid.errors import InputError
 from torchid.logs import Log
 from torchid.logs.fields import BoolArray
 from torchid.parameters import Array
@@ -25,11 +26,18 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         sensors: which imperfections, and how large.
         seed: of the noise, together with `name`; biases and gains depend on the seed alone.
         name: of the motion, by default the log's source; becomes the source.
+
+    Raises:
+        InputError: a delay of no sample, or of all.
     """
     name = name or truth.source
     torque, wrench = exact(truth, "joint_torque"), exact(truth, "contact_wrench_local")
     if sensors.delay.enabled:
-        late = round(sensors.delay.feet_s / float(np.median(np.diff(truth.time))))
+        step = float(np.median(np.diff(truth.time)))
+        late = round(sensors.delay.feet_s / step)
+        if late >= len(truth) or (late == 0 and sensors.delay.feet_s > 0.0):
+            accepted = f"0, or from one sample, {step:g} s, to less than the log, {len(truth) * step:g} s"
+            raise InputError(name, "sensors.delay.feet_s", f"{sensors.delay.feet_s:g}", accepted)
         wrench = wrench[np.maximum(np.arange(len(truth)) - late, 0)]  # the first reading is held
     if sensors.bias.enabled:
         torque, wrench = _biased(torque, wrench, sensors, np.random.default_rng([seed, 0]))

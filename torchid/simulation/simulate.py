@@ -52,7 +52,7 @@ class Simulation:
         points = [middle + foot.arms @ R.T for foot, middle, R, on in standing if on]
         if not points or not can_hold(np.concatenate(points)):
             names = ", ".join(foot.frame for foot, on in zip(self.feet, support, strict=True) if on)
-            found = f"stands on {names or 'no foot'} alone, whose contact points lie on a line"
+            found = f"stands on {names} alone, whose contact points lie on a line" if names else "no foot on the floor"
             raise InputError(self.source, field, found, "three points on the floor that do not, at any time")
 
     def run(self, config: MotionConfig, progress: Callable[[float], None] | None = None) -> tuple[Recording, Stability]:

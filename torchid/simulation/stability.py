@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull
 
 from torchid.config import BoundsConfig
 from torchid.errors import InputError
+from torchid.logs.fields import BoolArray
 from torchid.parameters import Array
 from torchid.simulation.feet import Foot
 from torchid.simulation.plant import Plant
@@ -74,7 +75,9 @@ def stability(
     """
     log = recording.log
     wrench = exact(log, "contact_wrench_local")
-    force, moment = (np.einsum("fij,nfj->nfi", stance.rotations, part) for part in (wrench[..., :3], wrench[..., 3:]))
+    R = recording.rotations
+    force, moment = ((R @ part[..., None])[..., 0] for part in (wrench[..., :3], wrench[..., 3:]))
+    middles = recording.feet + np.einsum("nfij,fj->nfi", R, np.array([foot.middle for foot in feet]))
     standing = force[..., 2] > load
     bearing = np.linalg.norm(force, axis=2).max(axis=0)
     for foot, most in zip(feet, bearing, strict=True):
@@ -86,7 +89,7 @@ def stability(
     return Stability(
         (float(height.min()), float(height.max())),
         float(np.abs(height - stance.position[2]).max()),
-        max(_slip(recording.feet[:, i, :2], standing[:, i]) for i in range(len(feet))),
+        max(_slip(middles[:, i, :2], standing[:, i]) for i in range(len(feet))),
         _zmp_margin(recording.feet, force, moment, stance, feet),
         max(float((log.joint_position - high).max()), float((low - log.joint_position).max()), 0.0),
         float(np.max(np.abs(exact(log, "joint_torque")) / plant.efforts)),
@@ -94,7 +97,7 @@ def stability(
     )
 
 
-def _slip(place: Array, standing: Array) -> float:
+def _slip(place: Array, standing: BoolArray) -> float:
     """Most that a point, (N, 2), moved from where it was when it began to stand."""
     begins = np.flatnonzero(np.diff(standing.astype(int), prepend=0) == 1)
     if not len(begins):

@@ -41,12 +41,17 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
 
     Raises:
         UnknownNameError: a joint that the robot does not have.
-        InputError: there is no such configuration near the posture.
+        InputError: a joint beyond its limits, or no such configuration near the posture.
     """
     for name in posture:
         if name not in plant.joint_names:
             raise UnknownNameError(source, "posture", name, plant.joint_names)
     low, high = plant.limits.T
+    for name, value in posture.items():
+        place = plant.joint_names.index(name)
+        if not low[place] <= value <= high[place]:
+            accepted = f"{low[place]:g} to {high[place]:g}, the joint's limits"
+            raise InputError(source, f"posture.{name}", f"{value:g}", accepted)
     joints = np.clip([posture.get(name, 0.0) for name in plant.joint_names], low, high)
     plant.place(np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 0.0], joints]))
     rotations = np.stack([_flattened(plant.foot(i).rotation, foot, source) for i, foot in enumerate(feet)])

@@ -12,7 +12,8 @@ GOOD = 0.2
 FLOOR = 2.0
 """... or at most this many times that of the true parameters, which is what filter and friction model leave."""
 POOR = 2.0
-"""A set is poor on a group of rows if its error is at least this many times that of full sensing."""
+"""A set is poor on a group of rows if its error is at least this many times that of full sensing, or if it is no
+better there than the nominal parameters."""
 
 _SETS = ("full", "contacts", "joints")
 _BASE, _INSIDE = ("base_force", "base_moment"), "nullspace"
@@ -47,7 +48,11 @@ def findings(results: Results, condition: str, training: str) -> tuple[Finding, 
     def good(sensors: str, group: str) -> bool:
         return share(sensors, group) <= GOOD or error(sensors, group) <= FLOOR * error(TRUE, group)
 
+    def poor(sensors: str, group: str) -> bool:
+        return times(sensors, group) >= POOR or share(sensors, group) >= 1.0
+
     worst = max(GROUPS, key=lambda group: share("full", group))
+    above_floor = error("full", worst) / error(TRUE, worst)
     base = max(_BASE, key=lambda group: share("contacts", group))
     torque = times("contacts", "joint_torque")
     best = min(_SETS, key=lambda sensors: error(sensors, _INSIDE))
@@ -56,16 +61,16 @@ def findings(results: Results, condition: str, training: str) -> tuple[Finding, 
         Finding(
             1,
             all(good("full", group) for group in GROUPS),
-            f"worst, {_name(worst)}: {share('full', worst):.2g} x nominal",
+            f"worst, {_name(worst)}: {share('full', worst):.2g} x nominal, {above_floor:.2g} x true",
         ),
         Finding(
             2,
-            all(good("contacts", group) for group in _BASE) and torque >= POOR,
+            all(good("contacts", group) for group in _BASE) and poor("contacts", "joint_torque"),
             f"{_name(base)} {share('contacts', base):.2g} x nominal, joint torque {torque:.2g} x full",
         ),
         Finding(
             3,
-            best == "joints" and times("joints", outside) >= POOR,
+            best == "joints" and any(poor("joints", group) for group in GROUPS if group != _INSIDE),
             f"inside best: {best}; outside, {_name(outside)} {times('joints', outside):.2g} x full",
         ),
     )

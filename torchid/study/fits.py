@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from torchid.estimators import Estimate, LeastSquares
@@ -53,18 +53,16 @@ class CompressedLogs:
         return [*out, StateRank("together", sum(found.samples for found in out), together.rank)]
 
     def _solve(self, factor: TriangularFactor, nominal: Array, friction: bool) -> Estimate:
-        settings = self.experiment.config.estimator
         robot = replace(self.experiment.robot, nominal=nominal)
         problem = linear_problem(factor, self.builder, robot, friction)
+        settings = self.experiment.config.estimator
         return LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
 
 
-def compressed(
-    experiment: Experiment, groups: Mapping[str, Sequence[Samples]], progress: Callable[[int], None] | None = None
-) -> CompressedLogs:
-    """Compress groups of logs with an experiment's sensors; `progress` gets samples done since the last call."""
+def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
+    """Compress groups of logs with an experiment's sensors."""
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(experiment.config.device)
-    factors = {name: compress_by_state(logs, builder, progress=progress) for name, logs in groups.items()}
+    factors = {name: compress_by_state(logs, builder) for name, logs in groups.items()}
     counts: dict[str, dict[State, int]] = {name: {} for name in groups}
     for name, logs in groups.items():
         for samples in logs:

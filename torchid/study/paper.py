@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -40,14 +40,28 @@ class _Draw:
     exact: Samples
 
 
-@dataclass
 class Reproduction:
     """A study under way."""
 
-    study: Study
-    records: list[Record] = field(default_factory=list)
-    ranks: list[Ranks] = field(default_factory=list)
-    shown: Series | None = None
+    def __init__(self, study: Study) -> None:
+        """Read the experiment files.
+
+        Raises:
+            InputError: the settings do not fit together.
+        """
+        self.study = study
+        self._experiments = {name: self._experiment(path) for name, path in study.experiments.items()}
+        first = next(iter(self._experiments.values()))
+        for name, experiment in self._experiments.items():
+            for key in ("preprocessing", "contacts"):
+                found, common = (getattr(e.config, key) for e in (experiment, first))
+                if found != common:
+                    raise ConfigError(study.experiments[name], key, f"{found}", f"{common}, as in the other files")
+        self._robot, self._contacts, self._filter = first.robot, first.contacts, first.config.preprocessing
+        self._evaluation = Evaluation(first.robot, first.contacts, first.config.device)
+        self._records: list[Record] = []
+        self._ranks: list[Ranks] = []
+        self._shown: list[Series] = []
 
     def run(self, folder: Path) -> tuple[Results, Series]:
         """Run the study; `folder` holds the simulated logs meanwhile.
@@ -56,14 +70,10 @@ class Reproduction:
             Errors of every fit, and forces over time of one of them.
 
         Raises:
-            InputError: the settings do not fit together, or the robot falls.
+            InputError: the robot falls.
         """
         cases = conditions(self.study.simulation)
         names = [motion.name for motion in self.study.simulation.motions]
-        self._experiments = {name: self._experiment(path) for name, path in self.study.experiments.items()}
-        first = next(iter(self._experiments.values()))
-        self._robot, self._contacts, self._filter = first.robot, first.contacts, first.config.preprocessing
-        self._evaluation = Evaluation(first.robot, first.contacts, first.config.device)
         for friction in (False, True):
             plant = [case for case in cases if case.friction == friction]
             exact = self._simulated(friction, folder / "simulation", names)
@@ -75,9 +85,7 @@ class Reproduction:
                     for number in range(self._draws(case)):
                         self._examine(self._draw(case, number, exact), done)
                         done()
-        if self.shown is None:
-            raise ConfigError("study", "conditions", f"none named {SHOWN[0]}", ", ".join(case.name for case in cases))
-        return Results(self.records, self.ranks), self.shown
+        return Results(self._records, self._ranks), self._shown[0]
 
     def _experiment(self, path: Path) -> Experiment:
         """An experiment file, for the study's robot and logs."""
@@ -91,7 +99,7 @@ class Reproduction:
         """What the robot did, with or without friction in its joints."""
         config = self.study.simulation
         plant = replace(config.friction, enabled=friction)
-        simulate(replace(config, output=folder, friction=plant), "simulation")
+        simulate(replace(config, output=folder, friction=plant), self.study.source)
         logs = {name: read_log(folder / "exact" / f"{name}.npz") for name in names}
         shutil.rmtree(folder)
         return logs
@@ -121,21 +129,22 @@ class Reproduction:
             for training, groups in TRAINING.items():
                 vectors[training][sensors] = [fit.phi for fit in logs.fit(groups, nominals, friction)]
                 if draw.condition.name == SHOWN[0] and draw.number == 0:
-                    self.ranks.append(Ranks(training, sensors, logs.ranks(groups, friction)))
+                    self._ranks.append(Ranks(training, sensors, logs.ranks(groups, friction)))
             done()
         true = self._true(friction).flatten()
         for training, fitted in vectors.items():
             rows = {NOMINAL: [nominal.flatten() for nominal in nominals], **fitted, TRUE: [true]}
             self._evaluate(draw, training, rows)
-            if (draw.condition.name, training) == SHOWN and self.shown is None:
-                self.shown = series_of(self._evaluation, draw.exact, {name: phi[0] for name, phi in rows.items()})
+            if (draw.condition.name, training) == SHOWN and draw.number == 0:
+                first = {name: phi[0] for name, phi in rows.items()}
+                self._shown.append(series_of(self._evaluation, draw.exact, first))
 
     def _evaluate(self, draw: _Draw, training: str, rows: Mapping[str, Sequence[Array]]) -> None:
         candidates = np.stack([phi for vectors in rows.values() for phi in vectors])
         measured, exact = (self._evaluation.metrics([log], candidates) for log in (draw.measured, draw.exact))
         labels = [(name, number) for name, vectors in rows.items() for number in range(len(vectors))]
         for (name, number), *metrics in zip(labels, measured, exact, strict=True):
-            self.records.append(Record(draw.condition.name, training, name, draw.number, number, *metrics))
+            self._records.append(Record(draw.condition.name, training, name, draw.number, number, *metrics))
 
     def _nominals(self) -> list[Array]:
         """Nominal parameters (L, 12), one per draw."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torchid.config import SimulationConfig
+from torchid.errors import ConfigError
 
 SHOWN = ("white noise", "all runs")  # condition and training set of the figures
 SQUATS, UNSEEN = "squat_", "unseen_"  # how the names of the squats, and of the motion that no fit sees, begin
@@ -22,14 +23,24 @@ class Study:
     Attributes:
         simulation: the motions; the study switches the imperfections, at the levels given there.
         experiments: experiment files by name of the sensor set; robot and logs in them are the study's.
+        source: of the simulation, named in errors.
         noise_draws: draws of white noise, and of biases and gains.
         nominal_draws: draws of the nominal parameters.
     """
 
     simulation: SimulationConfig
     experiments: Mapping[str, Path]
+    source: object = "simulation"
     noise_draws: int = 3
     nominal_draws: int = 5
+
+    def __post_init__(self) -> None:
+        """Make sure that there is something to fit on, and something to test on."""
+        names = [motion.name for motion in self.simulation.motions]
+        kinds = [name.startswith(SQUATS) for name in names], [name.startswith(UNSEEN) for name in names]
+        if not any(kinds[0]) or sum(kinds[1]) != 1:
+            accepted = f"some whose names begin with {SQUATS}, and one with {UNSEEN}"
+            raise ConfigError(self.source, "motions", ", ".join(names), accepted)
 
     def quick(self) -> Study:
         """The same in a minute: fewer and shorter motions, fewer draws."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
@@ -112,10 +113,15 @@ def _document(results: Results) -> dict[str, object]:
                 "sensors": record.sensors,
                 "noise_draw": record.noise_draw,
                 "nominal_draw": record.nominal_draw,
-                "measured": figures(record.measured),
-                "exact": figures(record.exact),
+                "measured": _finite(figures(record.measured)),
+                "exact": _finite(figures(record.exact)),
             }
             for record in results.records
         ],
         "ranks": [asdict(ranks) for ranks in results.ranks],
     }
+
+
+def _finite(values: dict[str, float]) -> dict[str, float | None]:
+    """With null for what a log cannot give."""
+    return {name: value if np.isfinite(value) else None for name, value in values.items()}
