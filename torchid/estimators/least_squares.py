@@ -10,6 +10,7 @@ import torch
 from torchid.estimators.result import Estimate
 from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
+from torchid.problem.threads import one_thread
 
 _HIDDEN = 1e-6  # far above rounding (1e-10 on a humanoid) and below any share found in a robot (1e-4)
 
@@ -79,5 +80,6 @@ def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:
     """Minimum-norm inverse, singular values and rank, from one call of `torch.linalg.lstsq`."""
     identity = torch.eye(A.shape[0], dtype=torch.float64)
     rcond = max(tolerance, np.finfo(float).eps * max(A.shape))
-    solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
+    with one_thread():  # twice as fast as two on some hundred columns
+        solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
     return solved.solution.numpy(), solved.singular_values.numpy(), int(solved.rank)
