@@ -92,12 +92,6 @@ STOOD = Stability((0.7, 0.8), 0.05, 0.001, 0.03, beyond_limits=0.0, effort=0.5, 
 """Of a robot that kept to all bounds."""
 
 
-def files_in(folder: Path) -> dict[str, bytes]:
-    """All files with what is in them, and all folders."""
-    paths = sorted(folder.rglob("*"))
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in paths}
-
-
 def forces(log: Log, urdf: Path = BIPED, feet: Sequence[str] = SOLES) -> tuple[Array, Array]:
     """Measured S^T tau + J_C^T lambda, and K phi of the true inertias without friction, (N, nv) each."""
     robot = load(urdf)

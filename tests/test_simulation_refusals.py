@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 import yaml
-from simulated import BIPED, SHIPPED, SOLES, STOOD, files_in
+from refusals import files_in, refusal
+from simulated import BIPED, SHIPPED, SOLES, STOOD
 
 from torchid.cli import main
 from torchid.config import load_simulation
@@ -80,17 +81,7 @@ SETTINGS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
 
 def refused(folder: Path, capsys: pytest.CaptureFixture[str], *overrides: str) -> str:
     """The one line with which a simulation ends that leaves everything as it was."""
-    before = files_in(folder)
-    status = main(["simulate", str(folder / "sim.yaml"), *overrides])
-    printed = capsys.readouterr()
-    complaint = [line for line in printed.err.splitlines() if "Warning:" not in line]
-    assert status == 2, printed.err
-    assert len(complaint) == 1
-    assert complaint[0].startswith("torchid: ")
-    assert "accepted: " in complaint[0]
-    assert printed.out == ""
-    assert files_in(folder) == before
-    return complaint[0]
+    return refusal(["simulate", str(folder / "sim.yaml"), *overrides], folder, capsys)
 
 
 def simulated(file: Path) -> Recording:

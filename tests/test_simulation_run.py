@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from simulated import BIPED, SHIPPED, SQUATS, SWAYS, UNSEEN, files_in, only, short
+from refusals import files_in
+from simulated import BIPED, SHIPPED, SQUATS, SWAYS, UNSEEN, only, short
 from synthetic import load
 
 from torchid import parameters

@@ -13,11 +13,11 @@ from synthetic import load
 from torchid.logs import preprocess, read_log
 from torchid.problem import Samples, bind
 from torchid.problem.predict import force_series, in_null_space
-from torchid.report.metrics import GROUPS, Evaluation, Metrics
+from torchid.report.metrics import BASE_ROWS, GROUPS, Evaluation, Metrics
 from torchid.report.tables import table_text
 from torchid.sensing import Contact
 from torchid.study.results import NOMINAL, TRUE, Record, Results
-from torchid.study.series import BASE_ROWS, Series, series_of
+from torchid.study.series import Series, series_of
 from torchid.study.settings import SHOWN
 from torchid.study.tables import error_table
 from torchid.study.write import study_figures

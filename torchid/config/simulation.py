@@ -109,6 +109,11 @@ class FrictionConfig:
     coulomb: NotNegative = 1.0
     viscous: NotNegative = 0.5
 
+    @property
+    def levels(self) -> tuple[float, float] | None:
+        """Coulomb and viscous friction, None when off."""
+        return (self.coulomb, self.viscous) if self.enabled else None
+
 
 @dataclass(config=STRICT, frozen=True)
 class SensorImperfectionsConfig:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.report.metrics import GROUPS, Metrics
+from torchid.report.metrics import BASE_ROWS, GROUPS, Metrics, group_name
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -26,7 +26,6 @@ STYLE: dict[Any, Any] = {
 }
 
 _MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
-_BASE_ROWS = ("base force x", "base force y", "base force z", "base moment x", "base moment y", "base moment z")
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ def force_figure(series: ForceSeries, joint_names: Sequence[str], base_rows: int
             series.time, series.identified[:, row], color=_IDENTIFIED, linewidth=1.0, label="predicted, identified"
         )
         force = row < base_rows and row < 3
-        name = _BASE_ROWS[row] if row < base_rows else joint_names[row - base_rows]
+        name = BASE_ROWS[row] if row < base_rows else joint_names[row - base_rows]
         axis.set_title(name, loc="left", fontsize=9)
         axis.set_ylabel("[N]" if force else "[N m]")
     if rows:
@@ -87,7 +86,7 @@ def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
             heights = [100.0 * (metrics.relative[group] or 0.0) for group in groups]
             bars = axis.bar(place + shift, heights, 0.38, color=color, label=label)
             axis.bar_label(bars, fmt="%.3g", fontsize=8)
-        axis.set_xticks(place, [GROUPS[group].split(" [")[0].replace(" ", "\n") for group in groups])
+        axis.set_xticks(place, [group_name(group).replace(" ", "\n") for group in groups])
         axis.set_title(name, loc="left")
     axes[0].set_ylabel("rms of error / rms of measured [%]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)

@@ -26,6 +26,14 @@ GROUPS = {
 }
 """Groups of rows that errors are given for, with a name and unit to show."""
 
+BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")
+"""Names of the six base rows."""
+
+
+def group_name(group: str) -> str:
+    """Name of a group of rows, without its unit."""
+    return GROUPS[group].split(" [")[0]
+
 
 @dataclass(frozen=True)
 class Metrics:

@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -72,6 +72,7 @@ def write_json(path: Path, document: object) -> None:
 def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) -> Iterator[Path]:
     """A temporary folder beside `output` that takes its place when the block ends without an error."""
     check_free(output, overwrite, kind)
+    made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
     temporary.chmod(0o755)
@@ -91,3 +92,7 @@ def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) ->
             temporary.rename(output)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        if not output.exists():
+            with suppress(OSError):  # another run has put something there meanwhile
+                for folder in made:
+                    folder.rmdir()

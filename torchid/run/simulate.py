@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from torchid import parameters
-from torchid.config import MotionConfig, SimulationConfig
+from torchid.config import MotionConfig, NominalConfig, SimulationConfig
 from torchid.config.reading import dump
 from torchid.logs import write_log
+from torchid.parameters import Array
 from torchid.report.urdf_export import identified_urdf
-from torchid.robot import load_robot
+from torchid.robot import Robot, load_robot
 from torchid.run.folder import SIMULATION, check_free, new_folder, write_json
 from torchid.run.progress import progress_bars
 from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
@@ -51,10 +52,13 @@ def simulate(config: SimulationConfig, source: object = "simulation") -> dict[st
         found = _in_processes(config, source, folder, lambda seconds: bars.update(bar, completed=seconds))
         (folder / "simulation.yaml").write_text(dump(config))
         write_json(folder / "stability.json", {name: asdict(stability) for name, stability in found.items()})
-        rng = np.random.default_rng([config.nominal.seed, 0])  # the first of the study's draws
-        nominal = parameters.perturbed(robot.nominal, config.nominal.error, rng)
-        (folder / "nominal.urdf").write_bytes(identified_urdf(robot, nominal))
+        (folder / "nominal.urdf").write_bytes(identified_urdf(robot, nominal_parameters(robot, config.nominal)))
     return found
+
+
+def nominal_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -> Array:
+    """Parameters (L, 12) that an identification starts from, off from those of the simulated robot."""
+    return parameters.perturbed(robot.nominal, settings.error, np.random.default_rng([settings.seed, draw]))
 
 
 def _in_processes(

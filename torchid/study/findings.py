@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchid.report.metrics import GROUPS
+from torchid.report.metrics import GROUPS, group_name
 from torchid.study.results import NOMINAL, TRUE, Results
 
 GOOD = 0.2
@@ -61,20 +61,16 @@ def findings(results: Results, condition: str, training: str) -> tuple[Finding, 
         Finding(
             1,
             all(good("full", group) for group in GROUPS),
-            f"worst, {_name(worst)}: {share('full', worst):.2g} x nominal, {above_floor:.2g} x true",
+            f"worst, {group_name(worst)}: {share('full', worst):.2g} x nominal, {above_floor:.2g} x true",
         ),
         Finding(
             2,
             all(good("contacts", group) for group in _BASE) and poor("contacts", "joint_torque"),
-            f"{_name(base)} {share('contacts', base):.2g} x nominal, joint torque {torque:.2g} x full",
+            f"{group_name(base)} {share('contacts', base):.2g} x nominal, joint torque {torque:.2g} x full",
         ),
         Finding(
             3,
             best == "joints" and any(poor("joints", group) for group in GROUPS if group != _INSIDE),
-            f"inside best: {best}; outside, {_name(outside)} {times('joints', outside):.2g} x full",
+            f"inside best: {best}; outside, {group_name(outside)} {times('joints', outside):.2g} x full",
         ),
     )
-
-
-def _name(group: str) -> str:
-    return GROUPS[group].split(" [")[0]

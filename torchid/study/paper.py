@@ -20,7 +20,7 @@ from torchid.problem import Samples, bind
 from torchid.report.metrics import Evaluation
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.progress import progress_bars
-from torchid.run.simulate import simulate
+from torchid.run.simulate import nominal_parameters, simulate
 from torchid.simulation import sensor_log
 from torchid.study.conditions import Condition, conditions
 from torchid.study.fits import compressed
@@ -149,10 +149,7 @@ class Reproduction:
     def _nominals(self) -> list[Array]:
         """Nominal parameters (L, 12), one per draw."""
         settings = self.study.simulation.nominal
-        seeds = [[settings.seed, number] for number in range(self.study.nominal_draws)]
-        return [
-            parameters.perturbed(self._robot.nominal, settings.error, np.random.default_rng(seed)) for seed in seeds
-        ]
+        return [nominal_parameters(self._robot, settings, draw) for draw in range(self.study.nominal_draws)]
 
     def _true(self, friction: bool) -> Array:
         """Parameters (L, 12) of the simulated robot."""

@@ -10,9 +10,7 @@ import numpy as np
 from torchid.parameters import Array
 from torchid.problem import Samples
 from torchid.problem.predict import force_series, in_null_space
-from torchid.report.metrics import Evaluation
-
-BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")
+from torchid.report.metrics import BASE_ROWS, Evaluation
 
 
 @dataclass(frozen=True)

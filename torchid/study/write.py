@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from torchid.report.comparison import Bars, Panel, bar_figure, panel_figure
-from torchid.report.metrics import GROUPS
+from torchid.report.metrics import GROUPS, group_name
 from torchid.report.tables import table_text
 from torchid.report.tensorboard import write_comparison
 from torchid.run.folder import write_json
@@ -41,10 +41,10 @@ def write_study(folder: Path, results: Results, series: Series) -> None:
         series: forces over time.
     """
     tables = study_tables(results)
-    figures = study_figures(results, series)
+    drawn = study_figures(results, series)
     (folder / "tables.txt").write_text("\n".join(table_text(table) for table in tables.values()))
     write_json(folder / "results.json", _document(results))
-    for name, figure in figures.items():
+    for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=130)
     scalars = {
         (sensors, f"{training}/{group}"): [
@@ -58,7 +58,7 @@ def write_study(folder: Path, results: Results, series: Series) -> None:
     texts = {"steps of the charts": steps} | {
         name: "    " + table_text(table).replace("\n", "\n    ") for name, table in tables.items()
     }
-    write_comparison(folder / "tensorboard", scalars, texts, figures)
+    write_comparison(folder / "tensorboard", scalars, texts, drawn)
 
 
 def study_tables(results: Results) -> dict[str, Table]:
@@ -93,10 +93,10 @@ def study_figures(results: Results, series: Series) -> dict[str, Figure]:
         ]
 
     bars = []
-    for group, label in GROUPS.items():
+    for group in GROUPS:
         spreads = {s: results.spread(condition, training, s, f"{group}/relative") for s in results.sensors}
         heights = {name: (spread.median, spread.least, spread.greatest) for name, spread in spreads.items()}
-        bars.append(Bars(label.split(" [")[0], heights))
+        bars.append(Bars(group_name(group), heights))
     return {
         "rms": bar_figure(f"Errors, {about}", bars),
         "forces": panel_figure(f"Forces, {about}", series.time[part], panels(_FORCES, False)),

@@ -65,8 +65,7 @@ class Simulation:
         Raises:
             InputError: the robot falls, slips, or its zero-moment point leaves the bounds.
         """
-        levels = self.config.friction
-        friction = (levels.coulomb, levels.viscous) if levels.enabled else (0.0, 0.0)
+        friction = self.config.friction.levels or (0.0, 0.0)
         controller = Controller(self.plant, self.feet, self.stance.rotations, friction)
         recording = record(self.plant, controller, self.stance, self.motion(config), self.config, self.source, progress)
         found = stability(
@@ -83,8 +82,7 @@ def set_up_simulation(config: SimulationConfig, source: object = "simulation") -
         InputError: the URDF, the feet or the posture are of no use.
     """
     feet = find_feet(config.feet, config.robot.urdf, source)
-    friction = (config.friction.coulomb, config.friction.viscous) if config.friction.enabled else None
-    plant = Plant(config.robot.urdf, feet, config.physics_hz, friction)
+    plant = Plant(config.robot.urdf, feet, config.physics_hz, config.friction.levels)
     simulation = Simulation(config, source, plant, feet, find_stance(plant, feet, config.posture, source))
     simulation.check_support(np.ones(len(feet), dtype=bool), "feet")
     return simulation
