@@ -17,6 +17,7 @@ from torchid import parameters
 from torchid.cli import main
 from torchid.config import FootConfig, load_simulation
 from torchid.config.reading import dump
+from torchid.report.tables import stability_table, table_text
 from torchid.simulation import Stability
 from torchid.simulation.feet import find_feet
 
@@ -134,3 +135,12 @@ def test_the_shipped_simulation_leaves_half_a_minute_of_every_training_motion() 
     assert [round(seconds[name], 6) for name in (*SQUATS, *SWAYS)] == [30.0] * 12
     assert seconds[UNSEEN] == pytest.approx(6.0)
     assert config.sensors.noise.enabled
+
+
+def test_the_table_of_how_a_robot_stood_says_its_units() -> None:
+    found = {"base_height": (0.6, 0.8), "slip": 0.002, "zmp_margin": 0.03, "effort": 0.2, "unloaded": (0.0, 0.25)}
+    text = table_text(stability_table({"squat": found}))
+    for unit in ("[m]", "[mm]", "[%]"):
+        assert unit in text
+    for value in ("0.600 to 0.800", "2.0", "30", "20", "0, 25"):
+        assert value in text

@@ -88,7 +88,7 @@ def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
         "effort [%]",
         "feet up [%]",
     ):
-        table.add_column(heading, justify="left" if heading == "motion" else "right")
+        table.add_column(Text(heading), justify="left" if heading == "motion" else "right")  # [m] is no markup
     for name, found in motions.items():
         low, high = found["base_height"]
         table.add_row(
