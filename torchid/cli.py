@@ -111,6 +111,7 @@ def _interrupt_held_back() -> Iterator[None]:
 def _identify(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
         from torchid.config import load_config
+        from torchid.estimators import ConsistentEstimate
         from torchid.report.tables import error_tables, print_tables, state_table
         from torchid.run import identify
 
@@ -121,6 +122,14 @@ def _identify(options: argparse.Namespace) -> None:
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
     print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
+    if isinstance(estimate, ConsistentEstimate):
+        least = min(x for x in estimate.eigenvalues if x == x)
+        print(f"consistent    smallest eigenvalue of a scaled pseudo-inertia {least:.3g}")
+        if estimate.unconstrained is not None:
+            worse = estimate.objective / estimate.unconstrained - 1.0
+            print(f"price         objective {100 * worse:.3g} % above that of least squares")
+        if estimate.certified_gap is not None:
+            print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
     print(f"total mass    {mass:.3f} kg (URDF: {robot.nominal[:, 0].sum():.3f} kg)")
     if robot.massless:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))

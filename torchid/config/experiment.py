@@ -78,12 +78,24 @@ class SensorsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class EstimatorConfig:
-    """Batch least squares: `ridge` pulls to the URDF, `friction: false` leaves friction at the URDF's values."""
+    """How parameters are found from the compressed logs.
 
-    name: Literal["least_squares"] = "least_squares"
+    `ridge` pulls to the URDF, `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of
+    theirs. The rest is for `consistent`, which returns what a physical robot can have: `margin` of the scaled
+    pseudo-inertias, `prior` that the ridge is in, `total_mass` [kg] if known, `method` and whether to `certify` it with
+    the other one.
+    """
+
+    name: Literal["least_squares", "consistent"] = "least_squares"
     ridge: NotNegative = 0.0
     rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
     friction: bool = True
+    frozen: list[str] = dataclasses.field(default_factory=list)
+    margin: Annotated[Number, Field(ge=0.0, lt=1.0)] = 1e-4
+    prior: Literal["euclidean", "pullback", "entropic"] = "euclidean"
+    method: Literal["barrier", "certified"] = "barrier"
+    certify: bool = False
+    total_mass: Positive | None = None
 
 
 def _spelled_out(value: object) -> object:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from torchid.config import ExperimentConfig, dump_config
 from torchid.errors import NumericalWarning, SensorError
-from torchid.estimators import Estimate, LeastSquares
+from torchid.estimators import ConsistentEstimate, Estimate
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.predict import force_series
@@ -25,6 +25,7 @@ from torchid.report.parameters_json import parameters_document
 from torchid.report.tensorboard import write_events
 from torchid.report.urdf_export import identified_urdf
 from torchid.robot import Robot
+from torchid.run.estimation import estimate_parameters
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.folder import check_free, new_folder, write_json
 from torchid.run.progress import progress_bars
@@ -85,8 +86,7 @@ def identify(config: ExperimentConfig, source: object = "experiment") -> Identif
             factor = compress(train, builder, progress=lambda n: bars.advance(streaming, n))
         with clock("solve"):
             problem = linear_problem(factor, builder, robot, config.estimator.friction)
-            settings = config.estimator
-            estimate = LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
+            estimate = estimate_parameters(problem, config.estimator, robot, source)
             _check_sense(estimate, source)
         with clock("evaluate"):
             evaluation = Evaluation(robot, experiment.contacts, config.device)
@@ -151,6 +151,8 @@ def metrics_document(run: Identification) -> dict[str, object]:
         pair = run.metrics.get(name)
         document[name] = None if pair is None else pair[1].as_dict()
         document[f"{name}_nominal"] = None if pair is None else pair[0].as_dict()
+    if isinstance(estimate, ConsistentEstimate):
+        document["consistency"] = consistency_document(estimate, robot)
     variation = {name: pair[1].base_force_of_variation for name, pair in run.metrics.items()}
     return document | {
         "base_force_rms_of_variation": variation,
@@ -164,6 +166,19 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "contact_states": [asdict(state) for state in run.states],
         "seconds": run.seconds,
+    }
+
+
+def consistency_document(estimate: ConsistentEstimate, robot: Robot) -> dict[str, object]:
+    """What `metrics.json` says of an estimate that meets its conditions."""
+    eigenvalues = zip(robot.body_names, estimate.eigenvalues, strict=True)
+    return {
+        "objective": estimate.objective,
+        "unconstrained_objective": estimate.unconstrained,
+        "gap": estimate.gap,
+        "certified_gap": estimate.certified_gap,
+        "smallest_eigenvalue": {name: float(x) for name, x in eigenvalues if np.isfinite(x)},
+        "steps": estimate.steps,
     }
 
 

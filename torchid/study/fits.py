@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from torchid.estimators import Estimate, LeastSquares
+from torchid.estimators import Estimate
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, linear_problem
 from torchid.problem.chunks import by_state
 from torchid.problem.plan import State
 from torchid.problem.streaming import compress_by_state, merged
 from torchid.problem.triangular import TriangularFactor
+from torchid.run.estimation import estimate_parameters
 from torchid.run.experiment import Experiment
 
 
@@ -55,8 +56,7 @@ class CompressedLogs:
     def _solve(self, factor: TriangularFactor, nominal: Array, friction: bool) -> Estimate:
         robot = replace(self.experiment.robot, nominal=nominal)
         problem = linear_problem(factor, self.builder, robot, friction)
-        settings = self.experiment.config.estimator
-        return LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
+        return estimate_parameters(problem, self.experiment.config.estimator, robot)
 
 
 def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:

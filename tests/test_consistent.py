@@ -1,0 +1,237 @@
+"""Consistent estimates: two solvers agree, nothing allowed is better, priors are what they say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from physical import (
+    active_case,
+    data,
+    least_eigenvalues,
+    nothing_seen,
+    pseudo,
+    random_bodies,
+    random_case,
+    random_parameters_within,
+)
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+from synthetic import Array, transform
+
+from torchid import parameters
+from torchid.errors import InputError
+from torchid.estimators import LeastSquares
+from torchid.estimators.conditions import Conditions, violations
+from torchid.estimators.consistent import Consistent, Method, Prior
+from torchid.problem.linear import LinearProblem, parameter_scale
+
+seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=10, deadline=None, derandomize=True)
+PRIORS: tuple[Prior, ...] = ("euclidean", "pullback", "entropic")
+METHODS: tuple[Method, ...] = ("barrier", "certified")
+both = pytest.mark.parametrize("method", METHODS)
+all_priors = pytest.mark.parametrize("prior", PRIORS)
+
+
+def prior_value(prior: Prior, phi: Array, nominal: Array, scale: Array) -> float:
+    """What the docstrings say, written out; every parameter is free."""
+    away = ((phi - nominal) / scale) ** 2
+    if prior == "euclidean":
+        return float(away.sum())
+    value = float(away[:, 10:].sum())
+    for body, urdf in zip(phi, nominal, strict=True):
+        L = np.linalg.cholesky(pseudo(urdf))
+        relative = np.linalg.solve(L, np.linalg.solve(L, pseudo(body)).T)  # similar to J_0^-1/2 J J_0^-1/2
+        if prior == "pullback":
+            value += np.sum((relative - np.eye(4)) ** 2)
+        else:
+            value += -np.linalg.slogdet(relative)[1] + np.trace(relative) - 4.0
+    return value
+
+
+def objective(prior: Prior, ridge: float, problem: LinearProblem, phi: Array) -> float:
+    """Mean squared residual and prior at `phi`, (L, 12)."""
+    nominal, scale = (x.reshape(phi.shape) for x in (problem.nominal, problem.scale))
+    return problem.cost(phi.ravel()) / problem.rows + ridge * prior_value(prior, phi, nominal, scale)
+
+
+# ------------------------------------------------------------------------------------------------------- two solvers
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(seed=seeds, prior=st.sampled_from(PRIORS))
+def test_both_solvers_find_the_same_optimum_and_meet_every_condition(seed: int, prior: Prior) -> None:
+    rng = np.random.default_rng(seed)
+    case = random_case(rng)
+    ridge = 10.0 ** rng.uniform(-6.0, -1.0)
+    fast, sure = (Consistent(ridge, prior, case.conditions, method).solve(case.problem) for method in METHODS)
+    assert fast.objective == pytest.approx(sure.objective, rel=1e-6)
+    for estimate in (fast, sure):
+        phi = estimate.phi.reshape(case.truth.shape)
+        assert violations(phi, case.scale, case.conditions, 1e-7) == []
+        least = least_eigenvalues(phi, case.scale)
+        assert (least >= case.conditions.margin - 1e-7).all()
+        np.testing.assert_allclose(estimate.eigenvalues, least, rtol=0.0, atol=1e-9)
+        assert estimate.objective == pytest.approx(objective(prior, ridge, case.problem, phi), rel=1e-7)
+        assert estimate.unconstrained is None or estimate.objective >= estimate.unconstrained * (1.0 - 1e-7)
+    accuracy = 1e-8 * sure.objective  # of Clarabel, whose conditions hold to 1e-9
+    assert 0.0 <= fast.gap <= 1e-6 * fast.objective
+    assert 0.0 <= sure.gap <= 1e-6 * sure.objective
+    assert fast.objective - sure.objective <= fast.gap + accuracy
+    assert sure.objective - fast.objective <= sure.gap + accuracy
+
+
+@all_priors
+def test_the_gap_between_the_solvers_is_stated_when_asked_for(prior: Prior) -> None:
+    problem, _ = active_case(1)
+    for method in METHODS:
+        estimate = Consistent(1e-2, prior, method=method, certify=True).solve(problem)
+        other = Consistent(1e-2, prior, method=METHODS[method == "barrier"]).solve(problem)
+        expected = abs(estimate.objective - other.objective) / estimate.objective
+        assert estimate.certified_gap == pytest.approx(expected, abs=1e-12)
+        assert other.certified_gap is None
+        assert expected < 1e-6
+
+
+# --------------------------------------------------------------------------------------------------------- optimality
+
+
+@few
+@given(seed=seeds, prior=st.sampled_from(PRIORS))
+def test_no_other_allowed_parameters_are_better(seed: int, prior: Prior) -> None:
+    rng = np.random.default_rng(seed)
+    case = random_case(rng, plain=True)
+    estimate = Consistent(1e-2, prior, case.conditions).solve(case.problem)
+    best, tried = estimate.phi.reshape(case.truth.shape), 0
+    for size in np.repeat([1e-6, 1e-4, 1e-2, 1e-1], 50):
+        other = random_parameters_within(rng, best, case.scale, case.conditions, size)
+        if other is not None:
+            tried += 1
+            assert objective(prior, 1e-2, case.problem, other) >= estimate.objective * (1.0 - 1e-12) - estimate.gap
+    inside = Consistent(1.0, prior, replace(case.conditions, margin=0.02)).solve(case.problem).phi.reshape(best.shape)
+    for share in (1e-6, 1e-4, 1e-2, 1.0):  # the allowed set is convex: all the way to another member
+        other = (1.0 - share) * best + share * inside
+        assert objective(prior, 1e-2, case.problem, other) >= estimate.objective * (1.0 - 1e-12) - estimate.gap
+    assert tried or (estimate.eigenvalues < 1.1 * case.conditions.margin).any()
+
+
+@all_priors
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_general_optimizer_finds_nothing_better(seed: int, prior: Prior) -> None:
+    """SLSQP over Cholesky factors of the scaled pseudo-inertias less the margin, from the nominal and from the best."""
+    problem, scale = active_case(seed, bodies=1, rows=9)
+    margin, ridge = 0.05, 1e-3
+    estimate = Consistent(ridge, prior, Conditions(margin)).solve(problem)
+    assert estimate.eigenvalues.min() < 1.01 * margin  # the condition is active
+    rows, columns = np.tril_indices(4)
+
+    def phi_of(z: Array) -> Array:
+        L = np.zeros((4, 4))
+        L[rows, columns] = z[:10]
+        J = L @ L.T + margin * np.eye(4)
+        second = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
+        ten = [J[3, 3], *J[:3, 3], *(second[i, j] for i, j in parameters.INERTIA_AXES)]
+        return np.append(ten, z[10:] ** 2)[None] * scale
+
+    def z_of(phi: Array) -> Array:
+        J = pseudo((phi / scale)[0]) - margin * np.eye(4)
+        values, vectors = np.linalg.eigh(J)
+        R = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 1e-10))).T, mode="r")
+        return np.append(R.T[rows, columns], np.sqrt(np.maximum(phi[0, 10:], 0.0)))
+
+    assert phi_of(z_of(estimate.phi[None])) == pytest.approx(estimate.phi[None], abs=1e-6)
+    for start in (parameters.perturbed(problem.nominal[None], 0.1, np.random.default_rng(0)), estimate.phi[None]):
+        found = minimize(
+            lambda z: objective(prior, ridge, problem, phi_of(z)) / estimate.objective,
+            z_of(start) + 1e-3,
+            method="SLSQP",
+            options={"maxiter": 300, "ftol": 1e-13},
+        )
+        assert found.fun >= 1.0 - 1e-9 - estimate.gap / estimate.objective
+        assert found.fun < 1.02  # it does arrive: the comparison means something
+
+
+@few
+@given(seed=seeds)
+@both
+def test_without_active_conditions_it_is_least_squares(method: Method, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    nominal = random_bodies(rng, 2)
+    nominal[:, 10:] = 1.0
+    scale = parameter_scale(nominal)
+    problem = data(rng, nominal, nominal + 1e-3 * scale * rng.normal(size=nominal.shape), scale, 20, 10.0, 1e-4)
+    plain = LeastSquares(ridge := 1e-3).solve(problem)
+    least = float(least_eigenvalues(plain.phi.reshape(nominal.shape), scale).min())
+    assume(least > 1e-4)
+    estimate = Consistent(ridge, "euclidean", Conditions(0.5 * least), method).solve(problem)
+    np.testing.assert_allclose(estimate.phi / problem.scale, plain.phi / problem.scale, rtol=0.0, atol=1e-7)
+    assert estimate.unconstrained == pytest.approx(estimate.objective, rel=1e-7)
+    for name in ("standard_error", "identifiable", "rank", "condition_number", "nominal_cost", "rows"):
+        np.testing.assert_array_equal(getattr(estimate, name), getattr(plain, name))
+    assert estimate.cost == problem.cost(estimate.phi)
+
+
+@pytest.mark.parametrize("ridge", [0.0, 1e-10])
+@pytest.mark.parametrize("rows", [10, 40])
+@both
+def test_noise_free_data_of_a_real_robot_are_explained(method: Method, rows: int, ridge: float) -> None:
+    rng = np.random.default_rng(6)
+    nominal = random_bodies(rng, 2)
+    truth = parameters.perturbed(nominal, 0.2, rng)
+    truth[:, 10:] += 0.1
+    problem = data(rng, nominal, truth, parameter_scale(nominal), rows, 10.0, 0.0)
+    estimate = Consistent(ridge, conditions=Conditions(1e-4), method=method).solve(problem)
+    np.testing.assert_allclose(problem.A @ estimate.phi, problem.b, rtol=0.0, atol=1e-6 * np.abs(problem.b).max())
+    assert np.isfinite(estimate.phi).all()
+    if rows > truth.size:
+        off = (estimate.phi - truth.ravel()) / problem.scale
+        assert np.abs(off).max() < 1e-5  # condition 10
+
+
+# ------------------------------------------------------------------------------------------------------------- priors
+
+
+@all_priors
+@both
+def test_with_nothing_seen_the_nominal_bodies_stay(prior: Prior, method: Method) -> None:
+    nominal = random_bodies(np.random.default_rng(7), 2)
+    nominal[:, 10:] = 0.3
+    problem = nothing_seen(nominal)
+    estimate = Consistent(1e-3, prior, method=method, certify=True).solve(problem)
+    np.testing.assert_allclose((estimate.phi - problem.nominal) / problem.scale, 0.0, atol=1e-4)
+    assert abs(estimate.objective) < 1e-9
+
+
+@pytest.mark.parametrize("prior", ["pullback", "entropic"])
+@few
+@given(seed=seeds)
+def test_frames_and_units_do_not_matter_to_the_priors_of_matter(prior: Prior, seed: int) -> None:
+    """Without a margin, which knows the link's origin. Solutions are good to sqrt(gap)."""
+    rng = np.random.default_rng(seed)
+    problem, _ = active_case(seed, bodies=1)
+    T = transform(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3))
+    T[:3] *= 10.0 ** rng.uniform(-1.0, 1.0)  # another unit of length
+    X = np.eye(12)
+    X[:10, :10] = parameters.change_of_frame(T)
+    nominal = (X @ problem.nominal)[None]
+    scale = parameter_scale(nominal).ravel()
+    moved = replace(problem, A=problem.A @ np.linalg.inv(X), nominal=nominal[0], scale=scale)
+    one, other = (Consistent(1e-2, prior, Conditions(0.0)).solve(p) for p in (problem, moved))
+    assert other.objective == pytest.approx(one.objective, rel=1e-7)
+    back = np.linalg.solve(X, other.phi)
+    np.testing.assert_allclose(back / problem.scale, one.phi / problem.scale, rtol=0.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("prior", ["pullback", "entropic"])
+@both
+def test_a_prior_of_matter_refuses_nominal_bodies_that_do_not_exist(prior: Prior, method: Method) -> None:
+    problem, _ = active_case(0, bodies=1)
+    for worst in (-0.1, 0.0):  # broken triangle inequality; a plate
+        inertia = np.diag([1.0, 1.0, 2.0 - worst])
+        nominal = np.append(parameters.inertial_vector(1.0, np.zeros(3), inertia), [0.0, 0.0])
+        with pytest.raises(InputError, match="body 0"):
+            Consistent(1e-2, prior, method=method).solve(replace(problem, nominal=nominal))

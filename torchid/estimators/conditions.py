@@ -1,0 +1,169 @@
+"""What a physical robot satisfies: conditions on the parameters, and how far some parameters break them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchid import parameters
+from torchid.parameters import PER_BODY, Array
+
+
+@dataclass(frozen=True)
+class Enclosure:
+    """Where the centre of mass of a body lies: a box or an ellipsoid in its link's frame.
+
+    `axes`, (3, 3): columns are the directions of `half`, (3,) [m], half edges or semi-axes; `centre`, (3,) [m].
+    """
+
+    body: int
+    kind: str
+    centre: Array
+    axes: Array
+    half: Array
+
+    def __post_init__(self) -> None:
+        """Check kind and size."""
+        if self.kind not in ("box", "ellipsoid"):
+            raise ValueError(f"kind: found {self.kind!r}; accepted: box, ellipsoid")
+        if not (np.isfinite(self.half).all() and (self.half > 0.0).all()):
+            raise ValueError(f"half: found {self.half}; accepted: three positive numbers")
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Two bodies that are mirror images: `reflection`, (3, 3), takes the first link's vectors to the second's."""
+
+    body: int
+    image: int
+    reflection: Array
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions on the parameters (L, 12) of all bodies.
+
+    Attributes:
+        margin: least eigenvalue of every body's scaled pseudo-inertia, which is 1 kg, 1 m for a body of the nominal
+            mass and radius of gyration; above 0, some density of matter has the parameters.
+        total_mass: of all bodies [kg], None if unknown.
+        enclosures: of centres of mass.
+        mirrors: left and right.
+        lower, upper: bounds (L, 12), infinite where there are none; friction is never negative.
+    """
+
+    margin: float = 1e-4
+    total_mass: float | None = None
+    enclosures: tuple[Enclosure, ...] = ()
+    mirrors: tuple[Mirror, ...] = ()
+    lower: Array | None = None
+    upper: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not (np.isfinite(self.margin) and 0.0 <= self.margin < 1.0):
+            raise ValueError(f"margin: found {self.margin}; accepted: a number from 0 to 1, without 1")
+        if self.total_mass is not None and not (np.isfinite(self.total_mass) and self.total_mass > 0.0):
+            raise ValueError(f"total_mass: found {self.total_mass}; accepted: a positive number")
+
+    def check_bodies(self, bodies: int) -> None:
+        """Make sure that they are about a robot of that many bodies.
+
+        Raises:
+            ValueError: they name another body.
+        """
+        for body in [e.body for e in self.enclosures] + [b for m in self.mirrors for b in (m.body, m.image)]:
+            if not 0 <= body < bodies:
+                raise ValueError(f"body: found {body}; accepted: 0 to {bodies - 1}")
+
+    def bounds(self, bodies: int) -> tuple[Array, Array]:
+        """Lower and upper bounds (L, 12), friction at least 0."""
+        lower = np.full((bodies, PER_BODY), -np.inf) if self.lower is None else self.lower.copy()
+        upper = np.full((bodies, PER_BODY), np.inf) if self.upper is None else self.upper
+        for name, bound in (("lower", lower), ("upper", upper)):
+            if bound.shape != (bodies, PER_BODY) or np.isnan(bound).any():
+                raise ValueError(f"{name}: found shape {bound.shape}; accepted: ({bodies}, {PER_BODY}), without NaN")
+        lower[:, parameters.FRICTION] = np.maximum(lower[:, parameters.FRICTION], 0.0)
+        return lower, upper
+
+
+def mirrored_parameters(reflection: Array) -> Array:
+    """Matrix (12, 12) that takes a body's parameters to those of its mirror image."""
+    T = np.eye(4)
+    T[:3, :3] = reflection
+    out = np.eye(PER_BODY)
+    out[parameters.INERTIAL, parameters.INERTIAL] = parameters.change_of_frame(T)
+    return out
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A condition that a body breaks: how far it is off, in the unit given."""
+
+    body: int | None
+    condition: str
+    amount: float
+    unit: str
+
+
+def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float = 1e-9) -> list[Violation]:
+    """Every condition that parameters (L, 12) break by more than `tolerance` of its natural size.
+
+    Args:
+        phi: parameters.
+        scale: (L, 12), the size that a deviation of each parameter is measured in (`parameter_scale`).
+        conditions: what to check.
+        tolerance: relative.
+    """
+    out: list[Violation] = []
+    for body in np.flatnonzero(phi[:, parameters.INERTIAL].any(axis=1)):
+        out += _of_matter(int(body), phi[body], scale[body], conditions.margin, tolerance)
+    for enclosure in (e for e in conditions.enclosures if phi[e.body, parameters.MASS] > 0.0):
+        outside = _outside(phi[enclosure.body], enclosure)
+        if outside > tolerance:
+            out.append(
+                Violation(enclosure.body, f"centre of mass outside its {enclosure.kind}", outside, "of its size")
+            )
+    for mirror in conditions.mirrors:
+        image = mirrored_parameters(mirror.reflection) @ phi[mirror.body]
+        off = float(np.max(np.abs(image - phi[mirror.image]) / scale[mirror.image]))
+        if off > tolerance:
+            out.append(Violation(mirror.image, f"no mirror image of body {mirror.body}", off, "of its scale"))
+    if conditions.total_mass is not None:
+        off = float(abs(phi[:, parameters.MASS].sum() - conditions.total_mass))
+        if off > tolerance * conditions.total_mass:
+            out.append(Violation(None, "total mass is another", off, "kg"))
+    lower, upper = conditions.bounds(len(phi))
+    beyond = np.maximum(lower - phi, phi - upper)
+    for body, number in zip(*np.nonzero(beyond > tolerance * scale), strict=True):
+        name = parameters.PARAMETERS[number]
+        negative = number >= parameters.FRICTION.start and phi[body, number] < 0.0
+        what = f"{name} negative" if negative else f"{name} beyond its bounds"
+        out.append(Violation(int(body), what, float(beyond[body, number]), parameters.UNITS[number]))
+    return out
+
+
+def _of_matter(body: int, phi: Array, scale: Array, margin: float, tolerance: float) -> list[Violation]:
+    """Mass, inertia about the centre of mass, triangle inequality, pseudo-inertia of one body."""
+    if phi[parameters.MASS] <= 0.0:
+        return [Violation(body, "mass not positive", float(-phi[parameters.MASS]), "kg")]
+    _, _, inertia = parameters.mass_com_inertia(phi)
+    a, b, c = np.linalg.eigvalsh(inertia)
+    size = float(scale[parameters.INERTIA].max())
+    out = []
+    if a < -tolerance * size:
+        out.append(Violation(body, "inertia about the centre of mass not positive", float(-a), "kg m^2"))
+    if a + b - c < -tolerance * size:
+        out.append(Violation(body, "triangle inequality of the principal inertias", float(c - a - b), "kg m^2"))
+    least = float(np.linalg.eigvalsh(parameters.pseudo_inertia(phi / scale))[0])
+    if least < margin - tolerance:
+        out.append(Violation(body, f"pseudo-inertia below the margin of {margin:g}", margin - least, "scaled"))
+    return out
+
+
+def _outside(phi: Array, enclosure: Enclosure) -> float:
+    """How far the centre of mass is outside, as a share of the half sizes; negative inside."""
+    com = phi[parameters.FIRST_MOMENT] / phi[parameters.MASS]
+    local = np.abs(enclosure.axes.T @ (com - enclosure.centre)) / enclosure.half
+    return float((local.max() if enclosure.kind == "box" else np.linalg.norm(local)) - 1.0)
