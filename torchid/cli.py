@@ -43,8 +43,8 @@ def guarded(program: str, command: Callable[[], None], debug: bool = False) -> i
         except (InputError, BaseLostError) as error:
             print(f"{program}: {error}", file=sys.stderr)
             return 2
-        except KeyboardInterrupt:
-            print(f"{program}: interrupted; nothing was written", file=sys.stderr)
+        except KeyboardInterrupt as interrupt:
+            print(f"{program}: {interrupt or 'interrupted; nothing was written'}", file=sys.stderr)
             return 1
         except Exception as error:  # a bug or a full disk: still no wall of text unless asked for
             if debug:
@@ -62,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     identify.add_argument("file", help="experiment file (YAML)")
     identify.add_argument("overrides", nargs="*", help="key.subkey=value, for example estimator.ridge=0.01")
+    identify.add_argument("--resume", action="store_true", help="go on with a training (sgd) that was interrupted")
     identify.set_defaults(command=_identify)
     evaluate = commands.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
     evaluate.add_argument("run", help="run folder")
@@ -111,25 +112,28 @@ def _interrupt_held_back() -> Iterator[None]:
 def _identify(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
         from torchid.config import load_config
-        from torchid.estimators import ConsistentEstimate
+        from torchid.estimators import ConsistentEstimate, SgdEstimate
         from torchid.report.tables import error_tables, print_tables, state_table
         from torchid.run import identify
+        from torchid.run.results import objective_above_least
+        from torchid.run.training import body_eigenvalues
 
-    run = identify(load_config(options.file, options.overrides), options.file)
+    run = identify(load_config(options.file, options.overrides), options.file, options.resume)
     estimate, robot = run.estimate, run.experiment.robot
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
     mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
     print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
-    if isinstance(estimate, ConsistentEstimate):
-        least = min(x for x in estimate.eigenvalues if x == x)
-        print(f"consistent    smallest eigenvalue of a scaled pseudo-inertia {least:.3g}")
-        if estimate.unconstrained is not None:
-            worse = estimate.objective / estimate.unconstrained - 1.0
-            print(f"price         objective {100 * worse:.3g} % above that of least squares")
-        if estimate.certified_gap is not None:
-            print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
+    least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
+    print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
+    above = objective_above_least(estimate)
+    if above is not None:
+        print(f"objective     {100.0 * above:.3g} % above the least without conditions")
+    if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
+        print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
+    if isinstance(estimate, SgdEstimate):
+        print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
     print(f"total mass    {mass:.3f} kg (URDF: {robot.nominal[:, 0].sum():.3f} kg)")
     if robot.massless:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))

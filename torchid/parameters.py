@@ -99,6 +99,19 @@ def consistency_margin(phi: Array) -> Array:
     return eigenvalues[..., 0] / np.maximum(eigenvalues[..., -1], np.finfo(float).tiny)
 
 
+def least_eigenvalues(phi: Array, scale: Array) -> Array:
+    """Smallest eigenvalue of every body's scaled pseudo-inertia, (L,), NaN for bodies without inertia.
+
+    Args:
+        phi: (12 L,).
+        scale: (12 L,), sizes that the parameters are measured in.
+    """
+    scaled = (phi / scale).reshape(-1, PER_BODY)
+    eigenvalues = np.array(np.linalg.eigvalsh(pseudo_inertia(scaled))[:, 0])
+    eigenvalues[~scaled[:, INERTIAL].any(axis=1)] = np.nan
+    return eigenvalues
+
+
 def perturbed(phi: Array, error: float, rng: np.random.Generator) -> Array:
     """Parameters (L, 12) of bodies that differ from `phi` by up to a share `error`, yet could exist as well as those.
 

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
+from torchid.config.estimator import PenaltiesConfig, TrainingConfig
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.types import STRICT, Device, NotNegative, Number, Positive
 from torchid.errors import ConfigError, TorchidWarning
@@ -39,10 +40,14 @@ class ContactConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class LogsConfig:
-    """Logs to fit on, and logs the fit never sees; `*` and `?` in a name stand for all files that match."""
+    """Logs to fit on, logs that tell a descent when to stop, and logs the fit never sees.
+
+    `*` and `?` in a name stand for all files that match.
+    """
 
     train: Annotated[list[Path], Field(min_length=1)]
     test: list[Path] = dataclasses.field(default_factory=list)
+    validation: list[Path] = dataclasses.field(default_factory=list)
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -76,6 +81,18 @@ class SensorsConfig:
     on_base_lost: Literal["error", "warn"] = "error"
 
 
+Interval = Annotated[list[Number | None], Field(min_length=2, max_length=2)]
+
+
+@dataclass(config=STRICT, frozen=True)
+class SymmetryConfig:
+    """Bodies whose names differ in `left` and `right` are mirror images along the base link's axis `normal`."""
+
+    left: Annotated[str, Field(min_length=1)]
+    right: Annotated[str, Field(min_length=1)]
+    normal: Literal["x", "y", "z"] = "y"
+
+
 @dataclass(config=STRICT, frozen=True)
 class EstimatorConfig:
     """How parameters are found from the compressed logs.
@@ -83,10 +100,11 @@ class EstimatorConfig:
     `ridge` pulls to the URDF, `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of
     theirs. The rest is for `consistent`, which returns what a physical robot can have: `margin` of the scaled
     pseudo-inertias, `prior` that the ridge is in, `total_mass` [kg] if known, `method` and whether to `certify` it with
-    the other one.
+    the other one; `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry` makes left
+    and right mirror images, `bounds` are [lower, upper] by body and parameter, null for none.
     """
 
-    name: Literal["least_squares", "consistent"] = "least_squares"
+    name: Literal["least_squares", "consistent", "sgd"] = "least_squares"
     ridge: NotNegative = 0.0
     rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
     friction: bool = True
@@ -96,6 +114,13 @@ class EstimatorConfig:
     method: Literal["barrier", "certified"] = "barrier"
     certify: bool = False
     total_mass: Positive | None = None
+    com_inside: Literal["box", "ellipsoid"] | None = None
+    com_shapes: Literal["visual", "collision"] = "visual"
+    symmetry: SymmetryConfig | None = None
+    bounds: dict[str, dict[str, Interval]] | None = None
+    consistency: Literal["log_cholesky", "penalties"] = "log_cholesky"
+    penalties: PenaltiesConfig = dataclasses.field(default_factory=PenaltiesConfig)
+    training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
 
 
 def _spelled_out(value: object) -> object:
@@ -132,7 +157,7 @@ _EXPERIMENT = FileKind(
     name="experiment",
     keys="robot, logs, sensors, output",
     list_example="contacts=[{frame: l_sole, type: flat}]",
-    paths=("robot.urdf", "logs.train.*", "logs.test.*", "output"),
+    paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*", "output"),
     prepare=_with_sensors_spelled_out,
     refusals={"sensors.ft_sensors": ("limb-mounted sensors, which are not supported yet", "an empty list")},
 )
@@ -155,12 +180,17 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     path = Path(path)
     config = load(_EXPERIMENT, path, overrides)
     _check_sensors(path, config.sensors)
-    train, test = (_matching(path, f"logs.{key}", getattr(config.logs, key)) for key in ("train", "test"))
-    both = sorted(set(train) & set(test))
+    _check_estimator(path, config)
+    logs = {key: _matching(path, f"logs.{key}", getattr(config.logs, key)) for key in ("train", "test", "validation")}
+    for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
+        both = sorted({*logs[key]} & {*logs["test"]})
+        if both:
+            message = f"{path}: logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion"
+            warnings.warn(message, TorchidWarning, stacklevel=2)
+    both = sorted({*logs["train"]} & {*logs["validation"]})
     if both:
-        message = f"{path}: logs.test: {both[0]} is fitted on as well; its errors say nothing of unseen motion"
-        warnings.warn(message, TorchidWarning, stacklevel=2)
-    return dataclasses.replace(config, logs=LogsConfig(train, test))
+        raise ConfigError(path, "logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
+    return dataclasses.replace(config, logs=LogsConfig(**logs))
 
 
 def dump_config(config: ExperimentConfig) -> str:
@@ -183,6 +213,29 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
     if again:
         raise ConfigError(source, field, f"{again[0]} is given twice", "every log once")
     return out
+
+
+_ALL = ("name", "ridge", "rank_tolerance", "friction", "frozen")
+_PHYSICAL = ("prior", "method", "certify", "total_mass", "com_inside", "com_shapes", "symmetry", "bounds")
+_KEYS = {
+    "least_squares": _ALL,
+    "consistent": (*_ALL, "margin", *_PHYSICAL),
+    "sgd": (*_ALL, "margin", "consistency", "penalties", "training"),
+}
+
+
+def _check_estimator(path: Path, config: ExperimentConfig) -> None:
+    """Refuse a setting that the estimator has not: it would be ignored in silence."""
+    estimator, defaults = config.estimator, EstimatorConfig()
+    for key, value in vars(estimator).items():
+        if key not in _KEYS[estimator.name] and value != getattr(defaults, key):
+            having = [name for name, keys in _KEYS.items() if key in keys]
+            found = f"set, which {estimator.name} has not"
+            raise ConfigError(path, f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
+    if config.logs.validation and estimator.name != "sgd":
+        raise ConfigError(path, "logs.validation", f"set, which {estimator.name} has no use for", "estimator.name: sgd")
+    if estimator.training.patience is not None and not config.logs.validation:
+        raise ConfigError(path, "estimator.training.patience", "set, without logs to hold out", "logs.validation too")
 
 
 def _check_sensors(path: Path, sensors: SensorsConfig) -> None:

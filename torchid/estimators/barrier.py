@@ -7,31 +7,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.optimize import brentq
 from torch import Tensor
 
 from torchid.errors import InputError, NumericalWarning
-from torchid.estimators.conic import ConicProblem
+from torchid.estimators.conic import ConicProblem, Solution
 from torchid.parameters import Array
 from torchid.problem.threads import one_thread
 
 _SHRINK = 0.05  # of the barrier's weight from stage to stage; 0.1 takes a fifth more steps
-_CENTRED = 1e-3  # squared Newton decrement at which a stage is done
-_NEARLY = 0.1  # the same where rounding ends a stage
-_STEPS, _STAGES, _HALVINGS = 60, 60, 60
-_ARMIJO = 1e-4
-_INSIDE = 1e-6  # least slack of a starting point
+_CENTRED = 0.05  # squared Newton decrement at which a full step ends a stage
+_STEPS, _STAGES = 60, 60
+_INSIDE = 1e-6  # least slack of a good starting point, _ROOM of any
+_ROOM = 1e-9
 _DEEP = 0.01  # and the most that is looked for
-_FLOOR = 1e-3  # of the objective at the start, for optima near 0
-
-
-@dataclass(frozen=True)
-class Solution:
-    """A minimizer x, its objective, a bound on how far that is above the least one, Newton steps taken."""
-
-    x: Array
-    objective: float
-    gap: float
-    steps: int
+_FLOOR = 1e-4  # of the problem's size, for optima near 0
+_LOOSE = 1e-6  # relative gap worth a warning
 
 
 def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
@@ -43,10 +34,13 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
 
     Args:
         problem: what to minimize.
-        tolerance: relative gap.
+        tolerance: relative gap; for optima near 0 relative to a small share of the problem's size.
 
     Raises:
         InputError: the conditions exclude each other.
+
+    Warns:
+        NumericalWarning: rounding ended the path early.
     """
     with one_thread():
         return _follow(problem, tolerance)
@@ -55,132 +49,144 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
 def _follow(problem: ConicProblem, tolerance: float) -> Solution:
     x, steps = _interior(problem)
     path = _Path(problem)
-    start = abs(problem.objective(x))
-    kappa, gap = max(start, np.finfo(float).tiny) / max(problem.degree, 1), np.inf
+    floor = _FLOOR * problem.size
+    kappa = max(problem.objective(x), problem.size) / max(problem.degree, 1)
+    best = Solution(x, problem.objective(x), np.inf, steps)
     for _ in range(_STAGES):
-        there, taken, centred = path.centre(x, kappa)
-        steps += taken
-        if not centred and np.isfinite(gap):
-            break  # rounding is all that is left: the last point of the path stands
-        x = there
-        gap = kappa * problem.degree if centred else np.inf
-        if gap <= tolerance * (abs(problem.objective(x)) + _FLOOR * start):
+        point = path.centre(x, kappa)
+        x, steps, gap = point.x, steps + point.steps, problem.gap(point.x, point.Z, point.y)
+        if gap >= best.gap:
+            break  # rounding is all that is left: the best point of the path stands
+        best = Solution(x, problem.objective(x), gap, steps)
+        if gap <= tolerance * (best.objective + floor):
             break
         kappa *= _SHRINK
-    if not np.isfinite(gap):
-        warnings.warn(
-            "estimator: the barrier method found no point of the central path", NumericalWarning, stacklevel=4
-        )
-    return Solution(x, problem.objective(x), gap, steps)
+    if not best.gap <= _LOOSE * (best.objective + floor):
+        message = f"estimator: the barrier method stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
+        warnings.warn(message, NumericalWarning, stacklevel=5)
+    return best
 
 
 def _interior(problem: ConicProblem) -> tuple[Array, int]:
     """A strictly feasible x, near 0 if that is one, and the Newton steps it took to find."""
-    x: Array = np.linalg.pinv(problem.E) @ problem.e
+    x = problem.E.T @ problem.e
     worst = float(problem.slack(x).min(initial=np.inf))
     if worst > _INSIDE:
         return x, 0
-    relaxed = _relaxed(problem)
-    path, z, kappa, steps = _Path(relaxed), np.append(x, 1.0 - worst), 1.0, 0
-    for _ in range(_STAGES):
-        z, taken, _ = path.centre(z, kappa)
-        steps += taken
+    z, kappa, steps = np.append(x, 1.0 - worst), 1.0, 0
+    while kappa * (problem.degree + 1) > 0.1 * _ROOM:
+        point = _Path(_relaxed(problem, kappa)).centre(z, kappa)
+        z, steps = point.x, steps + point.steps
         if problem.slack(z[:-1]).min() > _INSIDE:
             return z[:-1], steps
-        if kappa * relaxed.degree < 0.1 * _INSIDE:
-            break
         kappa *= _SHRINK
     slack = problem.slack(z[:-1])
+    if slack.min() > _ROOM:
+        return z[:-1], steps
     which = int(slack.argmin())
     name = problem.names[which // 4 if which < 4 * len(problem.base) else which - 3 * len(problem.base)]
     raise InputError("estimator", name, "excluded by the other conditions", "conditions that some robot can meet")
 
 
-def _relaxed(problem: ConicProblem) -> ConicProblem:
-    """Min s, with s added to every eigenvalue and slack: negative s is what `_interior` looks for."""
-    n, blocks, rows = len(problem.c), len(problem.base), len(problem.h)
+def _relaxed(problem: ConicProblem, kappa: float) -> ConicProblem:
+    """Min s, with s added to every eigenvalue and slack: negative s is what `_interior` looks for.
+
+    A pull to 0 that fades with the barrier, and a bound on s, keep what would grow for ever at its place.
+    """
+    n, blocks, rows = len(problem.linear), len(problem.base), len(problem.h)
     slopes = np.concatenate([problem.slopes, np.broadcast_to(np.eye(4), (blocks, 1, 4, 4))], axis=1)
     variables = np.concatenate([problem.variables, np.full((blocks, 1), n)], axis=1)
     return replace(
         problem,
-        H=np.diag(np.append(np.full(n, 1e-2), 0.0)),
-        c=np.append(np.zeros(n), 1.0),
-        constant=0.0,
+        root=np.sqrt(0.5 * kappa) * np.eye(n, n + 1),
+        target=np.zeros(n),
+        linear=np.eye(n + 1)[n],
         slopes=slopes,
         variables=variables,
         weights=np.zeros(blocks),
         G=np.vstack([np.hstack([problem.G, np.ones((rows, 1))]), np.eye(n + 1)[n:]]),
-        h=np.append(problem.h, -_DEEP),  # or growing bodies would have no bound
+        h=np.append(problem.h, -_DEEP),
         E=np.hstack([problem.E, np.zeros((len(problem.e), 1))]),
     )
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A point (n,) on or near the central path, multipliers (K, 4, 4) and (M,), the Newton steps it took."""
+
+    x: Array
+    Z: Array
+    y: Array
+    steps: int
 
 
 class _Path:
     """The central path of a problem, as tensors."""
 
     def __init__(self, problem: ConicProblem) -> None:
-        self.H, self.c = torch.from_numpy(problem.H), torch.from_numpy(problem.c)
+        self.problem = problem
         self.base, self.slopes = torch.from_numpy(problem.base), torch.from_numpy(problem.slopes)
         self.variables, self.weights = torch.from_numpy(problem.variables), torch.from_numpy(problem.weights)
         self.G, self.h = torch.from_numpy(problem.G), torch.from_numpy(problem.h)
-        free = np.eye(len(problem.c))
-        if len(problem.e):
-            free = np.linalg.svd(problem.E)[2][len(problem.e) :].T  # moves that keep E x
-        self.T = torch.from_numpy(np.ascontiguousarray(free))
+        self.H, self.moves = torch.from_numpy(problem.H), torch.from_numpy(problem.moves)
 
-    def centre(self, x: Array, kappa: float) -> tuple[Array, int, bool]:
-        """The point of the path at barrier weight `kappa`, Newton steps to it from x inside, and if it was reached."""
-        here = torch.from_numpy(x)
-        value, taken = self._merit(here, kappa), 0
-        while taken < _STEPS:
-            taken += 1
-            gradient, hessian = self._derivatives(here, kappa)
-            slope = self.T.T @ gradient
-            move = -(self.T @ _solved(self.T.T @ hessian @ self.T, slope))
-            descent = float(gradient @ move)
-            length = 1.0
-            for _ in range(_HALVINGS):
-                there = here + length * move
-                new = self._merit(there, kappa)
-                if new <= value + _ARMIJO * length * descent:
-                    here, value = there, new
-                    break
-                length *= 0.5
-            else:
-                return here.numpy(), taken, -descent <= _NEARLY * kappa
-            if -descent <= _CENTRED * kappa:
-                return here.numpy(), taken, True
-        return here.numpy(), taken, False
+    def centre(self, start: Array, kappa: float) -> _Point:
+        """The point of the path at barrier weight `kappa`, from `start`, (n,), inside.
 
-    def _blocks(self, x: Tensor) -> Tensor:
-        return self.base + (x[self.variables, None, None] * self.slopes).sum(1)
+        The last step is a full one: with the multipliers that Newton's equations give it, the dual residual is zero.
+        """
+        x, weights = torch.from_numpy(start), self.weights + kappa
+        for steps in range(1, _STEPS + 1):
+            blocks = self.base + (x[self.variables, None, None] * self.slopes).sum(1)
+            slack = self.G @ x - self.h
+            smooth = torch.from_numpy(self.problem.gradient(x.numpy()))
+            root = torch.linalg.cholesky(blocks)
+            half = torch.linalg.solve_triangular(root[:, None], self.slopes, upper=False)
+            inside = torch.linalg.solve_triangular(root[:, None], half.mT, upper=False)  # (K, V, 4, 4), C^-1 E C^-T
+            gradient, hessian = self._derivatives(smooth, inside, slack, weights, kappa)
+            move = -(self.moves @ _solved(self.moves.T @ hessian @ self.moves, self.moves.T @ gradient))
+            change = (move[self.variables, None, None] * inside).sum(1)  # of the blocks, relative
+            growth = self.G @ move / slack
+            decrement = float(-gradient @ move) / kappa
+            if decrement <= _CENTRED or steps == _STEPS:
+                break
+            rates = torch.cat([torch.linalg.eigvalsh(change).ravel(), growth]).numpy()
+            shares = torch.cat([weights.repeat_interleave(4), torch.full_like(slack, kappa)]).numpy()
+            x = x + _length(float(smooth @ move), float(move @ self.H @ move), rates, shares) * move
+        if decrement <= _CENTRED:
+            x = x + move
+        else:
+            change, growth = torch.zeros_like(change), torch.zeros_like(growth)
+        inverse = torch.linalg.solve_triangular(root, torch.eye(4, dtype=root.dtype), upper=False)
+        Z = weights[:, None, None] * inverse.mT @ (torch.eye(4, dtype=root.dtype) - change) @ inverse
+        return _Point(x.numpy(), Z.numpy(), (kappa / slack * (1.0 - growth)).numpy(), steps)
 
-    def _merit(self, x: Tensor, kappa: float) -> float:
-        """Quadratic and barrier, inf outside."""
-        slack = self.G @ x - self.h
-        root, failed = torch.linalg.cholesky_ex(self._blocks(x))
-        if failed.any() or (slack <= 0.0).any():
-            return float("inf")
-        logdet = 2.0 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        barrier = ((self.weights + kappa) * logdet).sum() + kappa * slack.log().sum()
-        return float(0.5 * x @ self.H @ x + self.c @ x - barrier)
-
-    def _derivatives(self, x: Tensor, kappa: float) -> tuple[Tensor, Tensor]:
-        """Gradient (n,) and Hessian (n, n) of the merit."""
-        weights = self.weights + kappa
-        root = torch.linalg.cholesky(self._blocks(x))[:, None]
-        half = torch.linalg.solve_triangular(root, self.slopes, upper=False)
-        inside = torch.linalg.solve_triangular(root, half.mT, upper=False).flatten(2)  # (K, V, 16), C^-1 E C^-T
-        trace = inside[..., ::5].sum(-1)
-        slack = self.G @ x - self.h
-        gradient = self.H @ x + self.c - kappa * (self.G.T @ (1.0 / slack))
-        gradient.index_put_((self.variables,), -weights[:, None] * trace, accumulate=True)
+    def _derivatives(
+        self, smooth: Tensor, inside: Tensor, slack: Tensor, weights: Tensor, kappa: float
+    ) -> tuple[Tensor, Tensor]:
+        """Gradient (n,) and Hessian (n, n) of the quadratic and the barrier."""
+        flat = inside.flatten(2)  # (K, V, 16)
+        gradient = smooth - kappa * (self.G.T @ (1.0 / slack))
+        gradient.index_put_((self.variables,), -weights[:, None] * flat[..., ::5].sum(-1), accumulate=True)
         scaled = self.G / slack[:, None]
         hessian = self.H + kappa * scaled.T @ scaled
         rows, columns = self.variables[:, :, None], self.variables[:, None, :]
-        curvature = weights[:, None, None] * (inside @ inside.mT)
+        curvature = weights[:, None, None] * (flat @ flat.mT)
         hessian.index_put_((rows.expand_as(curvature), columns.expand_as(curvature)), curvature, accumulate=True)
         return gradient, hessian
+
+
+def _length(slope: float, curvature: float, rates: Array, shares: Array) -> float:
+    """Length of the best step along a move: the quadratic's slope and curvature, and logarithms log(1 + length rate).
+
+    In closed form: differences of the objective itself drown in rounding near the end of the path.
+    """
+
+    def rise(length: float) -> float:
+        return slope + length * curvature - float(shares @ (rates / (1.0 + length * rates)))
+
+    longest = min(10.0, 0.99 / max(-float(rates.min(initial=0.0)), 1e-9))
+    return longest if rise(longest) <= 0.0 else float(brentq(rise, 0.0, longest, xtol=1e-3 * longest))
 
 
 def _solved(A: Tensor, b: Tensor) -> Tensor:

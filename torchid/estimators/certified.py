@@ -11,62 +11,64 @@ except ImportError as error:
 import numpy as np
 
 from torchid.errors import InputError, NumericalWarning
-from torchid.estimators.barrier import Solution
-from torchid.estimators.conic import ConicProblem
+from torchid.estimators.conic import ConicProblem, Solution
+from torchid.parameters import Array
 
-_LEAST_SIZE = 1e-6  # of the objective at the start: what the solver sees must not vanish
+_LEAST_SIZE = 1e-6  # of the problem's size: what the solver sees must not vanish
+_LOOSE = 1e-6  # relative gap worth a warning
 
 
-def solve_certified(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
-    """Solve with Clarabel, an interior-point method that returns a dual certificate.
-
-    The solver sees the objective from the unconstrained minimum up, in units of its size: its tolerances are absolute
-    for small numbers.
+def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution:
+    """Solve with Clarabel, a primal-dual interior-point method: its multipliers certify what it finds.
 
     Raises:
         InputError: the conditions exclude each other, or the solver gave up.
 
     Warns:
-        NumericalWarning: the solver stopped short of its tolerance.
+        NumericalWarning: the solver stopped short.
     """
-    values, vectors = np.linalg.eigh(problem.H)
-    kept = values > 1e-14 * max(float(values[-1]), np.finfo(float).tiny)
-    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-    centre = -inverse @ problem.c
-    linear = problem.c + problem.H @ centre  # what the quadratic cannot take in
-    lowest = 0.5 * problem.c @ centre + problem.constant
-    size = max(abs(lowest), _LEAST_SIZE * abs(problem.constant), np.finfo(float).tiny)
-    root = (vectors[:, kept] * np.sqrt(values[kept] / size)).T
-
-    d = cp.Variable(len(problem.c))
-    x = centre + d
-    objective = 0.5 * cp.sum_squares(root @ d) + (linear / size) @ d
-    conditions = []
+    size = max(problem.constant, _LEAST_SIZE * problem.size)
+    x = cp.Variable(len(problem.linear))
+    objective = cp.sum_squares((problem.root @ x - problem.target) / np.sqrt(size)) + (problem.linear / size) @ x
+    blocks = []
     for base, slopes, variables, weight in zip(
         problem.base, problem.slopes, problem.variables, problem.weights, strict=True
     ):
-        block = base + sum(x[int(index)] * slope for index, slope in zip(variables, slopes, strict=True) if slope.any())
-        symmetric = cp.Variable((4, 4), symmetric=True)
-        conditions += [symmetric == block, symmetric >> 0]
+        block = cp.reshape(slopes.reshape(10, 16).T @ x[variables] + base.ravel(), (4, 4), order="C")
+        blocks.append(block >> 0)
         if weight > 0.0:
-            objective -= (weight / size) * cp.log_det(symmetric)
-    if len(problem.h):
-        conditions.append(problem.G @ x >= problem.h)
-    if len(problem.e):
-        conditions.append(problem.E @ x == problem.e)
-    programme = cp.Problem(cp.Minimize(objective), conditions)
+            objective -= (weight / size) * cp.log_det(block)
+    rows = problem.G @ x >= problem.h
+    programme = cp.Problem(cp.Minimize(objective), [*blocks, rows, problem.E @ x == problem.e])
+    _run(programme, tolerance)
+    best = np.asarray(x.value, dtype=np.float64)
+    Z, y = size * np.array([_positive(block.dual_value) for block in blocks]), size * np.maximum(rows.dual_value, 0.0)
+    weighted = problem.weights > 0.0
+    Z[weighted] += problem.weights[weighted, None, None] * np.linalg.inv(problem.blocks(best)[weighted])
+    value = problem.objective(best)
+    gap = problem.gap(best, Z, y)
+    if not gap <= _LOOSE * max(value, _LEAST_SIZE * problem.size):
+        warnings.warn(
+            f"estimator: the conic solver stopped at a gap of {gap:.1g} to {value:.3g}", NumericalWarning, stacklevel=4
+        )
+    return Solution(best, value, gap, int(programme.solver_stats.num_iters or 0))
+
+
+def _run(programme: cp.Problem, tolerance: float) -> None:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of its own; the status says the same
-            programme.solve(solver=cp.CLARABEL, tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=1e-9)
+            warnings.simplefilter("ignore", UserWarning)  # of an inaccurate solution: the gap says how much
+            programme.solve(
+                solver=cp.CLARABEL, tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=tolerance, accept_unknown=True
+            )
     except cp.SolverError as error:
         raise InputError("estimator", "method", f"Clarabel gave up: {error}", "method: barrier") from error
-    if d.value is None:
+    if programme.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         found = f"{programme.status}: the conditions exclude each other"
         raise InputError("estimator", "conditions", found, "conditions that some robot can meet")
-    if programme.status != cp.OPTIMAL:
-        warnings.warn(f"estimator: the conic solver stopped early ({programme.status})", NumericalWarning, stacklevel=3)
-    best = centre + np.asarray(d.value, dtype=np.float64)
-    stats = programme.solver_stats
-    gap = size * abs(float(stats.extra_stats.obj_val) - float(stats.extra_stats.obj_val_dual))
-    return Solution(best, problem.objective(best), gap, int(stats.num_iters or 0))
+
+
+def _positive(Z: Array) -> Array:
+    """The nearest positive semidefinite matrix."""
+    values, vectors = np.linalg.eigh(Z)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, dtype=np.float64)

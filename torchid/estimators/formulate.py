@@ -63,12 +63,20 @@ class _Variables:
         return row, float(scaled @ self.nominal[body])
 
 
-def conic_problem(problem: LinearProblem, conditions: Conditions, ridge: float, prior: Prior) -> ConicProblem:
-    """The convex problem in x, the deviation of the free parameters from nominal in units of their scale."""
+def conic_problem(
+    problem: LinearProblem, conditions: Conditions, ridge: float, prior: Prior, reference: Array | None = None
+) -> ConicProblem:
+    """The convex problem in x, the deviation of the free parameters from nominal in units of their scale.
+
+    Args:
+        problem: the data.
+        conditions: on the parameters.
+        ridge: weight of the prior.
+        prior: what pulls to the nominal parameters.
+        reference: (12 L,), whose pseudo-inertias measure a pull-back prior's deviations; None for the nominal ones.
+    """
     conditions.check_bodies(len(problem.nominal) // PER_BODY)
     x = _Variables(problem)
-    A = problem.A[:, problem.free] * problem.scale[problem.free] / np.sqrt(max(problem.rows, 1))
-    b = (problem.b - problem.A @ problem.nominal) / np.sqrt(max(problem.rows, 1))
     blocks = [_matter(x, body, conditions.margin) for body in x.bodies]
     rows = _bounds(x, conditions)
     for enclosure in conditions.enclosures:
@@ -76,16 +84,24 @@ def conic_problem(problem: LinearProblem, conditions: Conditions, ridge: float, 
             blocks.append(_ellipsoid(x, enclosure))
         elif enclosure.body in x.bodies:
             rows += _box(x, enclosure)
-    H, c, constant = _prior(x, prior, ridge)
-    weights = np.zeros(len(blocks))
+    weights, linear = np.zeros(len(blocks)), np.zeros(x.count)
+    pull = np.eye(x.count)
+    if prior == "pullback":
+        pull = _pull_back(x, problem.nominal if reference is None else reference)
     if prior == "entropic":
-        blocks += [_matter(x, body, 0.0) for body in x.bodies]
-        weights = np.concatenate([weights, np.full(len(x.bodies), ridge)])
+        relative = [_relative(x, body) for body in x.bodies]
+        for block in relative:
+            pull[block.variables] = 0.0
+            linear[block.variables] = ridge * np.trace(block.slopes, axis1=1, axis2=2)
+        blocks += relative
+        weights = np.append(weights, np.full(len(relative), ridge))
+    root, target, unexplained = _compressed(problem, np.sqrt(ridge) * pull)
     E, e = _equalities(x, conditions)
     return ConicProblem(
-        H=2.0 * A.T @ A + H,
-        c=-2.0 * A.T @ b + c,
-        constant=float(b @ b) + problem.residual / max(problem.rows, 1) + constant,
+        root=root,
+        target=target,
+        linear=linear,
+        constant=unexplained,
         base=np.array([block.base for block in blocks]).reshape(-1, 4, 4),
         slopes=np.array([block.slopes for block in blocks]).reshape(len(blocks), 10, 4, 4),
         variables=np.array([block.variables for block in blocks], dtype=np.int64).reshape(-1, 10),
@@ -96,6 +112,17 @@ def conic_problem(problem: LinearProblem, conditions: Conditions, ridge: float, 
         e=e,
         names=(*(block.name for block in blocks), *(row.name for row in rows)),
     )
+
+
+def _compressed(problem: LinearProblem, pull: Array) -> tuple[Array, Array, float]:
+    """Data and quadratic prior as ||root x - target||^2 + constant, with no more rows than columns."""
+    free, rows = problem.free, max(problem.rows, 1)
+    A = problem.A[:, free] * problem.scale[free] / np.sqrt(rows)
+    b = (problem.b - problem.A @ problem.nominal) / np.sqrt(rows)
+    right = np.concatenate([b, np.zeros(len(pull))])
+    triangle = np.linalg.qr(np.column_stack([np.concatenate([A, pull]), right]), mode="r")
+    count = A.shape[1]
+    return triangle[:count, :count], triangle[:count, count], problem.residual / rows + float(triangle[count:, count] @ triangle[count:, count])
 
 
 def _matter(x: _Variables, body: int, margin: float) -> _Block:
@@ -188,27 +215,28 @@ def _independent(E: Array, e: Array) -> tuple[Array, Array]:
     return values[kept, None] * right[kept], U[:, kept].T @ e
 
 
-def _prior(x: _Variables, prior: Prior, ridge: float) -> tuple[Array, Array, float]:
-    """What a prior adds to the quadratic: (n, n), (n,) and a constant; an entropic prior's log det J is apart.
-
-    Friction is pulled by the Euclidean prior in any case.
-    """
-    H, c = 2.0 * ridge * np.eye(x.count), np.zeros(x.count)
-    if prior == "euclidean":
-        return H, c, 0.0
-    constant = 0.0
+def _pull_back(x: _Variables, reference: Array) -> Array:
+    """Root of the constant pull-back metric: per body J_0^-1/2 dJ J_0^-1/2, of friction the scaled deviation."""
+    scaled = reference.reshape(-1, PER_BODY) / x.scale
+    rows = [np.eye(x.count)[x.place[:, parameters.FRICTION][x.free[:, parameters.FRICTION]]]]
     for body in x.bodies:
-        J = parameters.pseudo_inertia(x.nominal[body])
-        if np.linalg.eigvalsh(J)[0] <= 0.0:
-            found = f"{prior}, but no density of matter has the nominal parameters of body {body}"
-            raise InputError("estimator", "prior", found, "euclidean, or nominal bodies that can exist")
-        place = np.ix_(x.ten(body), x.ten(body))
-        inverse = np.linalg.inv(J)
-        relative = inverse @ _TEN  # J_0^-1 dJ
-        if prior == "pullback":
-            H[place] = 2.0 * ridge * np.einsum("aij,bji->ab", relative, relative)
-        else:
-            H[place] = 0.0
-            c[x.ten(body)] = ridge * np.trace(relative, axis1=1, axis2=2)
-            constant += ridge * float(np.linalg.slogdet(J)[1])
-    return H, c, constant
+        row = np.zeros((16, x.count))
+        row[:, x.ten(body)] = _whitened(scaled[body], body, "pullback").reshape(10, 16).T
+        rows.append(row)
+    return np.concatenate(rows)
+
+
+def _relative(x: _Variables, body: int) -> _Block:
+    """J_0^-1/2 J J_0^-1/2 of a body."""
+    slopes = _whitened(x.nominal[body], body, "entropic")
+    return _Block(f"pseudo-inertia of body {body}", np.eye(4), slopes, x.ten(body))
+
+
+def _whitened(scaled: Array, body: int, prior: Prior) -> Array:
+    """L^-1 dJ L^-T for each of ten numbers, (10, 4, 4), of the pseudo-inertia J = L L^T of scaled parameters (12,)."""
+    J = parameters.pseudo_inertia(scaled)
+    if np.linalg.eigvalsh(J)[0] <= 0.0:
+        found = f"{prior}, but no density of matter has the parameters of body {body} that it starts from"
+        raise InputError("estimator", "prior", found, "euclidean, or bodies that can exist")
+    inverse = np.linalg.inv(np.linalg.cholesky(J))
+    return np.asarray(inverse @ _TEN @ inverse.T)

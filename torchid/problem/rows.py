@@ -112,11 +112,35 @@ class RowBuilder(nn.Module):
         """
         workspace = workspace or Workspace()
         plan, terms = self.plan(state), self.terms(samples, workspace)
-        if self.tree.base_rows or plan.mixed_joints:
-            for rows in self._mixed_rows(samples, plan, terms, workspace):
-                yield plan.support, rows
+        for _, _, rows in self._mixed_rows(samples, plan, terms, workspace):
+            yield plan.support, rows.flatten(1).T
         for joint in plan.lone_joints:
-            yield self._lone_row(joint, samples, terms)
+            columns, rows = self._lone_row(joint, samples, terms)
+            yield columns, rows.T
+
+    def rows_by_sample(self, samples: Samples, state: State) -> tuple[Tensor, Tensor]:
+        """The same rows sample by sample, for samples that share a contact state.
+
+        Returns:
+            (B, nv, columns + 1), `W^T [K | f]` with rows of zeros where there are fewer than nv, and W, (B, nv, nv).
+        """
+        plan, terms = self.plan(state), self.terms(samples)
+        base, mixed = self.tree.base_rows, self.tree.base_rows + len(plan.mixed_joints)
+        nv = base + len(self.columns.joint_rows)
+        rows = samples.time.new_zeros(len(samples), nv, self.columns.count + 1)
+        W = samples.time.new_zeros(len(samples), nv, nv)
+        moved = self._index([*range(base), *(base + joint for joint in plan.mixed_joints)])
+        support = self._index([*plan.support, self.columns.count])
+        for index, basis, found in self._mixed_rows(samples, plan, terms, Workspace()):
+            here = torch.arange(len(samples), device=self.device)[index][:, None, None]
+            slots = torch.arange(found.shape[1], device=self.device)
+            rows[here, slots[:, None], support] = found.permute(2, 1, 0)
+            W[here, moved[:, None], slots] = basis
+        for slot, joint in enumerate(plan.lone_joints, start=mixed):
+            columns, found = self._lone_row(joint, samples, terms)
+            rows[:, slot, self._index([*columns, self.columns.count])] = found.T
+            W[:, base + joint, slot] = 1.0 / self.sensors.noise.joint_torque
+        return rows, W
 
     def bases(self, samples: Samples, state: State) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """Orthonormal V_x, (B', base rows + mixed joints, r), with the samples it belongs to, grouped by rank."""
@@ -146,21 +170,25 @@ class RowBuilder(nn.Module):
         friction = [x for _, *pair in friction_columns(row, terms.joints) for x in pair]
         block = torch.cat([inertial, torch.stack([*friction, self.torque(samples)[:, joint]])])
         columns = (*range(row.start, row.end), *self.columns.friction_of(joint))
-        return columns, (block / self.sensors.noise.joint_torque).T
+        return columns, block / self.sensors.noise.joint_torque
 
     def _mixed_rows(
         self, samples: Samples, plan: StatePlan, terms: ChunkTerms, workspace: Workspace
-    ) -> Iterator[Tensor]:
+    ) -> Iterator[tuple[Tensor | slice, Tensor, Tensor]]:
+        """Samples of one rank, their W (B', base rows + mixed joints, r) and their rows (columns + 1, r, B')."""
+        if not (self.tree.base_rows or plan.mixed_joints):
+            return
         unmeasured, measured = self._contact_rows(plan, terms)
         torque = self.torque(samples)[:, list(plan.mixed_joints)]
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(plan.wrench_std):
             f = f + (measured.mT @ self._measured_wrench(samples, plan, terms)[..., None])[..., 0]
         for index, W in whitened_null_space(unmeasured, plan.row_std, measured, plan.wrench_std):
-            yield self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, plan, terms.select(index), workspace)
+            rows = self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, plan, terms.select(index), workspace)
+            yield index, W, rows
 
     def _projected(self, W: Tensor, f: Tensor, plan: StatePlan, terms: ChunkTerms, workspace: Workspace) -> Tensor:
-        """Rows W^T [K | f], (r B, columns + 1), for a basis W, (base rows + mixed joints, r, B), and f, (..., B).
+        """Rows W^T [K | f], (columns + 1, r, B), for a basis W, (base rows + mixed joints, r, B), and f, (..., B).
 
         A wrench on body i does work on the base and on the joints above it only, so that body i's columns of W^T K are
         A_i^T times its wrench columns, with A_i the sum of W's rows along i's path, each carried by its screw axis. No
@@ -194,7 +222,7 @@ class RowBuilder(nn.Module):
                 columns = X[start - inertial.start : end - inertial.start].unflatten(0, shape)
                 wrenches = terms.wrenches[:, start:end].unflatten(1, shape)
                 self._carry(wrenches, carried[:, bodies.start : bodies.stop], pulling, columns)
-        return X.flatten(1).T
+        return X
 
     @staticmethod
     def _carry(wrenches: Tensor, carried: Tensor, pulling: int, out: Tensor) -> None:

@@ -114,6 +114,25 @@ class Samples:
         alpha = self.base.get("base_angular_acceleration_base", still)
         return Motion(self.joint_position, self.joint_velocity, self.joint_acceleration, omega, alpha, force)
 
+    def coordinates(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Generalized coordinates q, v, a as `Regressor` takes them.
+
+        Base position and base linear velocity are 0: the dynamics do not depend on them, and logs need not hold them.
+        A bolted base has joints only.
+        """
+        joints = (self.joint_position, self.joint_velocity, self.joint_acceleration)
+        rotation, still = self.rotation_world_base, self.time.new_zeros(len(self), 3)
+        if rotation is None or "base_linear_acceleration_world" not in self.base:
+            return joints
+        linear = (rotation.mT @ self.base["base_linear_acceleration_world"][..., None])[..., 0]
+        base = (
+            torch.cat([still, self.base["base_quat_xyzw"]], dim=1),
+            torch.cat([still, self.base["base_angular_velocity_base"]], dim=1),
+            torch.cat([linear, self.base["base_angular_acceleration_base"]], dim=1),
+        )
+        q, v, a = (torch.cat(pair, dim=1) for pair in zip(base, joints, strict=True))
+        return q, v, a
+
 
 def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSet | None = None) -> Samples:
     """Order a preprocessed log by the robot's joints and the contacts, and check it.

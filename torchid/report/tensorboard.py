@@ -2,67 +2,111 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
-from torchid.estimators import Estimate
+from torchid.estimators import Epoch, Estimate
 from torchid.report.metrics import GROUPS, Metrics
 
-_NOMINAL_STEP, _IDENTIFIED_STEP = 0, 1
+_SETS = ("train", "test")
+_TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
 
 
-def write_events(
-    folder: Path,
-    sets: Mapping[str, tuple[Metrics, Metrics]],
-    estimate: Estimate,
-    settings: str,
-    hyperparameters: Mapping[str, str | float | bool],
-    figures: Mapping[str, Figure],
-) -> None:
-    """Write scalars, figures and settings.
+class RunEvents:
+    """Event files of one run: charts by step, train and unseen logs on one chart, figures and settings.
 
-    Errors are charts of two steps, 0 for the URDF's parameters and 1 for the identified ones, train and test on one
-    chart per group of rows.
-
-    Args:
-        folder: where the event files go.
-        sets: nominal and identified metrics by set name ("train", "test").
-        estimate: the fit.
-        settings: resolved configuration, YAML.
-        hyperparameters: for the HParams tab.
-        figures: by tag.
+    Steps of a descent are its epochs; a fit in one go has step 0, the URDF's parameters, and step 1, the identified.
     """
-    with SummaryWriter(str(folder)) as writer:
-        layout = {
-            "errors, share of measured (step 0: URDF, step 1: identified)": {
-                group: ["Multiline", [f"relative_error_{name}/{group}" for name in sets]] for group in GROUPS
-            }
+
+    def __init__(self, folder: Path, bodies: Sequence[str], descent: bool, since: int | None = None) -> None:
+        """Open a new event file.
+
+        Args:
+            folder: where it goes.
+            bodies: names of the bodies.
+            descent: whether steps are epochs.
+            since: step from which on what earlier event files in the folder say is void.
+        """
+        self._writer = SummaryWriter(str(folder), purge_step=since)
+        steps = "by epoch" if descent else "step 0: URDF, step 1: identified"
+        groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in _SETS]] for group in GROUPS}
+        loss = {
+            "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
+            "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
         }
-        writer.add_custom_scalars(layout)
-        for name, pair in sets.items():
-            for step, metrics in zip((_NOMINAL_STEP, _IDENTIFIED_STEP), pair, strict=True):
-                for group in GROUPS:
-                    if metrics.relative[group] is not None:
-                        writer.add_scalar(f"relative_error_{name}/{group}", metrics.relative[group], step)
-                    if metrics.rms[group] is not None:
-                        writer.add_scalar(f"rms_error_{name}/{group}", metrics.rms[group], step)
-        writer.add_scalar("fit/residual_std", estimate.residual_std, _IDENTIFIED_STEP)
-        writer.add_scalar("fit/rank", estimate.rank, _IDENTIFIED_STEP)
+        least = {"smallest eigenvalue": ["Multiline", [f"eigenvalue/{re.escape(name)}$" for name in bodies]]}
+        layout = {f"errors, share of measured ({steps})": groups, f"bodies ({steps})": least}
+        self._writer.add_custom_scalars(layout | ({"loss (by epoch)": loss} if descent else {}))
+
+    def __enter__(self) -> RunEvents:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.close()
+
+    def errors(self, step: int, sets: Mapping[str, Metrics]) -> None:
+        """Errors by group of rows of one parameter vector on sets of logs."""
+        for name, metrics in sets.items():
+            for group in GROUPS:
+                if metrics.relative[group] is not None:
+                    self._writer.add_scalar(f"relative_error_{name}/{group}", metrics.relative[group], step)
+                if metrics.rms[group] is not None:
+                    self._writer.add_scalar(f"rms_error_{name}/{group}", metrics.rms[group], step)
+
+    def eigenvalues(self, step: int, least: Mapping[str, float]) -> None:
+        """Smallest eigenvalue of the scaled pseudo-inertia by body; negative: no such body exists."""
+        for body, value in least.items():
+            self._writer.add_scalar(f"eigenvalue/{body}", value, step)
+
+    def epoch(self, epoch: Epoch) -> None:
+        """What an epoch of a descent says of itself."""
+        scalars = {f"loss/{name}": value for name, value in epoch.losses.items()}
+        if epoch.held_out is not None:
+            scalars["loss_held_out/data"] = epoch.held_out
+        scalars |= {f"share_of_force/{name}": value for name, value in epoch.shares.items()}
+        scalars["closed_form/objective_above_least"] = epoch.objective / epoch.closed_form - 1.0
+        scalars["closed_form/distance"] = epoch.distance
+        scalars["descent/learning_rate"] = epoch.learning_rate
+        scalars["descent/samples_per_second"] = epoch.samples_per_second
+        for tag, value in scalars.items():
+            self._writer.add_scalar(tag, value, epoch.number)
+
+    def fit(self, step: int, estimate: Estimate, objective_above_least: float | None) -> None:
+        """Figures of the fit; `objective_above_least`: share by which its objective is above that of least squares."""
+        scalars = {"residual_std": estimate.residual_std, "rank": estimate.rank}
         if estimate.rank:
-            writer.add_scalar("fit/condition_number", estimate.condition_number, _IDENTIFIED_STEP)
-        writer.add_text("config", "    " + settings.replace("\n", "\n    "))
+            scalars["condition_number"] = estimate.condition_number
+        for name, value in scalars.items():
+            self._writer.add_scalar(f"fit/{name}", value, step)
+        if objective_above_least is not None:
+            self._writer.add_scalar("closed_form/objective_above_least", objective_above_least, step)
+
+    def close_with(
+        self,
+        settings: str,
+        hyperparameters: Mapping[str, str | float | bool],
+        final: Mapping[str, float],
+        figures: Mapping[str, Figure],
+        step: int,
+    ) -> None:
+        """What a finished run adds.
+
+        Args:
+            settings: resolved configuration, YAML.
+            hyperparameters: for the HParams tab.
+            final: metrics beside them.
+            figures: by tag.
+            step: of the figures.
+        """
+        self._writer.add_text("config", "    " + settings.replace("\n", "\n    "))
         for tag, figure in figures.items():
-            writer.add_figure(tag, figure, close=False)
-        final = {
-            f"final/{name}_{group}": value
-            for name, (_, identified) in sets.items()
-            for group, value in identified.relative.items()
-            if value is not None
-        }
-        writer.add_hparams(dict(hyperparameters), final or {"final/rank": estimate.rank}, run_name="hparams")
+            self._writer.add_figure(tag, figure, step, close=False)
+        named = {f"final/{name}": value for name, value in final.items()}
+        self._writer.add_hparams(dict(hyperparameters), named, run_name="hparams")
 
 
 def write_comparison(

@@ -1,6 +1,7 @@
 """Commands: whole runs from files to folders."""
 
 from torchid.run.evaluate import evaluate
-from torchid.run.identify import Identification, identify
+from torchid.run.identify import identify
+from torchid.run.results import Identification
 
 __all__ = ["Identification", "evaluate", "identify"]

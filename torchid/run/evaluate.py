@@ -15,8 +15,8 @@ from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.parameters_json import read_parameters
 from torchid.run.experiment import set_up
 from torchid.run.folder import check_free, new_folder, write_json
-from torchid.run.identify import forces_of
 from torchid.run.progress import progress_bars
+from torchid.run.results import forces_of
 
 
 def evaluate(

@@ -30,7 +30,9 @@ class FolderKind:
 
 
 _RESULTS = ("parameters.json", "metrics.json", "identified.urdf", "forces.png", "errors.png", "parameters.png")
-RUN = FolderKind("run", "config.yaml", (*_RESULTS, "hparams", "evaluation", "events.out.tfevents*"))
+EVENTS = "events.out.tfevents*"
+RUN = FolderKind("run", "config.yaml", (*_RESULTS, "hparams", "evaluation", EVENTS))
+TRAINING = FolderKind("training", "config.yaml", ("checkpoint.pt", ".checkpoint.pt", EVENTS))
 SIMULATION = FolderKind("simulation", "simulation.yaml", ("logs", "exact", "nominal.urdf", "stability.json"))
 
 STUDY = FolderKind("study", "results.json", ("tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard"))

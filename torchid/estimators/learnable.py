@@ -1,0 +1,150 @@
+"""Parameters that an optimizer moves: a raw vector, a preconditioner, and a map that may keep every body physical."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchid import parameters
+from torchid.parameters import PER_BODY
+from torchid.problem.linear import LinearProblem
+
+_LEAST_FRICTION = 0.01  # of its scale: where friction starts if the URDF has none, since 0 is out of reach
+_LEAST_EIGENVALUE = 1e-3  # above the margin, where the URDF's body is not that far inside
+
+
+class LearnableParameters(nn.Module, ABC):
+    """phi, (12 L,), as a function of `raw`, which is 0 at the nominal parameters.
+
+    `raw` counts in units in which the compressed problem's Hessian is near the identity: what is mapped to phi is
+    `preconditioner @ raw`.
+    """
+
+    nominal: Tensor
+    scale: Tensor
+    free: Tensor
+    preconditioner: Tensor
+
+    def __init__(self, problem: LinearProblem, size: int) -> None:
+        """Start at the nominal parameters, without a preconditioner.
+
+        Args:
+            problem: whose nominal parameters, scale and free parameters are used.
+            size: numbers in `raw`.
+        """
+        super().__init__()
+        self.register_buffer("nominal", torch.from_numpy(problem.nominal.copy()))
+        self.register_buffer("scale", torch.from_numpy(problem.scale.copy()))
+        self.register_buffer("free", torch.from_numpy(problem.free.copy()))
+        self.register_buffer("preconditioner", torch.eye(size, dtype=torch.float64))
+        self.raw = nn.Parameter(torch.zeros(size, dtype=torch.float64))
+
+    @abstractmethod
+    def constrained(self, u: Tensor) -> Tensor:
+        """phi, (12 L,), at `preconditioner @ raw`, (size,)."""
+
+    def forward(self) -> Tensor:
+        """phi, (12 L,)."""
+        return self.constrained(self.preconditioner @ self.raw)
+
+    def precondition(self, problem: LinearProblem, ridge: float, damping: float) -> None:
+        """Set the preconditioner to (H + damping I)^(-1/2).
+
+        H is the Gauss-Newton Hessian at the nominal parameters of the mean squared residual plus ridge, in the
+        variables of `constrained`. Without it a problem of condition number 1e5 takes first-order methods some 1e10
+        steps; without the damping, directions that the data hardly see would be stretched until no step is safe.
+        """
+        start = torch.zeros_like(self.raw)
+        slopes = torch.autograd.functional.jacobian(self.constrained, start, vectorize=True).cpu()
+        data = torch.from_numpy(problem.A) @ slopes
+        pull = slopes / self.scale.cpu()[:, None]
+        hessian = 2.0 * (data.T @ data / max(problem.rows, 1) + ridge * pull.T @ pull)
+        values, vectors = torch.linalg.eigh(hessian)
+        self.preconditioner.copy_(vectors @ ((values.clamp_min(0.0) + damping).rsqrt()[:, None] * vectors.T))
+
+    def by_body(self, phi: Tensor) -> Tensor:
+        """Parameters in units of their scale, (L, 12)."""
+        return (phi / self.scale).unflatten(0, (-1, PER_BODY))
+
+
+class FreeParameters(LearnableParameters):
+    """Any phi: `raw` moves it along straight lines."""
+
+    def __init__(self, problem: LinearProblem) -> None:
+        """Start at the nominal parameters."""
+        super().__init__(problem, int(problem.free.sum()))
+
+    def constrained(self, u: Tensor) -> Tensor:
+        """Nominal parameters plus `u` in units of the scale."""
+        return self.nominal.masked_scatter(self.free, self.nominal[self.free] + self.scale[self.free] * u)
+
+
+class LogCholeskyParameters(LearnableParameters):
+    """Only phi of bodies that can exist: scaled pseudo-inertias above a margin, positive friction.
+
+    J = margin I + R R^T with R = R_0 M, where R_0 is the Cholesky factor at the nominal parameters and M is lower
+    triangular with the logarithms of its diagonal and its other entries as coordinates, so that M is the identity where
+    they are 0. Friction is a softplus.
+
+    Source: Rucker, Wensing, "Smooth parameterization of rigid-body inertia", RA-L 2022.
+    """
+
+    root: Tensor
+    friction_start: Tensor
+
+    def __init__(self, problem: LinearProblem, margin: float = 1e-4) -> None:
+        """Start at the nominal parameters, or the nearest eigenvalues inside.
+
+        Args:
+            problem: the problem.
+            margin: least eigenvalue of every free body's scaled pseudo-inertia.
+
+        Raises:
+            ValueError: inertial parameters that are not free body by body.
+        """
+        free = problem.free.reshape(-1, PER_BODY)
+        inertial = free[:, parameters.INERTIAL]
+        if (inertial.any(axis=1) != inertial.all(axis=1)).any():
+            raise ValueError("free: found a body of which part is free; accepted: inertial parameters body by body")
+        bodies = np.flatnonzero(inertial.all(axis=1))
+        super().__init__(problem, parameters.INERTIAL.stop * len(bodies) + int(free[:, parameters.FRICTION].sum()))
+        self.margin = margin
+        scaled = (problem.nominal / problem.scale).reshape(-1, PER_BODY)
+        values, vectors = np.linalg.eigh(parameters.pseudo_inertia(scaled[bodies]))
+        above = np.maximum(values - margin, _LEAST_EIGENVALUE)
+        nominal = torch.from_numpy((vectors * above[:, None]) @ vectors.transpose(0, 2, 1))
+        self.register_buffer("root", torch.linalg.cholesky(nominal))
+        self.register_buffer("_from_pseudo", torch.from_numpy(_from_pseudo_inertia()))
+        rows, columns = np.tril_indices(4)
+        self.register_buffer("_rows", torch.from_numpy(rows))
+        self.register_buffer("_columns", torch.from_numpy(columns))
+        moving = np.zeros(free.shape, dtype=bool)
+        moving[bodies, parameters.INERTIAL] = True
+        self.register_buffer("_inertial", torch.from_numpy(moving.ravel()))
+        self.register_buffer("_frictional", torch.from_numpy((free & ~moving).ravel()))
+        start = np.maximum(scaled.ravel()[(free & ~moving).ravel()], _LEAST_FRICTION)
+        self.register_buffer("friction_start", torch.from_numpy(np.log(np.expm1(start))))
+
+    def constrained(self, u: Tensor) -> Tensor:
+        """Parameters of the bodies with log-Cholesky coordinates `u`, ten by body, then friction."""
+        bodies = len(self.root)
+        coordinates = u[: parameters.INERTIAL.stop * bodies].unflatten(0, (bodies, -1))
+        rows, columns = self.get_buffer("_rows"), self.get_buffer("_columns")
+        entries = torch.where(rows == columns, coordinates.exp(), coordinates)
+        M = entries.new_zeros(bodies, 4, 4)
+        M[:, rows, columns] = entries
+        R = self.root @ M
+        J = R @ R.mT + self.margin * torch.eye(4, dtype=u.dtype, device=u.device)
+        ten = J.flatten(1) @ self.get_buffer("_from_pseudo").T
+        friction = nn.functional.softplus(u[parameters.INERTIAL.stop * bodies :] + self.friction_start)
+        inertial, frictional = self.get_buffer("_inertial"), self.get_buffer("_frictional")
+        phi = self.nominal.masked_scatter(inertial, ten.flatten() * self.scale[inertial])
+        return phi.masked_scatter(frictional, friction * self.scale[frictional])
+
+
+def _from_pseudo_inertia() -> np.ndarray:
+    """Matrix (10, 16) that takes a flattened pseudo-inertia to ten inertial numbers."""
+    return np.linalg.pinv(parameters.pseudo_inertia(np.eye(parameters.INERTIAL.stop)).reshape(-1, 16).T)

@@ -1,0 +1,122 @@
+"""Shuffled mini-batches of projected rows, several logs and contact states mixed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from torchid.problem.chunks import by_state
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples
+from torchid.problem.threads import one_thread
+
+_CHUNK = 1024  # samples whose rows are computed together: a batch alone would lose to dispatch
+_MEMORY = 2**30  # bytes of rows that are kept from epoch to epoch
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Projected and whitened rows of B samples: `K @ (columns @ phi)` is to equal `f`.
+
+    Attributes:
+        K: (B, nv, P'), `W^T K`, in the columns of the `MiniBatches` it came from; rows of zeros where there are fewer.
+        f: (B, nv), `W^T f`, in standard deviations of the sensor noise.
+        W: (B, nv, nv), takes any further generalized force (B, nv) [N, N m] to the rows: `W^T r`.
+        q, v, a: generalized coordinates as in `Samples.coordinates`.
+    """
+
+    K: Tensor
+    f: Tensor
+    W: Tensor
+    q: Tensor
+    v: Tensor
+    a: Tensor
+
+    def __len__(self) -> int:
+        return len(self.f)
+
+    @property
+    def rows(self) -> int:
+        """Rows that are not zero."""
+        return int(self.W.any(dim=1).sum())
+
+    def __getitem__(self, index: slice | Tensor) -> Batch:
+        """Some of the samples."""
+        return Batch(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all its tensors."""
+        return sum(getattr(self, field.name).nbytes for field in fields(self))
+
+
+class MiniBatches:
+    """Mini-batches of some logs.
+
+    Samples are dealt out at random, once, to chunks whose rows are computed together and kept if there is memory. An
+    epoch takes the chunks, and the samples within each, in a new order that depends on the seed and its number alone.
+    """
+
+    def __init__(
+        self, logs: Sequence[Samples], builder: RowBuilder, batch_size: int = 256, seed: int = 0, memory: int = _MEMORY
+    ) -> None:
+        """Deal the samples out.
+
+        Args:
+            logs: bound logs.
+            builder: of the rows; where it is, the batches are.
+            batch_size: samples per batch; the last of a chunk may hold fewer.
+            seed: of all random orders.
+            memory: bytes of rows to keep; what does not fit is computed anew each epoch.
+        """
+        if batch_size < 1:
+            raise ValueError(f"batch_size: found {batch_size}; accepted: at least 1")
+        self.builder, self.batch_size, self.seed = builder, batch_size, seed
+        self.columns = torch.from_numpy(builder.columns.from_parameters()).to(builder.device)
+        self.samples = sum(map(len, logs))
+        self._logs = tuple(logs)
+        self._starts = torch.tensor([0, *(len(log) for log in logs)]).cumsum(0).tolist()
+        chunk = max(_CHUNK // batch_size, 1) * batch_size
+        self._chunks = torch.randperm(self.samples, generator=self._generator(0)).split(chunk)
+        self._kept: dict[int, Batch] = {}
+        self._left = memory
+
+    def epoch(self, number: int) -> Iterator[Batch]:
+        """All samples in the order of an epoch, numbered from 1."""
+        generator = self._generator(number)
+        for chunk in torch.randperm(len(self._chunks), generator=generator).tolist():
+            order = torch.randperm(len(self._chunks[chunk]), generator=generator)
+            rows = self._rows(chunk)
+            for part in order.to(rows.f.device).split(self.batch_size):
+                yield rows[part]
+
+    def chunks(self) -> Iterator[Batch]:
+        """All samples, chunk by chunk, always the same."""
+        return (self._rows(chunk) for chunk in range(len(self._chunks)))
+
+    def _generator(self, number: int) -> torch.Generator:
+        return torch.Generator().manual_seed((self.seed * 1_000_003 + number) % 2**63)
+
+    def _rows(self, chunk: int) -> Batch:
+        if chunk in self._kept:
+            return self._kept[chunk]
+        batch = self._computed(self._chunks[chunk])
+        if batch.nbytes <= self._left:
+            self._left -= batch.nbytes
+            self._kept[chunk] = batch
+        return batch
+
+    @torch.no_grad()
+    def _computed(self, index: Tensor) -> Batch:
+        parts = []
+        with one_thread():
+            for log, start, end in zip(self._logs, self._starts, self._starts[1:], strict=False):
+                samples = log[index[(index >= start) & (index < end)] - start].to(self.builder.device)
+                for state, where in by_state(samples, len(index)):
+                    chosen = samples[where]
+                    rows, W = self.builder.rows_by_sample(chosen, state)
+                    parts.append(Batch(rows[..., :-1], rows[..., -1], W, *chosen.coordinates()))
+        return Batch(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Batch)))

@@ -1,0 +1,191 @@
+"""What a finished identification holds, and the folder it is written to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from torchid.config import ExperimentConfig, dump_config
+from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
+from torchid.parameters import PER_BODY, Array
+from torchid.problem import Samples
+from torchid.problem.predict import force_series
+from torchid.problem.states import StateReport
+from torchid.report.figures import ForceSeries, error_figure, force_figure, parameter_figure
+from torchid.report.metrics import Evaluation, Metrics
+from torchid.report.parameters_json import parameters_document
+from torchid.report.tensorboard import RunEvents
+from torchid.report.urdf_export import identified_urdf
+from torchid.robot import Robot
+from torchid.run.experiment import Experiment
+from torchid.run.folder import new_folder, write_json
+from torchid.run.training import Training, body_eigenvalues
+
+SETS = ("train", "test")
+"""Sets of logs that errors are given for."""
+
+_PLOTTED_SAMPLES = 3000
+
+
+@dataclass(frozen=True)
+class Identification:
+    """A finished run: the fit, and nominal and identified metrics by set of logs ("train", "test")."""
+
+    experiment: Experiment
+    estimate: Estimate
+    states: list[StateReport]
+    metrics: dict[str, tuple[Metrics, Metrics]]
+    seconds: dict[str, float]
+    samples: int
+
+    @property
+    def phi(self) -> Array:
+        """Identified parameters, (L, 12)."""
+        return self.estimate.phi.reshape(-1, PER_BODY)
+
+
+def candidates(robot: Robot, phi: Array) -> Array:
+    """Nominal and identified parameters, (2, 12 L), from the latter (12 L,)."""
+    return np.stack([robot.nominal.flatten(), phi])
+
+
+def write_run(run: Identification, evaluation: Evaluation, shown: Samples, training: Training | None) -> None:
+    """Write the run folder.
+
+    Args:
+        run: what to write.
+        evaluation: for the predicted forces.
+        shown: log of the figure of forces.
+        training: whose curves go into the folder, and whose checkpoint is then no longer needed.
+    """
+    config, robot = run.experiment.config, run.experiment.robot
+    figures = {
+        "forces": forces_of(evaluation, shown, candidates(robot, run.estimate.phi), robot),
+        "errors": error_figure(run.metrics),
+        "parameters": parameter_figure(
+            robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
+        ),
+    }
+    with new_folder(config.output, config.overwrite) as folder:
+        (folder / "config.yaml").write_text(dump_config(config))
+        write_json(folder / "parameters.json", parameters_document(robot, run.estimate))
+        write_json(folder / "metrics.json", metrics_document(run))
+        (folder / "identified.urdf").write_bytes(identified_urdf(robot, run.phi))
+        for name, figure in figures.items():
+            figure.savefig(folder / f"{name}.png", dpi=130)
+        if training is not None:
+            training.copy_curves(folder)
+        _write_curves(run, folder, figures)
+    if training is not None:
+        training.forget()
+
+
+def forces_of(evaluation: Evaluation, samples: Samples, phi: Array, robot: Robot) -> Figure:
+    """The figure of measured forces of a log's first samples, and those of nominal and identified phi, (2, 12 L)."""
+    part = samples[:_PLOTTED_SAMPLES]
+    measured, (nominal, identified) = force_series(evaluation.builder, part, phi)
+    series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured, nominal, identified)
+    return force_figure(series, robot.joint_names, robot.base_rows)
+
+
+def metrics_document(run: Identification) -> dict[str, object]:
+    """What `metrics.json` holds: errors of the identified parameters, and of the nominal ones beside them."""
+    estimate, robot = run.estimate, run.experiment.robot
+    document: dict[str, object] = {}
+    for name in SETS:
+        pair = run.metrics.get(name)
+        document[name] = None if pair is None else pair[1].as_dict()
+        document[f"{name}_nominal"] = None if pair is None else pair[0].as_dict()
+    variation = {name: pair[1].base_force_of_variation for name, pair in run.metrics.items()}
+    return document | {
+        "base_force_rms_of_variation": variation,
+        "rank": estimate.rank,
+        "parameters": int(estimate.phi.size),
+        "condition_number": estimate.condition_number if estimate.rank else None,
+        "samples": run.samples,
+        "rows": estimate.rows,
+        "residual_std": estimate.residual_std,
+        "total_mass": float(run.phi[:, 0].sum()),
+        "total_mass_nominal": float(robot.nominal[:, 0].sum()),
+        "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
+        "solution": _solution_document(estimate),
+        "contact_states": [asdict(state) for state in run.states],
+        "seconds": run.seconds,
+    }
+
+
+def _solution_document(estimate: Estimate) -> dict[str, object] | None:
+    """What is known of the optimum, or of the descent."""
+    if isinstance(estimate, ConsistentEstimate):
+        return {
+            "objective": estimate.objective,
+            "unconstrained_objective": estimate.unconstrained,
+            "gap": estimate.gap,
+            "certified_gap": estimate.certified_gap,
+            "steps": estimate.steps,
+        }
+    if isinstance(estimate, SgdEstimate):
+        return {
+            "objective": estimate.objective,
+            "unconstrained_objective": estimate.unconstrained,
+            "epochs": estimate.epochs,
+            "best_epoch": estimate.best_epoch,
+        }
+    return None
+
+
+def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figure]) -> None:
+    estimate, robot, config = run.estimate, run.experiment.robot, run.experiment.config
+    above = objective_above_least(estimate)
+    descent = isinstance(estimate, SgdEstimate)
+    last = estimate.epochs if isinstance(estimate, SgdEstimate) else 1
+    with RunEvents(folder, robot.body_names, descent) as events:
+        if not descent:
+            for step, phi in enumerate(candidates(robot, estimate.phi)):
+                events.errors(step, {name: pair[step] for name, pair in run.metrics.items()})
+                events.eigenvalues(step, body_eigenvalues(robot, phi))
+        events.fit(last, estimate, above)
+        final = {
+            f"{name}_{group}": value
+            for name, (_, identified) in run.metrics.items()
+            for group, value in identified.relative.items()
+            if value is not None
+        }
+        final |= {"rank": float(estimate.rank)} | ({} if above is None else {"objective_above_least": above})
+        events.close_with(dump_config(config), _hyperparameters(config), final, figures, last)
+
+
+def objective_above_least(estimate: Estimate) -> float | None:
+    """Share by which the objective is above the least without conditions; None where that is not known."""
+    if not isinstance(estimate, (ConsistentEstimate, SgdEstimate)) or not estimate.unconstrained:
+        return None
+    return estimate.objective / estimate.unconstrained - 1.0
+
+
+def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
+    estimator = config.estimator
+    values: dict[str, str | float | bool] = {
+        "sensors": config.sensors.set or "by name",
+        "estimator": estimator.name,
+        "ridge": estimator.ridge,
+        "friction": estimator.friction,
+        "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
+    }
+    if estimator.name == "consistent":
+        values |= {"prior": estimator.prior, "margin": estimator.margin}
+    if estimator.name == "sgd":
+        training = estimator.training
+        values |= {
+            "consistency": estimator.consistency,
+            "optimizer": training.optimizer["name"],
+            "lr": float(training.optimizer.get("lr", 0.0)),
+            "schedule": (training.schedule or {}).get("name", "none"),
+            "batch_size": training.batch_size,
+            "epochs": training.epochs,
+            "seed": training.seed,
+        }
+    return values

@@ -1,0 +1,229 @@
+"""A descent as part of a run: progress, curves and checkpoints while it goes on, and going on after an interruption."""
+
+from __future__ import annotations
+
+import shutil
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.progress import Progress
+
+from torchid import parameters
+from torchid.config import ExperimentConfig, dump_config
+from torchid.errors import ConfigError, InputError, TorchidWarning
+from torchid.estimators import Epoch, PenaltyWeights, Sgd, SgdEstimate, Trainer
+from torchid.parameters import Array
+from torchid.problem import LinearProblem, MiniBatches, RowBuilder, Samples
+from torchid.problem.linear import parameter_scale
+from torchid.report.metrics import Metrics
+from torchid.report.tensorboard import RunEvents
+from torchid.robot import Robot
+from torchid.run.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
+from torchid.run.folder import EVENTS, TRAINING, check_free
+
+Evaluate = Callable[[Array], Mapping[str, Metrics]]
+
+_FREE_TO_CHANGE = ("output", "overwrite")
+_SAME = 1e-9  # relative: the logs of a checkpoint, up to rounding
+
+
+def training_folder(output: Path) -> Path:
+    """Where a run that trains keeps checkpoint and curves until it is done."""
+    return output.with_name(f"{output.name}.training")
+
+
+def check_training(config: ExperimentConfig, resume: bool, source: object) -> None:
+    """Make sure, before any work, that a training may start or go on.
+
+    Raises:
+        ConfigError: nothing to go on with, or an unfinished training in the way.
+    """
+    folder, output = training_folder(config.output), config.output
+    if config.estimator.name != "sgd":
+        if resume:
+            found = f"{config.estimator.name}, which is done in one go"
+            raise ConfigError(source, "--resume", found, "estimator.name: sgd, or no --resume")
+        return
+    waiting = (folder / CHECKPOINT).is_file()
+    if resume and not waiting:
+        if output.exists() and not config.overwrite:
+            raise ConfigError(output, "--resume", "a finished run", "an unfinished one, or overwrite=true")
+        message = f"{folder}: no checkpoint to go on from; training starts at the beginning"
+        warnings.warn(message, TorchidWarning, stacklevel=3)
+    elif waiting and not resume and not config.overwrite:
+        raise ConfigError(folder, "output", "an unfinished training", "--resume, overwrite=true, or another output")
+    if not waiting or not resume:
+        check_free(folder, config.overwrite, TRAINING)
+
+
+class Training:
+    """The descent of one run, which leaves its state in a folder of its own until the run is done."""
+
+    def __init__(self, config: ExperimentConfig, robot: Robot, source: object = "experiment") -> None:
+        """Fix the settings.
+
+        Raises:
+            InputError: optimizer, schedule or a number that cannot be.
+        """
+        self.config, self.robot, self.source = config, robot, source
+        self.folder = training_folder(config.output)
+        self.settings = descent_settings(config, source)
+
+    def run(
+        self,
+        problem: LinearProblem,
+        builder: RowBuilder,
+        logs: Mapping[str, Sequence[Samples]],
+        evaluate: Evaluate,
+        bars: Progress,
+        resume: bool,
+    ) -> SgdEstimate:
+        """Train until finished; what is interrupted can be resumed.
+
+        Args:
+            problem: compressed training logs, with what is free.
+            builder: of their rows.
+            logs: "train" and "validation".
+            evaluate: metrics on sets of logs, of one parameter vector (12 L,).
+            bars: for the progress.
+            resume: whether to go on from the checkpoint, if there is one.
+
+        Raises:
+            InputError: the checkpoint belongs to other settings or logs; the descent diverged.
+            KeyboardInterrupt: says how to go on.
+        """
+        training = self.config.estimator.training
+        train, held_out = (
+            MiniBatches(logs[name], builder, training.batch_size, training.seed) if logs[name] else None
+            for name in ("train", "validation")
+        )
+        assert train is not None  # noqa: S101  # an experiment has training logs
+        trainer = Trainer(self.settings, problem, train, held_out)
+        self._prepare(trainer, resume)
+        bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
+        with RunEvents(self.folder, self.robot.body_names, True, trainer.epoch + 1) as events:
+            if trainer.epoch == 0:
+                self._evaluate(0, trainer.phi(), evaluate, events)
+                self._save(trainer)
+            with self._interruptible(trainer):
+                self._train(trainer, evaluate, events, lambda text: bars.update(bar, advance=1, description=text))
+        return trainer.estimate()
+
+    def copy_curves(self, folder: Path) -> None:
+        """Copy the event files into the finished run's folder."""
+        for path in self.folder.glob(EVENTS):
+            shutil.copy2(path, folder)
+
+    def forget(self) -> None:
+        """Remove the checkpoint of a run that is done."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _train(self, trainer: Trainer, evaluate: Evaluate, events: RunEvents, progress: Callable[[str], None]) -> None:
+        training = self.config.estimator.training
+        saved = time.monotonic()
+        while not trainer.finished:
+            epoch = trainer.run_epoch()
+            events.epoch(epoch)
+            if epoch.number % training.evaluate_every == 0 or trainer.finished:
+                self._evaluate(epoch.number, trainer.phi(), evaluate, events)
+            if time.monotonic() - saved >= training.checkpoint_seconds or trainer.finished:
+                self._save(trainer)
+                saved = time.monotonic()
+            progress(_described(epoch))
+
+    def _evaluate(self, step: int, phi: Array, evaluate: Evaluate, events: RunEvents) -> None:
+        events.errors(step, evaluate(phi))
+        events.eigenvalues(step, body_eigenvalues(self.robot, phi))
+
+    def _prepare(self, trainer: Trainer, resume: bool) -> None:
+        """Start a new folder, or take up what is in it."""
+        if resume and (self.folder / CHECKPOINT).is_file():
+            state = load_checkpoint(self.folder)
+            self._check(state, trainer)
+            trainer.load_state_dict(state["trainer"])
+            return
+        if self.folder.exists():
+            check_free(self.folder, True, TRAINING)
+            shutil.rmtree(self.folder)
+        self.folder.mkdir(parents=True)
+        (self.folder / "config.yaml").write_text(dump_config(self.config))
+
+    def _save(self, trainer: Trainer) -> None:
+        state = {"config": dump_config(self.config), "logs": _fingerprint(trainer), "trainer": trainer.state_dict()}
+        save_checkpoint(self.folder, state)
+        self.saved = trainer.epoch
+
+    def _check(self, state: Mapping[str, Any], trainer: Trainer) -> None:
+        path = self.folder / CHECKPOINT
+        if set(state) != {"config", "logs", "trainer"}:
+            raise InputError(path, "file", "not a checkpoint of a run", "one that torchid identify wrote")
+        before, now = (yaml.safe_load(text) for text in (state["config"], dump_config(self.config)))
+        for place, old, new in _differences(before, now):
+            if place not in _FREE_TO_CHANGE:
+                raise ConfigError(self.source, place, f"{new}, but the checkpoint has {old}", "the same settings")
+        rows, cost = _fingerprint(trainer)
+        if state["logs"][0] != rows or abs(state["logs"][1] - cost) > _SAME * cost:
+            raise ConfigError(self.source, "logs", "not those of the checkpoint", "the same files, unchanged")
+
+    @contextmanager
+    def _interruptible(self, trainer: Trainer) -> Iterator[None]:
+        try:
+            yield
+        except KeyboardInterrupt as error:
+            stopped = f"interrupted in epoch {trainer.epoch}; --resume goes on after epoch {self.saved}"
+            raise KeyboardInterrupt(stopped) from error
+
+
+def descent_settings(config: ExperimentConfig, source: object = "experiment") -> Sgd:
+    """What an experiment file says of a descent.
+
+    Raises:
+        InputError: an optimizer or schedule that torch does not have or that does not take its options.
+    """
+    estimator, training = config.estimator, config.estimator.training
+    optimizer, schedule = dict(training.optimizer), dict(training.schedule or {})
+    try:
+        return Sgd(
+            ridge=estimator.ridge,
+            consistency=estimator.consistency,
+            margin=estimator.margin,
+            penalties=PenaltyWeights(**vars(estimator.penalties)),
+            optimizer=optimizer.pop("name"),
+            optimizer_options=optimizer,
+            schedule=schedule.pop("name", None),
+            schedule_options=schedule,
+            epochs=training.epochs,
+            patience=training.patience,
+            clip=training.clip,
+            damping=training.damping,
+        )
+    except InputError as error:
+        raise ConfigError(source, f"estimator.training.{error.field}", error.found, error.accepted) from error
+
+
+def body_eigenvalues(robot: Robot, phi: Array) -> dict[str, float]:
+    """Smallest eigenvalue of every body's scaled pseudo-inertia, by name, of parameters (12 L,)."""
+    least = parameters.least_eigenvalues(phi, parameter_scale(robot.nominal).flatten())
+    return {name: float(x) for name, x in zip(robot.body_names, least, strict=True) if x == x}
+
+
+def _described(epoch: Epoch) -> str:
+    return f"training, loss {epoch.losses['data']:.4g}"
+
+
+def _fingerprint(trainer: Trainer) -> tuple[int, float]:
+    return trainer.problem.rows, trainer.problem.cost(trainer.problem.nominal)
+
+
+def _differences(before: Any, now: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Places where two settings differ."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        for key in dict.fromkeys([*before, *now]):
+            yield from _differences(before.get(key), now.get(key), f"{place}.{key}" if place else str(key))
+    elif before != now:
+        yield place, before, now
