@@ -2,8 +2,10 @@
 
     python scripts/benchmark.py [--samples 65536] [--repeats 5]
 
-Needs the packages pin and example-robot-data (extra `[oracle]`). Both pipelines start from the arrays of a log and end
-with parameters, `joints` sensors: torques measured, contact forces not, two thirds of the samples on all feet.
+Needs the packages pin and example-robot-data (extra `[oracle]`), CVXPY and Clarabel (extra `[certified]`). Pipelines
+start from the arrays of a log and end with parameters, `joints` sensors: torques measured, contact forces not, two
+thirds of the samples on all feet. Consistent parameters are timed on a log of Solo12 that a robot with other, possible
+parameters could have left, with noise.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +25,11 @@ from rich.console import Console
 from rich.table import Table
 
 from torchid.errors import TorchidWarning
-from torchid.estimators import LeastSquares
-from torchid.parameters import Array
+from torchid.estimators import Consistent, LeastSquares
+from torchid.parameters import FRICTION, Array, perturbed
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.rows import ChunkTerms
-from torchid.regressor import Regressor
+from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
@@ -152,6 +154,59 @@ class PerSample:
             pin.computeJointTorqueRegressor(self.model, self.data, *x)
 
 
+def torques_of(robot: Robot, case: Case, samples: Samples, phi: Array, noise: float) -> Samples:
+    """The same motion with the torques and unseen foot forces of a robot with parameters (12 L,), and noise [N m]."""
+    regressor, feet = Regressor(robot), [FrameJacobian(robot, foot) for foot in case.feet]
+    rows = 3 if case.kind == "point" else 6
+    rng, torques = torch.Generator().manual_seed(1), []
+    for start in range(0, len(samples), 1024):
+        part = samples[start : start + 1024]
+        q, v, a = part.coordinates()
+        needed = regressor(q, v, a) @ torch.from_numpy(phi)
+        J = torch.cat([foot(q)[:, :rows] for foot in feet], dim=1)
+        J = J * part.active.repeat_interleave(rows, dim=1)[..., None]
+        carried = (torch.linalg.pinv(J[:, :, :6].mT) @ needed[:, :6, None]).mT @ J
+        torques.append(needed[:, 6:] - carried[:, 0, 6:])
+    exact = torch.cat(torques)
+    noisy = exact + noise * torch.randn(exact.shape, generator=rng, dtype=exact.dtype)
+    return replace(samples, torque=noisy)
+
+
+def measure_consistent(count: int, repeats: int) -> dict[str, float]:
+    """Median seconds from the arrays of a log of Solo12 to parameters."""
+    case = CASES[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        robot = load_robot(robots_folder() / case.urdf)
+    contacts = [Contact(foot, case.kind) for foot in case.feet]
+    noise = 0.1
+    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts), SensorNoise(noise)))
+    phi = perturbed(robot.nominal, 0.2, np.random.default_rng(0))
+    phi[1:, FRICTION] = 0.1
+    samples = torques_of(robot, case, random_samples(robot, len(contacts), count), phi.flatten(), noise)
+    estimators: dict[str, LeastSquares | Consistent] = {
+        "least squares": LeastSquares(1e-4),
+        "consistent, barrier": Consistent(1e-4),
+        "consistent, certified": Consistent(1e-4, method="certified"),
+    }
+
+    def pipeline(estimator: LeastSquares | Consistent) -> Callable[[], object]:
+        return lambda: estimator.solve(linear_problem(compress([samples], builder), builder, robot))
+
+    return medians({name: (pipeline(estimator), 10**6) for name, estimator in estimators.items()}, repeats)
+
+
+def medians(contestants: dict[str, tuple[Callable[[], object], int]], repeats: int) -> dict[str, float]:
+    """Median microseconds per sample; all contestants take turns, so that a busy machine slows them alike."""
+    times: dict[str, list[float]] = {name: [] for name in contestants}
+    for work, _ in contestants.values():
+        work()
+    for _ in range(repeats):
+        for name, (work, size) in contestants.items():
+            times[name].append(microseconds(work, size))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
 def microseconds(work: Callable[[], object], samples: int) -> float:
     """Wall time per sample of one call."""
     start = time.perf_counter()
@@ -160,7 +215,7 @@ def microseconds(work: Callable[[], object], samples: int) -> float:
 
 
 def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
-    """Medians of microseconds per sample; all contestants take turns, so that a busy machine slows them alike."""
+    """Medians of microseconds per sample of one robot."""
     urdf = robots_folder() / case.urdf
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
@@ -193,13 +248,7 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
         "per sample, Gram": (lambda: old.by_gram(few), len(few)),
         "torchid": (pipeline, count),
     }
-    times: dict[str, list[float]] = {name: [] for name in contestants}
-    for work, _ in contestants.values():
-        work()
-    for _ in range(repeats):
-        for name, (work, size) in contestants.items():
-            times[name].append(microseconds(work, size))
-    return {name: statistics.median(values) for name, values in times.items()}
+    return medians(contestants, repeats)
 
 
 def main() -> None:
@@ -210,6 +259,7 @@ def main() -> None:
     arguments = parser.parse_args()
     table = Table(title=f"Median microseconds per sample, {torch.get_num_threads()} threads, float64")
     results = {case.name: measure(case, arguments.samples, arguments.repeats) for case in CASES}
+    measured = measure_consistent(10_500, arguments.repeats)
     table.add_column("")
     for case in CASES:
         table.add_column(case.name, justify="right")
@@ -218,7 +268,13 @@ def main() -> None:
     for name in ("per sample, lstsq", "per sample, Gram"):
         ratios = [results[case.name][name] / results[case.name]["torchid"] for case in CASES]
         table.add_row(f"{name} / torchid", *(f"{ratio:.1f}" for ratio in ratios))
-    Console(width=100).print(table)
+    consistent = Table(title="Seconds from the arrays of 10,500 samples of Solo12 to parameters, friction included")
+    for name in measured:
+        consistent.add_column(name, justify="right")
+    consistent.add_row(*(f"{seconds:.2f}" for seconds in measured.values()))
+    console = Console(width=100)
+    console.print(table)
+    console.print(consistent)
 
 
 if __name__ == "__main__":

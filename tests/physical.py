@@ -133,6 +133,34 @@ def random_parameters_within(
     return other if (least_eigenvalues(other, scale) >= conditions.margin).all() else None
 
 
+def prior_value(prior: str, phi: Array, nominal: Array, scale: Array, reference: Array | None = None) -> float:
+    """What the docstrings say, written out, of bodies (L, 12) that are all free; `reference` for the pull-back."""
+    away = ((phi - nominal) / scale) ** 2
+    if prior == "euclidean":
+        return float(away.sum())
+    value = float(away[:, 10:].sum())
+    for body, urdf, measure in zip(phi, nominal, nominal if reference is None else reference, strict=True):
+        L = np.linalg.cholesky(pseudo(measure))
+        relative = np.linalg.solve(L, np.linalg.solve(L, pseudo(body)).T)  # similar to J_0^-1/2 J J_0^-1/2
+        if prior == "pullback":
+            start = np.linalg.solve(L, np.linalg.solve(L, pseudo(urdf)).T)
+            value += np.sum((relative - start) ** 2)
+        else:
+            value += -np.linalg.slogdet(relative)[1] + np.trace(relative) - 4.0
+    return value
+
+
+def objective(prior: str, ridge: float, problem: LinearProblem, phi: Array) -> float:
+    """Mean squared residual and prior at `phi`, (L, 12)."""
+    nominal, scale = (x.reshape(phi.shape) for x in (problem.nominal, problem.scale))
+    return problem.cost(phi.ravel()) / problem.rows + ridge * prior_value(prior, phi, nominal, scale)
+
+
+def as_good_as_none(ridge: float, problem: LinearProblem) -> float:
+    """The objective below which gaps are relative to this."""
+    return max(1e-8 * problem.cost(np.zeros_like(problem.nominal)) / problem.rows, 1e-3 * ridge)
+
+
 def active_case(seed: int, bodies: int = 2, rows: int = 20) -> tuple[LinearProblem, Array]:
     """Data from bodies that do not exist, so that the margin is active, and the scale (L, 12)."""
     rng = np.random.default_rng(seed)

@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from physical import (
     active_case,
+    as_good_as_none,
     data,
     least_eigenvalues,
     nothing_seen,
+    objective,
     pseudo,
     random_bodies,
     random_case,
@@ -27,7 +29,7 @@ from torchid.errors import InputError
 from torchid.estimators import LeastSquares
 from torchid.estimators.conditions import Conditions, violations
 from torchid.estimators.consistent import Consistent, Method, Prior
-from torchid.problem.linear import LinearProblem, parameter_scale
+from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=10, deadline=None, derandomize=True)
@@ -37,52 +39,48 @@ both = pytest.mark.parametrize("method", METHODS)
 all_priors = pytest.mark.parametrize("prior", PRIORS)
 
 
-def prior_value(prior: Prior, phi: Array, nominal: Array, scale: Array) -> float:
-    """What the docstrings say, written out; every parameter is free."""
-    away = ((phi - nominal) / scale) ** 2
-    if prior == "euclidean":
-        return float(away.sum())
-    value = float(away[:, 10:].sum())
-    for body, urdf in zip(phi, nominal, strict=True):
-        L = np.linalg.cholesky(pseudo(urdf))
-        relative = np.linalg.solve(L, np.linalg.solve(L, pseudo(body)).T)  # similar to J_0^-1/2 J J_0^-1/2
-        if prior == "pullback":
-            value += np.sum((relative - np.eye(4)) ** 2)
-        else:
-            value += -np.linalg.slogdet(relative)[1] + np.trace(relative) - 4.0
-    return value
-
-
-def objective(prior: Prior, ridge: float, problem: LinearProblem, phi: Array) -> float:
-    """Mean squared residual and prior at `phi`, (L, 12)."""
-    nominal, scale = (x.reshape(phi.shape) for x in (problem.nominal, problem.scale))
-    return problem.cost(phi.ravel()) / problem.rows + ridge * prior_value(prior, phi, nominal, scale)
-
-
 # ------------------------------------------------------------------------------------------------------- two solvers
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(seed=seeds, prior=st.sampled_from(PRIORS))
+@example(seed=3628799, prior="euclidean")  # one row that the nominal parameters happen to explain: an optimum of 1e-15
+@example(seed=3628799, prior="entropic")
 def test_both_solvers_find_the_same_optimum_and_meet_every_condition(seed: int, prior: Prior) -> None:
     rng = np.random.default_rng(seed)
     case = random_case(rng)
     ridge = 10.0 ** rng.uniform(-6.0, -1.0)
     fast, sure = (Consistent(ridge, prior, case.conditions, method).solve(case.problem) for method in METHODS)
-    assert fast.objective == pytest.approx(sure.objective, rel=1e-6)
-    for estimate in (fast, sure):
+    floor = as_good_as_none(ridge, case.problem)
+    assert fast.objective == pytest.approx(sure.objective, rel=1e-6, abs=1e-6 * floor)
+    for estimate, outside in ((fast, 1e-12), (sure, 1e-7)):  # Clarabel's iterates end up to 1e-8 outside
         phi = estimate.phi.reshape(case.truth.shape)
-        assert violations(phi, case.scale, case.conditions, 1e-7) == []
+        assert violations(phi, case.scale, case.conditions, max(outside, 1e-9)) == []
         least = least_eigenvalues(phi, case.scale)
-        assert (least >= case.conditions.margin - 1e-7).all()
-        np.testing.assert_allclose(estimate.eigenvalues, least, rtol=0.0, atol=1e-9)
-        assert estimate.objective == pytest.approx(objective(prior, ridge, case.problem, phi), rel=1e-7)
+        assert (least >= case.conditions.margin - outside).all()
+        np.testing.assert_allclose(estimate.eigenvalues, least, rtol=0.0, atol=1e-12)
+        value = objective(prior, ridge, case.problem, phi)
+        assert estimate.objective == pytest.approx(value, rel=1e-7, abs=1e-7 * floor)
+        assert (estimate.unconstrained is None) == (prior == "entropic")
         assert estimate.unconstrained is None or estimate.objective >= estimate.unconstrained * (1.0 - 1e-7)
-    accuracy = 1e-8 * sure.objective  # of Clarabel, whose conditions hold to 1e-9
-    assert 0.0 <= fast.gap <= 1e-6 * fast.objective
-    assert 0.0 <= sure.gap <= 1e-6 * sure.objective
-    assert fast.objective - sure.objective <= fast.gap + accuracy
-    assert sure.objective - fast.objective <= sure.gap + accuracy
+        accuracy = 1e-9 if estimate is fast else 1e-6
+        assert 0.0 <= estimate.gap <= accuracy * max(estimate.objective, floor)
+    outside_gains = 1e-8 * max(sure.objective, floor)
+    assert fast.objective - sure.objective <= fast.gap + outside_gains
+    assert sure.objective - fast.objective <= sure.gap + outside_gains
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+def test_a_quadruped_takes_few_steps(prior: Prior) -> None:
+    """Thirteen bodies, whitened as real data are; seconds are not the matter of a test."""
+    problem, scale = active_case(5, bodies=13, rows=156)
+    problem = replace(problem, A=100.0 * problem.A, b=100.0 * problem.b)
+    conditions = Conditions(total_mass=float(problem.nominal[::12].sum()))
+    estimate = Consistent(1e-4, prior, conditions, certify=True).solve(problem)
+    assert estimate.steps < 100
+    assert estimate.certified_gap is not None
+    assert estimate.certified_gap < 1e-6
+    assert violations(estimate.phi.reshape(scale.shape), scale, conditions) == []
 
 
 @all_priors
@@ -170,9 +168,29 @@ def test_without_active_conditions_it_is_least_squares(method: Method, seed: int
     estimate = Consistent(ridge, "euclidean", Conditions(0.5 * least), method).solve(problem)
     np.testing.assert_allclose(estimate.phi / problem.scale, plain.phi / problem.scale, rtol=0.0, atol=1e-7)
     assert estimate.unconstrained == pytest.approx(estimate.objective, rel=1e-7)
+    assert estimate.price == pytest.approx(0.0, abs=1e-7 * estimate.objective)
     for name in ("standard_error", "identifiable", "rank", "condition_number", "nominal_cost", "rows"):
         np.testing.assert_array_equal(getattr(estimate, name), getattr(plain, name))
     assert estimate.cost == problem.cost(estimate.phi)
+
+
+@all_priors
+@both
+def test_what_the_conditions_cost_is_stated(method: Method, prior: Prior) -> None:
+    """Against the least objective without conditions, found by a general optimizer."""
+    problem, scale = active_case(1, bodies=1, rows=9)
+    nominal = problem.nominal.reshape(scale.shape)
+    estimate = Consistent(1e-2, prior, method=method).solve(problem)
+    if prior == "entropic":  # whose domain is a condition
+        assert estimate.unconstrained is None
+        assert estimate.price is None
+        return
+    found = minimize(
+        lambda x: objective(prior, 1e-2, problem, nominal + scale * x), np.zeros(12), options={"gtol": 1e-9}
+    )
+    assert estimate.unconstrained == pytest.approx(found.fun, rel=1e-7)
+    assert estimate.price == pytest.approx(estimate.objective - found.fun, rel=1e-5)
+    assert estimate.price > 0.01 * estimate.objective  # something is active
 
 
 @pytest.mark.parametrize("ridge", [0.0, 1e-10])
@@ -190,6 +208,19 @@ def test_noise_free_data_of_a_real_robot_are_explained(method: Method, rows: int
     if rows > truth.size:
         off = (estimate.phi - truth.ravel()) / problem.scale
         assert np.abs(off).max() < 1e-5  # condition 10
+
+
+@all_priors
+@both
+def test_data_that_the_nominal_parameters_explain_leave_them(method: Method, prior: Prior) -> None:
+    """An optimum of zero, without a pull, at which nothing is relative to the objective."""
+    rng = np.random.default_rng(11)
+    nominal = random_bodies(rng, 2)
+    nominal[:, 10:] = 0.3
+    problem = data(rng, nominal, nominal, parameter_scale(nominal), 40, 10.0, 0.0)
+    estimate = Consistent(0.0, prior, method=method, certify=True).solve(problem)
+    np.testing.assert_allclose(estimate.phi / problem.scale, problem.nominal / problem.scale, rtol=0.0, atol=1e-6)
+    assert abs(estimate.objective) < 1e-12
 
 
 # ------------------------------------------------------------------------------------------------------------- priors

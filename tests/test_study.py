@@ -2,57 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-import io
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from script_calls import call
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchid.report.metrics import GROUPS, Metrics
 from torchid.study.findings import findings
 from torchid.study.results import NOMINAL, TRUE, Record, Results
 
-ROOT = Path(__file__).resolve().parents[1]
 SETS = ("full", "contacts", "joints", "reduced")
 CONDITIONS = ("exact sensors", "white noise", "bias and gain", "delay", "joint friction", "all")
 TRAINING = ("all runs", "squats alone")
-
-
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("reproduce_paper", ROOT / "scripts" / "reproduce_paper.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def call(*arguments: str) -> tuple[int, str, str]:
-    """Exit status, standard output and standard error of the script."""
-    before, out, err = sys.argv, io.StringIO(), io.StringIO()
-    sys.argv = ["reproduce_paper.py", *arguments]
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            status = script().main()
-    finally:
-        sys.argv = before
-    return status, out.getvalue(), err.getvalue()
 
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a quick study, and what it printed."""
     folder = tmp_path_factory.mktemp("study") / "paper"
-    status, out, err = call("--quick", "--output", str(folder))
+    status, out, err = call("reproduce_paper", "--quick", "--output", str(folder))
     assert status == 0, err
     return folder, out
 
@@ -160,7 +134,7 @@ def test_figures_and_charts_are_written(study: tuple[Path, str]) -> None:
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     for overwrite in ([], ["--overwrite"]):
-        status, out, err = call("--quick", "--output", str(tmp_path), *overwrite)
+        status, out, err = call("reproduce_paper", "--quick", "--output", str(tmp_path), *overwrite)
         assert status == 2
         assert not out
         assert len(err.splitlines()) == 1

@@ -8,18 +8,46 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torchid.errors import TorchidError, TorchidWarning
-    from torchid.estimators import Estimate, LeastSquares
+    from torchid.estimators import (
+        Conditions,
+        Consistent,
+        Estimate,
+        LeastSquares,
+        LogCholeskyParameters,
+        Sgd,
+        Trainer,
+        project,
+        violations,
+    )
     from torchid.logs import Log, preprocess, read_log, write_log
-    from torchid.problem import LinearProblem, RowBuilder, TriangularFactor, bind, compress, linear_problem
+    from torchid.problem import LinearProblem, MiniBatches, RowBuilder, TriangularFactor, bind, compress, linear_problem
     from torchid.regressor import FrameJacobian, Motion, Regressor, motion_from_state
     from torchid.robot import Robot, load_robot
     from torchid.sensing import Contact, Projection, SensorNoise, SensorSet, chosen_sensors, named_sensors
 
 _HOMES = {
     "torchid.errors": ("TorchidError", "TorchidWarning"),
-    "torchid.estimators": ("Estimate", "LeastSquares"),
+    "torchid.estimators": (
+        "Conditions",
+        "Consistent",
+        "Estimate",
+        "LeastSquares",
+        "LogCholeskyParameters",
+        "Sgd",
+        "Trainer",
+        "project",
+        "violations",
+    ),
     "torchid.logs": ("Log", "preprocess", "read_log", "write_log"),
-    "torchid.problem": ("LinearProblem", "RowBuilder", "TriangularFactor", "bind", "compress", "linear_problem"),
+    "torchid.problem": (
+        "LinearProblem",
+        "MiniBatches",
+        "RowBuilder",
+        "TriangularFactor",
+        "bind",
+        "compress",
+        "linear_problem",
+    ),
     "torchid.regressor": ("FrameJacobian", "Motion", "Regressor", "motion_from_state"),
     "torchid.robot": ("Robot", "load_robot"),
     "torchid.sensing": ("Contact", "Projection", "SensorNoise", "SensorSet", "chosen_sensors", "named_sensors"),
@@ -27,12 +55,16 @@ _HOMES = {
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Conditions",
+    "Consistent",
     "Contact",
     "Estimate",
     "FrameJacobian",
     "LeastSquares",
     "LinearProblem",
     "Log",
+    "LogCholeskyParameters",
+    "MiniBatches",
     "Motion",
     "Projection",
     "Regressor",
@@ -40,8 +72,10 @@ __all__ = [
     "RowBuilder",
     "SensorNoise",
     "SensorSet",
+    "Sgd",
     "TorchidError",
     "TorchidWarning",
+    "Trainer",
     "TriangularFactor",
     "bind",
     "chosen_sensors",
@@ -51,7 +85,9 @@ __all__ = [
     "motion_from_state",
     "named_sensors",
     "preprocess",
+    "project",
     "read_log",
+    "violations",
     "write_log",
 ]
 

@@ -44,7 +44,7 @@ def guarded(program: str, command: Callable[[], None], debug: bool = False) -> i
             print(f"{program}: {error}", file=sys.stderr)
             return 2
         except KeyboardInterrupt as interrupt:
-            print(f"{program}: {interrupt or 'interrupted; nothing was written'}", file=sys.stderr)
+            print(f"{program}: {str(interrupt) or 'interrupted; nothing was written'}", file=sys.stderr)
             return 1
         except Exception as error:  # a bug or a full disk: still no wall of text unless asked for
             if debug:
@@ -112,8 +112,8 @@ def _interrupt_held_back() -> Iterator[None]:
 def _identify(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
         from torchid.config import load_config
-        from torchid.estimators import ConsistentEstimate, SgdEstimate
-        from torchid.report.tables import error_tables, print_tables, state_table
+        from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
+        from torchid.report.tables import error_tables, print_tables, state_table, violation_table
         from torchid.run import identify
         from torchid.run.results import objective_above_least
         from torchid.run.training import body_eigenvalues
@@ -121,6 +121,10 @@ def _identify(options: argparse.Namespace) -> None:
     run = identify(load_config(options.file, options.overrides), options.file, options.resume)
     estimate, robot = run.estimate, run.experiment.robot
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
+    if run.violations:
+        print_tables(violation_table(run.violations_by_name()))
+        if type(estimate) is Estimate:
+            print("estimator.name=consistent finds the best parameters that break none of them")
     mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
@@ -128,7 +132,7 @@ def _identify(options: argparse.Namespace) -> None:
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
     above = objective_above_least(estimate)
-    if above is not None:
+    if above:
         print(f"objective     {100.0 * above:.3g} % above the least without conditions")
     if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
         print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
-from torchid.config.types import STRICT, NotNegative, Positive, Seed
+from torchid.config.types import STRICT, NotNegative, Positive, Seed, no_flag
 
 
 def _with_name(value: dict[str, Any]) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def _with_name(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, BeforeValidator(no_flag), Field(ge=1)]
 Named = Annotated[dict[str, Any], AfterValidator(_with_name)]
 """A class of `torch.optim` and what it takes: `{name: Adam, lr: 0.05}`."""
 

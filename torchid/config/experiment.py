@@ -232,6 +232,9 @@ def _check_estimator(path: Path, config: ExperimentConfig) -> None:
             having = [name for name, keys in _KEYS.items() if key in keys]
             found = f"set, which {estimator.name} has not"
             raise ConfigError(path, f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
+    if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
+        found = f"set, which consistency: {estimator.consistency} has not"
+        raise ConfigError(path, "estimator.penalties", found, "consistency: penalties, or no such key")
     if config.logs.validation and estimator.name != "sgd":
         raise ConfigError(path, "logs.validation", f"set, which {estimator.name} has no use for", "estimator.name: sgd")
     if estimator.training.patience is not None and not config.logs.validation:

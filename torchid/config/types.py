@@ -10,7 +10,8 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 STRICT = ConfigDict(extra="forbid")
 
 
-def _no_flag(value: object) -> object:
+def no_flag(value: object) -> object:
+    """The value, unless it is true or false, which pydantic takes for 1 and 0."""
     if isinstance(value, bool):
         raise ValueError("a number")  # and not 1.0 for `true`
     return value
@@ -28,9 +29,9 @@ def _file_name(value: str) -> str:
     return value
 
 
-Number = Annotated[float, BeforeValidator(_no_flag), Field(allow_inf_nan=False)]
+Number = Annotated[float, BeforeValidator(no_flag), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
-Seed = Annotated[int, BeforeValidator(_no_flag), Field(ge=0)]
+Seed = Annotated[int, BeforeValidator(no_flag), Field(ge=0)]
 FileName = Annotated[str, AfterValidator(_file_name)]
 Device = Annotated[str, AfterValidator(_torch_device)]

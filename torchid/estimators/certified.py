@@ -14,8 +14,8 @@ from torchid.errors import InputError, NumericalWarning
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.parameters import Array
 
-_LEAST_SIZE = 1e-6  # of the problem's size: what the solver sees must not vanish
-_LOOSE = 1e-6  # relative gap worth a warning
+_LOOSE = 1e-6  # relative gap that is worth another try, and in the end a warning
+_TRIES = (1.0, 10.0, 0.1, 100.0)  # units of the objective: Clarabel stalls on an exponential cone now and then
 
 
 def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution:
@@ -27,7 +27,19 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
     Warns:
         NumericalWarning: the solver stopped short.
     """
-    size = max(problem.constant, _LEAST_SIZE * problem.size)
+    size = max(problem.constant, problem.floor, 10.0 * float(problem.weights.max(initial=0.0)))
+    best = Solution(np.zeros(len(problem.linear)), np.inf, np.inf, 0)
+    for unit in _TRIES:
+        best = min(best, _solve(problem, unit * size, tolerance), key=lambda found: found.gap)
+        if best.gap <= _LOOSE * max(best.objective, problem.floor):
+            return best
+    message = f"estimator: the conic solver stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
+    warnings.warn(message, NumericalWarning, stacklevel=4)
+    return best
+
+
+def _solve(problem: ConicProblem, size: float, tolerance: float) -> Solution:
+    """Solve in units of the objective: tolerances are absolute for small numbers."""
     x = cp.Variable(len(problem.linear))
     objective = cp.sum_squares((problem.root @ x - problem.target) / np.sqrt(size)) + (problem.linear / size) @ x
     blocks = []
@@ -41,31 +53,29 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
     rows = problem.G @ x >= problem.h
     programme = cp.Problem(cp.Minimize(objective), [*blocks, rows, problem.E @ x == problem.e])
     _run(programme, tolerance)
-    best = np.asarray(x.value, dtype=np.float64)
-    Z, y = size * np.array([_positive(block.dual_value) for block in blocks]), size * np.maximum(rows.dual_value, 0.0)
+    best = x.value - problem.E.T @ (problem.E @ x.value - problem.e)
+    Z = size * np.array([_positive(block.dual_value) for block in blocks]).reshape(-1, 4, 4)
+    y = size * np.maximum(rows.dual_value, 0.0)
     weighted = problem.weights > 0.0
     Z[weighted] += problem.weights[weighted, None, None] * np.linalg.inv(problem.blocks(best)[weighted])
-    value = problem.objective(best)
-    gap = problem.gap(best, Z, y)
-    if not gap <= _LOOSE * max(value, _LEAST_SIZE * problem.size):
-        warnings.warn(
-            f"estimator: the conic solver stopped at a gap of {gap:.1g} to {value:.3g}", NumericalWarning, stacklevel=4
-        )
-    return Solution(best, value, gap, int(programme.solver_stats.num_iters or 0))
+    gap = abs(problem.gap(best, Z, y))  # negative where the solver's accuracy leaves x outside
+    return Solution(best, problem.objective(best), gap, int(programme.solver_stats.num_iters or 0))
 
 
 def _run(programme: cp.Problem, tolerance: float) -> None:
+    """Solve, accepting what is not quite optimal: the gap says by how much."""
+    accuracy = {"tol_gap_abs": tolerance, "tol_gap_rel": tolerance, "tol_feas": tolerance}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of an inaccurate solution: the gap says how much
-            programme.solve(
-                solver=cp.CLARABEL, tol_gap_abs=tolerance, tol_gap_rel=tolerance, tol_feas=tolerance, accept_unknown=True
-            )
+            warnings.simplefilter("ignore", UserWarning)  # of an inaccurate solution
+            programme.solve(solver=cp.CLARABEL, accept_unknown=True, **accuracy)
     except cp.SolverError as error:
-        raise InputError("estimator", "method", f"Clarabel gave up: {error}", "method: barrier") from error
-    if programme.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-        found = f"{programme.status}: the conditions exclude each other"
+        raise InputError("estimator", "method", f"certified, but Clarabel gave up: {error}", "barrier") from error
+    if programme.status in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE):
+        found = "they exclude each other"
         raise InputError("estimator", "conditions", found, "conditions that some robot can meet")
+    if programme.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        raise InputError("estimator", "method", f"certified, but Clarabel says {programme.status}", "barrier")
 
 
 def _positive(Z: Array) -> Array:

@@ -9,12 +9,15 @@ import numpy as np
 from torchid import parameters
 from torchid.parameters import PER_BODY, Array
 
+_ROUNDING = 1e-6  # of matrices that users write down with six digits
+
 
 @dataclass(frozen=True)
 class Enclosure:
     """Where the centre of mass of a body lies: a box or an ellipsoid in its link's frame.
 
-    `axes`, (3, 3): columns are the directions of `half`, (3,) [m], half edges or semi-axes; `centre`, (3,) [m].
+    `axes`, (3, 3), orthonormal: columns are the directions of `half`, (3,) [m], half edges or semi-axes; `centre`,
+    (3,) [m].
     """
 
     body: int
@@ -24,20 +27,42 @@ class Enclosure:
     half: Array
 
     def __post_init__(self) -> None:
-        """Check kind and size."""
+        """Check kind, place and size."""
         if self.kind not in ("box", "ellipsoid"):
             raise ValueError(f"kind: found {self.kind!r}; accepted: box, ellipsoid")
-        if not (np.isfinite(self.half).all() and (self.half > 0.0).all()):
-            raise ValueError(f"half: found {self.half}; accepted: three positive numbers")
+        if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
+            raise ValueError(f"centre: found {_short(self.centre)}; accepted: three finite numbers")
+        if np.shape(self.half) != (3,) or not (np.isfinite(self.half).all() and (self.half > 0.0).all()):
+            raise ValueError(f"half: found {_short(self.half)}; accepted: three positive numbers")
+        _check_orthogonal("axes", self.axes)
 
 
 @dataclass(frozen=True)
 class Mirror:
-    """Two bodies that are mirror images: `reflection`, (3, 3), takes the first link's vectors to the second's."""
+    """Two bodies that are mirror images, friction included, or one that is symmetric.
+
+    `reflection`, (3, 3), orthogonal, takes the first link's vectors to the second's. Its determinant is -1, or 1 for
+    equal bodies whose links are turned.
+    """
 
     body: int
     image: int
     reflection: Array
+
+    def __post_init__(self) -> None:
+        """Check that lengths stay."""
+        _check_orthogonal("reflection", self.reflection)
+
+
+def _check_orthogonal(name: str, matrix: Array) -> None:
+    """Raise a ValueError unless a matrix is (3, 3) and orthogonal."""
+    if np.shape(matrix) != (3, 3) or not np.allclose(matrix.T @ matrix, np.eye(3), rtol=0.0, atol=_ROUNDING):
+        raise ValueError(f"{name}: found {_short(matrix)}; accepted: an orthogonal matrix (3, 3)")
+
+
+def _short(value: object) -> str:
+    """A value on one line."""
+    return " ".join(str(value).split())
 
 
 @dataclass(frozen=True)
@@ -81,9 +106,11 @@ class Conditions:
         """Lower and upper bounds (L, 12), friction at least 0."""
         lower = np.full((bodies, PER_BODY), -np.inf) if self.lower is None else self.lower.copy()
         upper = np.full((bodies, PER_BODY), np.inf) if self.upper is None else self.upper
-        for name, bound in (("lower", lower), ("upper", upper)):
-            if bound.shape != (bodies, PER_BODY) or np.isnan(bound).any():
-                raise ValueError(f"{name}: found shape {bound.shape}; accepted: ({bodies}, {PER_BODY}), without NaN")
+        for name, bound, never in (("lower", lower, np.inf), ("upper", upper, -np.inf)):
+            if bound.shape != (bodies, PER_BODY):
+                raise ValueError(f"{name}: found shape {bound.shape}; accepted: ({bodies}, {PER_BODY})")
+            if np.isnan(bound).any() or (bound == never).any():
+                raise ValueError(f"{name}: found NaN or {never}; accepted: numbers, {-never} where there is no bound")
         lower[:, parameters.FRICTION] = np.maximum(lower[:, parameters.FRICTION], 0.0)
         return lower, upper
 
@@ -107,6 +134,22 @@ class Violation:
     unit: str
 
 
+def check_parameters(**arrays: Array) -> None:
+    """Make sure that arrays, by their names, are of one shape (L, 12) and finite, and what is called scale positive.
+
+    Raises:
+        ValueError: one is not.
+    """
+    shape = (*next(iter(arrays.values())).shape[:1], PER_BODY)
+    for name, array in arrays.items():
+        if array.shape != shape or array.ndim != 2:
+            raise ValueError(f"{name}: found shape {array.shape}; accepted: (L, {PER_BODY}), the same for all")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name}: found a number that is not finite; accepted: finite numbers")
+        if name == "scale" and not (array > 0.0).all():
+            raise ValueError(f"{name}: found a number that is not positive; accepted: positive numbers")
+
+
 def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float = 1e-9) -> list[Violation]:
     """Every condition that parameters (L, 12) break by more than `tolerance` of its natural size.
 
@@ -116,6 +159,8 @@ def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: floa
         conditions: what to check.
         tolerance: relative.
     """
+    check_parameters(phi=phi, scale=scale)
+    conditions.check_bodies(len(phi))
     out: list[Violation] = []
     for body in np.flatnonzero(phi[:, parameters.INERTIAL].any(axis=1)):
         out += _of_matter(int(body), phi[body], scale[body], conditions.margin, tolerance)
@@ -134,6 +179,12 @@ def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: floa
         off = float(abs(phi[:, parameters.MASS].sum() - conditions.total_mass))
         if off > tolerance * conditions.total_mass:
             out.append(Violation(None, "total mass is another", off, "kg"))
+    return out + _beyond(phi, scale, conditions, tolerance)
+
+
+def _beyond(phi: Array, scale: Array, conditions: Conditions, tolerance: float) -> list[Violation]:
+    """Parameters outside their bounds."""
+    out = []
     lower, upper = conditions.bounds(len(phi))
     beyond = np.maximum(lower - phi, phi - upper)
     for body, number in zip(*np.nonzero(beyond > tolerance * scale), strict=True):

@@ -7,10 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
+from torchid.errors import InputError
 from torchid.parameters import Array
 
+SAME = 1e-9
+"""Numbers closer than this share of their scale are one."""
+
 _REACH = 1e3  # scales of the parameters: no better point is looked for further away, where the data say nothing
-_WORTH = 1e-6  # least size of an objective, as a share of what deviations of one scale cost: a thousandth of one
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,15 @@ class Solution:
 
 
 @dataclass(frozen=True)
+class Row:
+    """A linear condition: row @ x >= bound, or == bound."""
+
+    name: str
+    row: Array
+    bound: float
+
+
+@dataclass(frozen=True)
 class ConicProblem:
     """min ||R x - r||^2 + c^T x + constant - sum_k w_k log det J_k(x), with J_k(x) >= 0, G x >= h, E x = e.
 
@@ -43,6 +55,7 @@ class ConicProblem:
         G, h: (M, n), (M,).
         E, e: (Q, n), (Q,), rows of E orthonormal.
         names: (K,) and then (M,): what each condition says, for messages.
+        floor: > 0, an objective that is as good as none: below, gaps are relative to this.
     """
 
     root: Array
@@ -58,6 +71,7 @@ class ConicProblem:
     E: Array
     e: Array
     names: tuple[str, ...]
+    floor: float
 
     @property
     def degree(self) -> int:
@@ -65,7 +79,7 @@ class ConicProblem:
         return 4 * len(self.base) + len(self.h)
 
     @cached_property
-    def H(self) -> Array:
+    def hessian(self) -> Array:
         """Hessian of the quadratic, (n, n)."""
         return 2.0 * self.root.T @ self.root
 
@@ -77,17 +91,11 @@ class ConicProblem:
         return np.ascontiguousarray(np.linalg.svd(self.E)[2][len(self.e) :].T)
 
     @cached_property
-    def size(self) -> float:
-        """Size of the objective: at x = 0, or that of a small deviation if there it is nothing."""
-        curvature = float(np.square(self.root).sum()) / max(len(self.linear), 1)
-        return max(self.objective(np.zeros(len(self.linear))), _WORTH * curvature, float(np.finfo(float).tiny))
-
-    @cached_property
     def unconstrained(self) -> float | None:
         """Least objective without conditions; None where log-determinants keep one."""
         if self.weights.any() or self.linear.any():
             return None
-        return self.objective(np.linalg.lstsq(self.root, self.target)[0])
+        return self.objective(np.asarray(np.linalg.lstsq(self.root, self.target)[0], dtype=np.float64))
 
     def blocks(self, x: Array) -> Array:
         """J_k(x), (K, 4, 4)."""
@@ -123,27 +131,65 @@ class ConicProblem:
             Z: (K, 4, 4), positive semidefinite multipliers of the blocks; of weighted blocks, w_k / J_k and the like.
             y: (M,) >= 0, multipliers of the rows.
         """
-        residual = self.gradient(x) - self.G.T @ y
-        np.subtract.at(residual, self.variables, np.einsum("kvij,kij->kv", self.slopes, Z))
-        residual = self.moves @ (self.moves.T @ residual)
-        blocks = self.blocks(x)
-        gap = float(y @ (self.G @ x - self.h))
-        for k, weight in enumerate(self.weights):
-            if weight == 0.0:
-                gap += float(np.sum(Z[k] * blocks[k]))
-                continue
-            # A weighted block depends on ten variables, and its multiplier takes up what is left there.
-            rest = np.linalg.lstsq(self.slopes[k].reshape(10, 16), residual[self.variables[k]])[0].reshape(4, 4)
-            residual[self.variables[k]] = 0.0
-            relative = np.linalg.eigvals(blocks[k] @ (Z[k] + rest)).real / weight
-            gap += weight * float((relative - 1.0 - np.log(relative)).sum()) if relative.min() > 0.0 else np.inf
-        values, vectors = self._curvature
-        off = np.abs(vectors.T @ residual)
-        bowl = np.divide(off**2, 2.0 * values, out=np.full_like(off, np.inf), where=values > 0.0)
-        return gap + float(np.minimum(bowl, _REACH * off).sum())
+        blocks, weighted = self.blocks(x), self.weights > 0.0
+        turned = np.zeros_like(self.slopes)  # w J^-1 dJ J^-1, change of a weighted block's multiplier
+        inverse = np.linalg.inv(blocks[weighted])[:, None]
+        turned[weighted] = self.weights[weighted, None, None, None] * inverse @ self.slopes[weighted] @ inverse
+        hessian = self.hessian.copy()
+        pairs = (self.variables[:, :, None], self.variables[:, None, :])
+        np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", turned, self.slopes))
+        residual = self.gradient(x) - self.G.T @ y - self._gathered(Z)
+        # A Newton step says what the quadratic and the log-determinants can take up of it, at least cost.
+        values, vectors = np.linalg.eigh(self.moves.T @ hessian @ self.moves)
+        modes = vectors.T @ (self.moves.T @ residual)
+        seen = np.abs(modes) <= 2.0 * _REACH * values
+        step = -self.moves @ (vectors[:, seen] @ (modes[seen] / np.maximum(values[seen], np.finfo(float).tiny)))
+        taken = np.einsum("kv,kvij->kij", step[self.variables], turned)
+        left = self.moves.T @ (residual + self.hessian @ step + self._gathered(taken))
+        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + _REACH * np.abs(left).sum()
+        products = blocks @ (Z - taken)
+        gap += np.trace(products[~weighted], axis1=1, axis2=2).sum()
+        weights = self.weights[weighted, None]
+        relative = np.linalg.eigvals(products[weighted]).real / weights
+        if relative.min(initial=1.0) <= 0.0:
+            return np.inf
+        return float(gap + (weights * (relative - 1.0 - np.log(relative))).sum())
 
-    @cached_property
-    def _curvature(self) -> tuple[Array, Array]:
-        """Eigenvalues and eigenvectors, (n, n - Q), of the Hessian along the moves."""
-        values, vectors = np.linalg.eigh(self.moves.T @ self.H @ self.moves)
-        return values, self.moves @ vectors
+    def _gathered(self, Z: Array) -> Array:
+        """Sum of <Z_k, dJ_k/dx>, (n,)."""
+        out = np.zeros(len(self.linear))
+        np.add.at(out, self.variables, np.einsum("kvij,kij->kv", self.slopes, Z))
+        return out
+
+
+def independent(rows: list[Row], count: int) -> tuple[Array, Array]:
+    """The same equalities in as few rows as they have rank.
+
+    Raises:
+        InputError: they contradict each other, or what is held fixed.
+    """
+    E, e = np.array([row.row for row in rows]).reshape(len(rows), count), np.array([row.bound for row in rows])
+    U, values, right = np.linalg.svd(E, full_matrices=False)
+    kept = values > 1e-10 * values.max(initial=0.0)
+    off = np.abs(e - U[:, kept] @ (U[:, kept].T @ e)) > SAME * (1.0 + np.abs(e).max(initial=0.0))
+    if off.any():
+        names = ", ".join(dict.fromkeys(row.name for row, wrong in zip(rows, off, strict=True) if wrong))
+        found = "contradicts what is held fixed or the other equalities"
+        raise InputError("estimator", names, found, "equalities that some parameters meet")
+    return right[kept], (U[:, kept].T @ e) / values[kept]
+
+
+def with_room(rows: list[Row], E: Array, e: Array) -> list[Row]:
+    """The rows that the equalities leave open: a barrier has no inside where they settle one.
+
+    Raises:
+        InputError: the equalities contradict one.
+    """
+    out = []
+    for row in rows:
+        along = E @ row.row
+        if np.linalg.norm(row.row - E.T @ along) > SAME * np.linalg.norm(row.row):
+            out.append(row)
+        elif along @ e < row.bound - SAME * (1.0 + abs(row.bound)):
+            raise InputError("estimator", row.name, "excluded by equalities", "conditions that some robot can meet")
+    return out

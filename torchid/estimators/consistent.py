@@ -8,9 +8,9 @@ from typing import Literal, get_args
 import numpy as np
 
 from torchid import parameters
-from torchid.estimators.barrier import Solution, solve_barrier
-from torchid.estimators.conditions import Conditions
-from torchid.estimators.conic import ConicProblem
+from torchid.estimators.barrier import solve_barrier
+from torchid.estimators.conditions import Conditions, check_parameters
+from torchid.estimators.conic import ConicProblem, Solution
 from torchid.estimators.formulate import Prior, conic_problem
 from torchid.estimators.least_squares import LeastSquares
 from torchid.estimators.result import Estimate
@@ -26,9 +26,11 @@ class ConsistentEstimate(Estimate):
 
     Attributes:
         objective: mean squared whitened residual plus prior.
-        unconstrained: the least objective without conditions, for the Euclidean prior; None for the others.
-        gap: bound on how far the objective is above the least one that the conditions allow.
-        certified_gap: relative difference from the other solver's objective, None unless asked for.
+        unconstrained: the least objective without conditions; None for the entropic prior, which has no other domain.
+        gap: to the dual objective; no parameters that meet the conditions have an objective lower by more.
+        certified_gap: difference from the other solver's objective, None unless asked for. Relative to the objective;
+            where data without noise leave next to none, relative to 1e-8 of the mean square of the data or 1e-3 of the
+            ridge, whichever is larger.
         eigenvalues: (L,), smallest eigenvalue of every body's scaled pseudo-inertia, NaN for bodies without mass.
         steps: Newton steps, or iterations of the conic solver.
     """
@@ -40,16 +42,24 @@ class ConsistentEstimate(Estimate):
     eigenvalues: Array
     steps: int
 
+    @property
+    def price(self) -> float | None:
+        """What the conditions cost: objective less the unconstrained one; None for the entropic prior."""
+        return None if self.unconstrained is None else self.objective - self.unconstrained
+
 
 @dataclass(frozen=True)
 class Consistent:
     """min ||A phi - b||^2 / rows + ridge * prior(phi) over all phi that a physical robot can have.
 
+    What is not free stays nominal, whether or not it meets the conditions: `violations` tells. "barrier" stays inside
+    them; "certified" meets them to the accuracy of its solver, 1e-8 of their natural size.
+
     Attributes:
         ridge: weight of the prior against the mean square of the whitened residual.
         prior: "euclidean", ||(phi - nominal) / scale||^2; "pullback", sum of ||J_0^-1/2 (J - J_0) J_0^-1/2||^2 over
             the bodies' pseudo-inertias J (Lee, Wensing, Park 2020); "entropic", sum of the log-det divergences
-            -log det(J_0^-1 J) + tr(J_0^-1 J) - 4 (Lee, Park 2018).
+            -log det(J_0^-1 J) + tr(J_0^-1 J) - 4 (Lee, Park 2018). Friction is pulled by the first in any case.
         conditions: on the parameters.
         method: "barrier", the fast path, or "certified", a semidefinite programme.
         certify: solve with the other method as well, and report the difference.
@@ -64,13 +74,9 @@ class Consistent:
     rank_tolerance: float = 1e-10
 
     def __post_init__(self) -> None:
-        """Check the names."""
-        for name, value, accepted in (
-            ("prior", self.prior, get_args(Prior)),
-            ("method", self.method, get_args(Method)),
-        ):
-            if value not in accepted:
-                raise ValueError(f"{name}: found {value!r}; accepted: {', '.join(accepted)}")
+        """Check names and weights."""
+        _check_names(self.prior, self.method)
+        LeastSquares(self.ridge, self.rank_tolerance)
 
     def solve(self, problem: LinearProblem) -> ConsistentEstimate:
         """Fit the free parameters.
@@ -78,7 +84,7 @@ class Consistent:
         Standard errors and ranks are those of least squares with the same ridge: conditions only narrow them.
 
         Raises:
-            InputError: the conditions exclude each other.
+            InputError: the conditions exclude each other, or a prior of matter starts from bodies that cannot exist.
         """
         plain = LeastSquares(self.ridge, self.rank_tolerance).solve(problem)
         conic = conic_problem(problem, self.conditions, self.ridge, self.prior)
@@ -86,15 +92,13 @@ class Consistent:
         certified_gap = None
         if self.certify:
             other = _solve(conic, "certified" if self.method == "barrier" else "barrier")
-            size = max(abs(solution.objective), np.finfo(float).tiny)
-            certified_gap = abs(other.objective - solution.objective) / size
+            compared = max(solution.objective, conic.floor)
+            certified_gap = abs(other.objective - solution.objective) / compared
         phi = problem.nominal.copy()
         phi[problem.free] += problem.scale[problem.free] * solution.x
         scaled = (phi / problem.scale).reshape(-1, PER_BODY)
         eigenvalues = np.asarray(np.linalg.eigvalsh(parameters.pseudo_inertia(scaled))[:, 0], dtype=np.float64)
         eigenvalues[~scaled[:, parameters.INERTIAL].any(axis=1)] = np.nan
-        deviation = (plain.phi - problem.nominal) / problem.scale
-        unconstrained = plain.cost / max(problem.rows, 1) + self.ridge * float(deviation @ deviation)
         return ConsistentEstimate(
             phi=phi,
             standard_error=plain.standard_error,
@@ -105,7 +109,7 @@ class Consistent:
             nominal_cost=plain.nominal_cost,
             rows=problem.rows,
             objective=solution.objective,
-            unconstrained=unconstrained if self.prior == "euclidean" else None,
+            unconstrained=conic.unconstrained,
             gap=solution.gap,
             certified_gap=certified_gap,
             eigenvalues=eigenvalues,
@@ -113,27 +117,66 @@ class Consistent:
         )
 
 
-def project(phi: Array, scale: Array, conditions: Conditions, method: Method = "barrier") -> Array:
-    """The parameters nearest to `phi`, (L, 12), that meet the conditions, in the scaled Euclidean metric.
+def project(
+    phi: Array,
+    scale: Array,
+    conditions: Conditions,
+    *,
+    prior: Prior = "euclidean",
+    nominal: Array | None = None,
+    method: Method = "barrier",
+) -> Array:
+    """The parameters nearest to `phi` that meet the conditions (Mistry, Schaal, Yamane 2009, III-B).
 
-    Source: Mistry, Schaal, Yamane 2009, III-B.
+    Bodies without mass stay so; friction of zero stays zero unless a bound or a mirror image says otherwise.
+
+    Args:
+        phi: (L, 12), whether a robot can have them or not.
+        scale: (L, 12), as in `parameter_scale`.
+        conditions: to meet.
+        prior: what nearest means, as in `Consistent` with `phi` for the nominal parameters. "entropic" is defined only
+            from a `phi` whose bodies can exist.
+        nominal: (L, 12), whose pseudo-inertias J_0 measure deviations for "pullback"; None for those of `phi`.
+        method: as in `Consistent`.
 
     Raises:
-        InputError: the conditions exclude each other.
+        InputError: the conditions exclude each other, or pseudo-inertias that a prior of matter starts from are not
+            positive definite.
     """
-    flat = phi.flatten()
-    free = phi != 0.0  # friction that there is
+    _check_names(prior, method)
+    if nominal is not None and prior != "pullback":
+        raise ValueError(f"nominal: found parameters for the {prior} prior; accepted: None, or prior 'pullback'")
+    check_parameters(phi=phi, scale=scale, nominal=phi if nominal is None else nominal)
+    free = _changeable(phi, conditions)
+    nothing = np.zeros((0, phi.size))
+    problem = LinearProblem(nothing, np.zeros(0), 0.0, 1, phi.flatten(), scale.flatten(), free.flatten())
+    reference = None if nominal is None else nominal.flatten()
+    solution = _solve(conic_problem(problem, conditions, 1.0, prior, reference), method)
+    out = phi.copy()
+    out[free] += scale[free] * solution.x
+    return out
+
+
+def _changeable(phi: Array, conditions: Conditions) -> np.ndarray:
+    """What a projection may change, (L, 12) bool."""
+    conditions.check_bodies(len(phi))
+    lower, _ = conditions.bounds(len(phi))
+    free = (phi != 0.0) | (lower > 0.0)
+    for mirror in conditions.mirrors:
+        pair = [mirror.body, mirror.image]
+        free[pair] = free[pair].any(axis=0)
     free[:, parameters.INERTIAL] = phi[:, parameters.INERTIAL].any(axis=1, keepdims=True)
-    free = free.flatten()
-    nothing = np.zeros((0, len(flat)))
-    problem = LinearProblem(nothing, np.zeros(0), 0.0, 1, flat, scale.flatten(), free)
-    solution = _solve(conic_problem(problem, conditions, 1.0, "euclidean"), method)
-    flat[free] += scale.flatten()[free] * solution.x
-    return flat.reshape(phi.shape)
+    return np.asarray(free)
+
+
+def _check_names(prior: str, method: str) -> None:
+    for name, value, accepted in (("prior", prior, get_args(Prior)), ("method", method, get_args(Method))):
+        if value not in accepted:
+            raise ValueError(f"{name}: found {value!r}; accepted: {', '.join(accepted)}")
 
 
 def _solve(conic: ConicProblem, method: Method) -> Solution:
-    if not len(conic.c):
+    if not len(conic.linear):
         return Solution(np.zeros(0), conic.constant, 0.0, 0)
     if method == "barrier":
         return solve_barrier(conic)

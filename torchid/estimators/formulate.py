@@ -10,11 +10,13 @@ import numpy as np
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators.conditions import Conditions, Enclosure, mirrored_parameters
-from torchid.estimators.conic import ConicProblem
+from torchid.estimators.conic import SAME, ConicProblem, Row, independent, with_room
 from torchid.parameters import PER_BODY, Array
 from torchid.problem.linear import LinearProblem
 
 Prior = Literal["euclidean", "pullback", "entropic"]
+
+_LITTLE, _CHEAP = 1e-8, 1e-3  # of the mean square of the data, of the ridge
 
 _TEN = parameters.pseudo_inertia(np.eye(10))  # (10, 4, 4), change of a pseudo-inertia with each number
 
@@ -27,15 +29,6 @@ class _Block:
     base: Array
     slopes: Array
     variables: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A linear condition: row @ x >= bound."""
-
-    name: str
-    row: Array
-    bound: float
 
 
 class _Variables:
@@ -78,17 +71,15 @@ def conic_problem(
     conditions.check_bodies(len(problem.nominal) // PER_BODY)
     x = _Variables(problem)
     blocks = [_matter(x, body, conditions.margin) for body in x.bodies]
-    rows = _bounds(x, conditions)
-    for enclosure in conditions.enclosures:
-        if enclosure.body in x.bodies and enclosure.kind == "ellipsoid":
-            blocks.append(_ellipsoid(x, enclosure))
-        elif enclosure.body in x.bodies:
-            rows += _box(x, enclosure)
-    weights, linear = np.zeros(len(blocks)), np.zeros(x.count)
-    pull = np.eye(x.count)
+    enclosures = [enclosure for enclosure in conditions.enclosures if enclosure.body in x.bodies]
+    blocks += [_ellipsoid(x, enclosure) for enclosure in enclosures if enclosure.kind == "ellipsoid"]
+    boxes = [_box(x, enclosure) for enclosure in enclosures if enclosure.kind == "box"]
+    E, e = _equalities(x, conditions)
+    rows = with_room([*_bounds(x, conditions), *sum(boxes, [])], E, e)
+    weights, linear, pull = np.zeros(len(blocks)), np.zeros(x.count), np.eye(x.count)
     if prior == "pullback":
         pull = _pull_back(x, problem.nominal if reference is None else reference)
-    if prior == "entropic":
+    elif prior == "entropic":
         relative = [_relative(x, body) for body in x.bodies]
         for block in relative:
             pull[block.variables] = 0.0
@@ -96,7 +87,6 @@ def conic_problem(
         blocks += relative
         weights = np.append(weights, np.full(len(relative), ridge))
     root, target, unexplained = _compressed(problem, np.sqrt(ridge) * pull)
-    E, e = _equalities(x, conditions)
     return ConicProblem(
         root=root,
         target=target,
@@ -106,11 +96,12 @@ def conic_problem(
         slopes=np.array([block.slopes for block in blocks]).reshape(len(blocks), 10, 4, 4),
         variables=np.array([block.variables for block in blocks], dtype=np.int64).reshape(-1, 10),
         weights=weights,
-        G=np.array([row.row for row in rows]).reshape(-1, x.count),
+        G=np.array([row.row for row in rows]).reshape(len(rows), x.count),
         h=np.array([row.bound for row in rows]),
         E=E,
         e=e,
         names=(*(block.name for block in blocks), *(row.name for row in rows)),
+        floor=_floor(problem, ridge),
     )
 
 
@@ -120,9 +111,16 @@ def _compressed(problem: LinearProblem, pull: Array) -> tuple[Array, Array, floa
     A = problem.A[:, free] * problem.scale[free] / np.sqrt(rows)
     b = (problem.b - problem.A @ problem.nominal) / np.sqrt(rows)
     right = np.concatenate([b, np.zeros(len(pull))])
-    triangle = np.linalg.qr(np.column_stack([np.concatenate([A, pull]), right]), mode="r")
+    triangle = np.asarray(np.linalg.qr(np.column_stack([np.concatenate([A, pull]), right]), mode="r"))
     count = A.shape[1]
-    return triangle[:count, :count], triangle[:count, count], problem.residual / rows + float(triangle[count:, count] @ triangle[count:, count])
+    unexplained = problem.residual / rows + float(np.square(triangle[count:, count]).sum())
+    return triangle[:count, :count], triangle[:count, count], unexplained
+
+
+def _floor(problem: LinearProblem, ridge: float) -> float:
+    """An objective that is as good as none: Clarabel's accuracy with an entropic prior is 1e-10 of the ridge."""
+    data = (float(problem.b @ problem.b) + problem.residual) / max(problem.rows, 1)
+    return max(_LITTLE * data, _CHEAP * ridge) or 1.0
 
 
 def _matter(x: _Variables, body: int, margin: float) -> _Block:
@@ -145,7 +143,7 @@ def _ellipsoid(x: _Variables, enclosure: Enclosure) -> _Block:
     return _Block(f"centre of mass of body {body}", base, slopes, x.ten(body))
 
 
-def _box(x: _Variables, enclosure: Enclosure) -> list[_Row]:
+def _box(x: _Variables, enclosure: Enclosure) -> list[Row]:
     """M half +- (m com - m centre) >= 0 along each axis of the box."""
     out = []
     for axis, half in zip(enclosure.axes.T, enclosure.half, strict=True):
@@ -154,65 +152,52 @@ def _box(x: _Variables, enclosure: Enclosure) -> list[_Row]:
             weights[parameters.MASS] = 1.0 - sign * (axis @ enclosure.centre) / half
             weights[parameters.FIRST_MOMENT] = sign * axis / half
             row, constant = x.row(enclosure.body, weights / x.scale[enclosure.body, parameters.MASS])
-            out.append(_Row(f"centre of mass of body {enclosure.body}", row, -constant))
+            out.append(Row(f"centre of mass of body {enclosure.body}", row, -constant))
     return out
 
 
-def _bounds(x: _Variables, conditions: Conditions) -> list[_Row]:
+def _bounds(x: _Variables, conditions: Conditions) -> list[Row]:
+    """Bounds of the free parameters; `_equalities` has those that meet."""
     lower, upper = conditions.bounds(len(x.free))
     out = []
     for bound, sign, word in ((lower, 1.0, "lower"), (upper, -1.0, "upper")):
-        for body, number in zip(*np.nonzero(np.isfinite(bound) & x.free & (lower < upper)), strict=True):
+        for body, number in zip(*np.nonzero(np.isfinite(bound) & x.free & ~_meet(x, lower, upper)), strict=True):
             row = np.zeros(x.count)
             row[x.place[body, number]] = sign
             limit = sign * (bound[body, number] / x.scale[body, number] - x.nominal[body, number])
-            out.append(_Row(f"{word} bound of {parameters.PARAMETERS[number]} of body {body}", row, float(limit)))
+            out.append(Row(f"{word} bound of {parameters.PARAMETERS[number]} of body {body}", row, float(limit)))
     return out
 
 
+def _meet(x: _Variables, lower: Array, upper: Array) -> np.ndarray:
+    """Where bounds, (L, 12), leave no room, (L, 12) bool."""
+    return np.asarray(upper - lower <= SAME * x.scale)
+
+
 def _equalities(x: _Variables, conditions: Conditions) -> tuple[Array, Array]:
-    """Total mass and mirror images, as independent rows E x = e."""
-    rows, values = [np.zeros((0, x.count))], [np.zeros(0)]
+    """Total mass, mirror images and bounds that meet, as orthonormal rows E x = e."""
+    out: list[Row] = []
     if conditions.total_mass is not None:
-        mass = np.eye(PER_BODY)[parameters.MASS]
+        mass = np.eye(PER_BODY)[parameters.MASS] / conditions.total_mass
         found = [x.row(body, mass) for body in range(len(x.free))]
-        rows.append(np.sum([row for row, _ in found], axis=0)[None] / conditions.total_mass)
-        values.append(np.array([1.0 - sum(constant for _, constant in found) / conditions.total_mass]))
+        row = np.sum([row for row, _ in found], axis=0)
+        out.append(Row("total_mass", row, 1.0 - sum(constant for _, constant in found)))
     for mirror in conditions.mirrors:
         reflected = mirrored_parameters(mirror.reflection)
         for number, unit in enumerate(np.eye(PER_BODY)):
             size = x.scale[mirror.image, number]
             (left, known), (right, fixed) = x.row(mirror.body, reflected[number]), x.row(mirror.image, unit)
-            rows.append((left - right)[None] / size)
-            values.append(np.array([(fixed - known) / size]))
+            name = f"body {mirror.image} as mirror image of body {mirror.body}"
+            out.append(Row(name, (left - right) / size, (fixed - known) / size))
     lower, upper = conditions.bounds(len(x.free))
-    for body, number in zip(*np.nonzero((lower >= upper) & x.free), strict=True):
-        rows.append(np.eye(x.count)[[x.place[body, number]]])
-        values.append(np.array([lower[body, number] / x.scale[body, number] - x.nominal[body, number]]))
-        if lower[body, number] > upper[body, number]:
-            name = f"bounds of {parameters.PARAMETERS[number]} of body {body}"
-            raise InputError(
-                "estimator", name, f"{lower[body, number]:g} above {upper[body, number]:g}", "lower <= upper"
-            )
-    return _independent(np.concatenate(rows), np.concatenate(values))
-
-
-def _independent(E: Array, e: Array) -> tuple[Array, Array]:
-    """The same conditions in as few rows as they have rank.
-
-    Raises:
-        InputError: they contradict each other, or what is held fixed.
-    """
-    if not E.size:
-        U, kept, values, right = np.zeros((len(e), 0)), np.zeros(0, dtype=bool), np.zeros(0), E[:0]
-    else:
-        U, values, right = np.linalg.svd(E, full_matrices=False)
-        kept = values > 1e-10 * max(float(values[0]), np.finfo(float).tiny)
-    reached = U[:, kept] @ (U[:, kept].T @ e)
-    if np.abs(e - reached).max(initial=0.0) > 1e-9 * (1.0 + np.abs(e).max(initial=0.0)):
-        found = "excluded by each other or by what is held fixed"
-        raise InputError("estimator", "total mass, mirror images or equal bounds", found, "equalities that can be met")
-    return values[kept, None] * right[kept], U[:, kept].T @ e
+    for body, number in zip(*np.nonzero(_meet(x, lower, upper) & x.free), strict=True):
+        least, most, scale = lower[body, number], upper[body, number], x.scale[body, number]
+        name = f"bounds of {parameters.PARAMETERS[number]} of body {body}"
+        if least - most > SAME * scale:
+            raise InputError("estimator", name, f"{least:g} above {most:g}", "a lower bound below the upper one")
+        value = 0.5 * (least + most) / scale - x.nominal[body, number]
+        out.append(Row(name, np.eye(x.count)[x.place[body, number]], value))
+    return independent(out, x.count)
 
 
 def _pull_back(x: _Variables, reference: Array) -> Array:
@@ -236,7 +221,7 @@ def _whitened(scaled: Array, body: int, prior: Prior) -> Array:
     """L^-1 dJ L^-T for each of ten numbers, (10, 4, 4), of the pseudo-inertia J = L L^T of scaled parameters (12,)."""
     J = parameters.pseudo_inertia(scaled)
     if np.linalg.eigvalsh(J)[0] <= 0.0:
-        found = f"{prior}, but no density of matter has the parameters of body {body} that it starts from"
+        found = f"{prior}, but no density of matter has the parameters of body {body} that it measures from"
         raise InputError("estimator", "prior", found, "euclidean, or bodies that can exist")
     inverse = np.linalg.inv(np.linalg.cholesky(J))
     return np.asarray(inverse @ _TEN @ inverse.T)

@@ -126,12 +126,12 @@ class LogCholeskyParameters(LearnableParameters):
         self.register_buffer("_inertial", torch.from_numpy(moving.ravel()))
         self.register_buffer("_frictional", torch.from_numpy((free & ~moving).ravel()))
         start = np.maximum(scaled.ravel()[(free & ~moving).ravel()], _LEAST_FRICTION)
-        self.register_buffer("friction_start", torch.from_numpy(np.log(np.expm1(start))))
+        self.register_buffer("friction_start", torch.from_numpy(start + np.log(-np.expm1(-start))))
 
     def constrained(self, u: Tensor) -> Tensor:
         """Parameters of the bodies with log-Cholesky coordinates `u`, ten by body, then friction."""
         bodies = len(self.root)
-        coordinates = u[: parameters.INERTIAL.stop * bodies].unflatten(0, (bodies, -1))
+        coordinates = u[: parameters.INERTIAL.stop * bodies].reshape(bodies, parameters.INERTIAL.stop)
         rows, columns = self.get_buffer("_rows"), self.get_buffer("_columns")
         entries = torch.where(rows == columns, coordinates.exp(), coordinates)
         M = entries.new_zeros(bodies, 4, 4)

@@ -66,8 +66,8 @@ class Loss(nn.Module):
             deviation = (phi - self.learnable.nominal) / self.learnable.scale
             losses["prior"] = settings.ridge * deviation.square().sum()
         if settings.consistency == "penalties":
-            bodies = self.learnable.by_body(phi)[self.get_buffer("_bodies")]
-            losses |= penalties(bodies, settings.margin, settings.penalties)
+            scaled, bodies = self.learnable.by_body(phi), self.get_buffer("_bodies")
+            losses |= penalties(scaled, bodies, settings.margin, settings.penalties)
         forces = {"rigid_body": rigid, "measured": batch.f}
         if other is not None:
             forces["residual"] = other

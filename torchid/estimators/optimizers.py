@@ -16,6 +16,8 @@ from torchid.errors import InputError, UnknownNameError
 Group = dict[str, Any]
 
 _WHOLE_RUN = ("T_max", "total_steps")  # lengths that are the number of epochs unless given
+_FAILURES = (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""What torch's classes have been seen to raise at options that cannot be."""
 
 
 def optimizer_names() -> list[str]:
@@ -40,7 +42,7 @@ def make_optimizer(name: str, options: Mapping[str, Any], groups: Sequence[Group
         raise UnknownNameError("estimator", "optimizer", name, optimizer_names())
     try:
         return found(list(groups), **options)
-    except (TypeError, ValueError) as error:
+    except _FAILURES as error:
         raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(found)) from error
 
 
@@ -60,8 +62,8 @@ def make_schedule(
         raise UnknownNameError("estimator", "schedule", name, schedule_names())
     lengths = {key: epochs for key in _WHOLE_RUN if key in inspect.signature(found).parameters}
     try:
-        return found(optimizer, **lengths | options)
-    except (TypeError, ValueError, AttributeError) as error:
+        return found(optimizer, **{**lengths, **options})
+    except _FAILURES as error:
         raise InputError("estimator", f"schedule {name}", _short(error), _accepted(found)) from error
 
 
@@ -74,9 +76,9 @@ def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
 
 
 def try_out(
-    optimizer: str, options: Mapping[str, Any], schedule: str | None, schedule_options: Mapping[str, Any]
+    optimizer: str, options: Mapping[str, Any], schedule: str | None, schedule_options: Mapping[str, Any], epochs: int
 ) -> None:
-    """Take two steps on a parabola, so that what does not work is known at once.
+    """Take two steps on a parabola and the schedule through all epochs, so that what does not work is known at once.
 
     Raises:
         UnknownNameError: a name that torch does not have.
@@ -84,7 +86,7 @@ def try_out(
     """
     x = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
     tried = make_optimizer(optimizer, options, [{"params": [x]}])
-    schedule_of = make_schedule(schedule, schedule_options, tried, 2)
+    schedule_of = make_schedule(schedule, schedule_options, tried, epochs)
 
     def loss() -> torch.Tensor:
         tried.zero_grad()
@@ -96,11 +98,16 @@ def try_out(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             for _ in range(2):
-                tried.step(loss)
-                step_schedule(schedule_of, 1.0)
-    except (RuntimeError, TypeError, ValueError, AttributeError) as error:
-        found = f"{optimizer} cannot take a step: {_short(error)}"
-        raise InputError("estimator", "optimizer, schedule", found, "another, for example Adam") from error
+                tried.step(loss)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
+    except _FAILURES as error:
+        found = f"cannot take a step: {_short(error)}"
+        raise InputError("estimator", f"optimizer {optimizer}", found, "another, for example Adam") from error
+    try:
+        for _ in range(epochs):
+            step_schedule(schedule_of, 1.0)
+    except _FAILURES as error:
+        found = f"does not last {epochs} epochs: {_short(error)}"
+        raise InputError("estimator", f"schedule {schedule}", found, "other options, or another schedule") from error
 
 
 def _classes(module: Any, base: type) -> list[tuple[str, Any]]:
@@ -114,4 +121,5 @@ def _accepted(found: Any) -> str:
 
 
 def _short(error: Exception) -> str:
-    return str(error).split("\n")[0].replace("__init__()", "").strip()
+    text = str(error.args[0] if error.args else error)  # a KeyError's own text is a repr
+    return (text.splitlines() or [""])[0].replace("__init__()", "").strip() or type(error).__name__

@@ -38,8 +38,8 @@ class PenaltyWeights:
 
     @property
     def curvature(self) -> float:
-        """Largest second derivative of the squares, in units of the scale."""
-        return 2.0 * (self.eigenvalue + self.mass + self.friction)
+        """Bound of the squares' second derivatives, in units of the scale; what is off the diagonal is there twice."""
+        return 2.0 * (2.0 * self.eigenvalue + self.mass + self.friction)
 
 
 def pseudo_inertias(scaled: Tensor) -> Tensor:
@@ -47,23 +47,24 @@ def pseudo_inertias(scaled: Tensor) -> Tensor:
     return torch.tensordot(scaled[:, parameters.INERTIAL], _TEN.to(scaled), dims=1)
 
 
-def penalties(scaled: Tensor, margin: float, weights: PenaltyWeights) -> dict[str, Tensor]:
+def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWeights) -> dict[str, Tensor]:
     """Weighted penalties by name; those of weight 0 are left out.
 
     Args:
-        scaled: (L', 12), parameters of the bodies with mass, in units of their scale.
+        scaled: (L, 12), parameters in units of their scale.
+        bodies: (L',) int, bodies whose inertia is asked to be possible; friction is asked to be of all.
         margin: least eigenvalue asked for.
         weights: of the terms.
     """
     out: dict[str, Tensor] = {}
     if weights.eigenvalue or weights.log_det:
-        eigenvalues = torch.linalg.eigvalsh(pseudo_inertias(scaled))
+        eigenvalues = torch.linalg.eigvalsh(pseudo_inertias(scaled[bodies]))
         if weights.eigenvalue:
             out["eigenvalue"] = weights.eigenvalue * (margin - eigenvalues).clamp_min(0.0).square().sum()
         if weights.log_det:
             out["log_det"] = -weights.log_det * _extended_log(eigenvalues - margin).sum()
     if weights.mass:
-        out["mass"] = weights.mass * scaled[:, parameters.MASS].clamp_max(0.0).square().sum()
+        out["mass"] = weights.mass * scaled[bodies, parameters.MASS].clamp_max(0.0).square().sum()
     if weights.friction:
         out["friction"] = weights.friction * scaled[:, parameters.FRICTION].clamp_max(0.0).square().sum()
     return out

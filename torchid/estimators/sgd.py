@@ -23,6 +23,7 @@ class Sgd:
 
     Attributes:
         ridge: weight of the prior.
+        rank_tolerance: of the statistics, as in `LeastSquares`.
         consistency: "log_cholesky", every step's parameters are physical; "penalties", steps are pulled there.
         margin: least eigenvalue of every body's scaled pseudo-inertia, kept or aimed at.
         penalties: their weights, with "penalties".
@@ -39,6 +40,7 @@ class Sgd:
     """
 
     ridge: float = 0.0
+    rank_tolerance: float = 1e-10
     consistency: Consistency = "log_cholesky"
     margin: float = 1e-4
     penalties: PenaltyWeights = field(default_factory=PenaltyWeights)
@@ -73,4 +75,4 @@ class Sgd:
                 raise ValueError(f"{name}: found {value}; accepted: a positive number")
         if not (np.isfinite(self.margin) and 0.0 <= self.margin < 1.0):
             raise ValueError(f"margin: found {self.margin}; accepted: a number from 0 to 1, without 1")
-        try_out(self.optimizer, self.optimizer_options, self.schedule, self.schedule_options)
+        try_out(self.optimizer, self.optimizer_options, self.schedule, self.schedule_options, self.epochs)

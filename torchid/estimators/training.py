@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
 
 _BETTER = 1e-5  # relative: less is no improvement
+_DIVERGED = 1e6  # times the loss at the nominal parameters, or that of stated noise if more
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class Trainer:
                 K phi; arguments as in `Batch`.
         """
         self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out
-        self.closed_form = LeastSquares(settings.ridge).solve(problem)
+        self.closed_form = LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
         device = batches.columns.device
         self.loss = Loss(settings, problem, batches, _learnable(settings, problem).to(device), residual)
         groups: list[dict[str, Any]] = [{"params": [self.loss.learnable.raw]}]
@@ -130,7 +132,7 @@ class Trainer:
             on_epoch: called after each epoch.
 
         Raises:
-            InputError: the loss is no longer finite.
+            InputError: the loss has grown beyond all bounds.
         """
         while not self.finished:
             epoch = self.run_epoch()
@@ -142,7 +144,7 @@ class Trainer:
         """Train on all samples once.
 
         Raises:
-            InputError: the loss is no longer finite.
+            InputError: the loss has grown beyond all bounds.
         """
         self.epoch += 1
         self._choose_trained()
@@ -160,11 +162,15 @@ class Trainer:
             elapsed = time.perf_counter() - start
             held_out = None if self.held_out is None else self.loss.mean_square(self.held_out)
         losses["total"] = sum(losses.values())
+        phi, size = self.phi(), squares.pop("measured")
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._check(self._objective(phi))  # no batch has seen the last step yet
+        self._check(0.0 if held_out is None else held_out)
+        self._learn_all()
         step_schedule(self.schedule, losses["total"] if held_out is None else held_out)
         if held_out is None or held_out < self.best_loss * (1.0 - _BETTER):
             self.best_epoch, self.best_loss = self.epoch, losses["total"] if held_out is None else held_out
             self._best = self._learned()
-        phi, size = self.phi(), squares.pop("measured")
         away = self.problem.A @ (phi - self.closed_form.phi)
         return Epoch(
             number=self.epoch,
@@ -211,8 +217,8 @@ class Trainer:
         return {
             "learned": self._learned(),
             "best": self._best,
-            "optimizer": self.optimizer.state_dict(),
-            "schedule": None if self.schedule is None else self.schedule.state_dict(),
+            "optimizer": copy.deepcopy(self.optimizer.state_dict()),  # torch hands out what the next step writes to
+            "schedule": None if self.schedule is None else copy.deepcopy(self.schedule.state_dict()),
             "random": [torch.get_rng_state(), *torch.cuda.get_rng_state_all()],
             "epoch": self.epoch,
             "best_epoch": self.best_epoch,
@@ -223,9 +229,9 @@ class Trainer:
         """Go on where `state_dict` was called."""
         self._learn(state["learned"])
         self._best = state["best"]
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
         if self.schedule is not None:
-            self.schedule.load_state_dict(state["schedule"])
+            self.schedule.load_state_dict(copy.deepcopy(state["schedule"]))
         torch.set_rng_state(state["random"][0])
         torch.cuda.set_rng_state_all(state["random"][1:])
         self.epoch = state["epoch"]
@@ -255,6 +261,16 @@ class Trainer:
             for x in group["params"]:
                 x.requires_grad_(trained)
 
+    def _learn_all(self) -> None:
+        """Leave nothing frozen: another trainer may take the residual module up."""
+        for group in self.optimizer.param_groups:
+            for x in group["params"]:
+                x.requires_grad_(True)
+
+    def _check(self, loss: float) -> None:
+        if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
+            raise InputError("estimator", "training", f"a loss of {loss:.3g} in epoch {self.epoch}", "smaller steps")
+
     def _step(self, batch: Batch) -> Terms:
         """One step of the optimizer; terms are those before it."""
         found: list[Terms] = []
@@ -269,10 +285,11 @@ class Trainer:
             found.append(Terms({name: x.detach() for name, x in terms.losses.items()}, terms.squares))
             return total
 
-        self.optimizer.step(closure)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
-        total = float(found[0].total())
-        if not np.isfinite(total):
-            raise InputError("estimator", "training", f"a loss of {total} in epoch {self.epoch}", "smaller steps")
+        try:
+            self.optimizer.step(closure)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
+        except torch.linalg.LinAlgError:  # eigenvalues of what is not finite
+            self._check(float("nan"))
+        self._check(float(found[0].losses["data"]))
         return found[0]
 
 

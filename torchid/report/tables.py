@@ -77,6 +77,20 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
     return table
 
 
+def violation_table(violations: Sequence[Mapping[str, Any]], most: int = 12) -> Table:
+    """Conditions that parameters break, by body, the first of them."""
+    title = "Conditions that the identified parameters break"
+    if len(violations) > most:
+        title += f", the first {most} of {len(violations)}"
+    table = Table(title=title, title_justify="left")
+    for heading in ("body", "condition", "off by"):
+        table.add_column(heading, justify="right" if heading == "off by" else "left")
+    for found in violations[:most]:
+        amount = Text(f"{found['amount']:.3g} {found['unit']}")
+        table.add_row(Text(found["body"] or "all"), Text(str(found["condition"])), amount)
+    return table
+
+
 def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
     """How a simulated robot stood: fields of `Stability` by motion."""
     table = Table(title="Standing", title_justify="left")

@@ -32,15 +32,14 @@ class RunEvents:
             since: step from which on what earlier event files in the folder say is void.
         """
         self._writer = SummaryWriter(str(folder), purge_step=since)
-        steps = "by epoch" if descent else "step 0: URDF, step 1: identified"
         groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in _SETS]] for group in GROUPS}
         loss = {
             "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
             "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
         }
         least = {"smallest eigenvalue": ["Multiline", [f"eigenvalue/{re.escape(name)}$" for name in bodies]]}
-        layout = {f"errors, share of measured ({steps})": groups, f"bodies ({steps})": least}
-        self._writer.add_custom_scalars(layout | ({"loss (by epoch)": loss} if descent else {}))
+        layout = {"errors, share of measured (step 0: URDF)": groups, "bodies (step 0: URDF)": least}
+        self._writer.add_custom_scalars(layout | ({"loss by epoch": loss} if descent else {}))
 
     def __enter__(self) -> RunEvents:
         return self

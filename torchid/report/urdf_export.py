@@ -17,8 +17,8 @@ from torchid.robot.urdf import parse_xml
 def identified_urdf(robot: Robot, phi: Array) -> bytes:
     """The URDF with parameters `phi`, (L, 12).
 
-    A body's whole inertia goes to the link that names it; links welded to it keep none. Relative mesh paths stay as
-    they were written.
+    A body's whole inertia goes to the link that names it; links welded to it say that they have none. Relative mesh
+    paths stay as they were written.
 
     Warns:
         TorchidWarning: bodies that no distribution of positive mass can have, or negative friction, which simulators
@@ -29,13 +29,11 @@ def identified_urdf(robot: Robot, phi: Array) -> bytes:
     joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
     _warn(robot, phi)
     for body, values in zip(robot.bodies, phi, strict=True):
-        for name in body.links:
-            for inertial in links[name].findall("inertial"):
-                links[name].remove(inertial)
         if body.joint is not None:
             _set_friction(joints[body.joint.name], values)
-        if values[parameters.MASS] != 0.0:
-            links[body.name].insert(0, _inertial(values))
+        if not body.massless or values[parameters.INERTIAL].any():
+            for name in body.links:
+                _set_inertial(links[name], values if name == body.name and values[parameters.MASS] else None)
     etree.indent(tree)
     return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
 
@@ -56,8 +54,22 @@ def _warn(robot: Robot, phi: Array) -> None:
         warnings.warn(message, TorchidWarning, stacklevel=3)
 
 
-def _inertial(values: Array) -> etree._Element:
-    mass, com, inertia = parameters.mass_com_inertia(values)
+def _set_inertial(link: etree._Element, values: Array | None) -> None:
+    """Parameters (12,) of a link, or None for a link whose matter is counted elsewhere.
+
+    That one says 0 kg instead of nothing: of a link that collides and has no `<inertial>` MuJoCo makes up one of the
+    density of water, Bullet one of 1 kg.
+    """
+    before = link.findall("inertial")
+    for inertial in before:
+        link.remove(inertial)
+    if values is not None:
+        link.insert(0, _inertial(*parameters.mass_com_inertia(values)))
+    elif before or link.find("collision") is not None:
+        link.insert(0, _inertial(0.0, np.zeros(3), np.zeros((3, 3))))
+
+
+def _inertial(mass: float, com: Array, inertia: Array) -> etree._Element:
     element = etree.Element("inertial")
     etree.SubElement(element, "origin", xyz=" ".join(repr(float(x)) for x in com), rpy="0 0 0")
     etree.SubElement(element, "mass", value=repr(mass))

@@ -11,9 +11,7 @@ from torchid.config.experiment import EstimatorConfig
 from torchid.errors import ConfigError, TorchidWarning, UnknownNameError
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror
 from torchid.parameters import PARAMETERS, Array
-from torchid.robot import Robot
-from torchid.robot.shapes import body_extents
-from torchid.robot.symmetry import mirror_pairs
+from torchid.robot import Robot, body_extents, mirror_pairs
 
 _POSITIVE = [parameters.MASS, *(4 + i for i, (row, column) in enumerate(parameters.INERTIA_AXES) if row == column)]
 

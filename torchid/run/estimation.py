@@ -8,7 +8,7 @@ import numpy as np
 
 from torchid.config.experiment import EstimatorConfig
 from torchid.errors import UnknownNameError
-from torchid.estimators import Consistent, Estimate, LeastSquares
+from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem
 from torchid.robot import Robot
@@ -31,24 +31,30 @@ def with_frozen(
     return replace(problem, free=problem.free & ~frozen.flatten())
 
 
-def estimate_parameters(
-    problem: LinearProblem, settings: EstimatorConfig, robot: Robot, source: object = "experiment"
-) -> Estimate:
-    """Solve a compressed problem in one go, as an experiment file says.
+def stated_conditions(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> Conditions:
+    """What parameters are to meet, as an experiment file says; least squares may break it.
+
+    Raises:
+        ConfigError: conditions that do not fit the robot.
+    """
+    if settings.name == "consistent":
+        return conditions_from(settings, robot, source)
+    return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0)
+
+
+def estimate_parameters(problem: LinearProblem, settings: EstimatorConfig, conditions: Conditions) -> Estimate:
+    """Solve a compressed problem in one go.
 
     Args:
         problem: in the parameters of all bodies of the robot.
         settings: the estimator, `least_squares` or `consistent`.
-        robot: for the bodies that conditions name.
-        source: named in errors.
+        conditions: that a consistent estimate meets.
 
     Raises:
-        ConfigError: conditions that do not fit the robot.
         InputError: conditions that exclude each other.
     """
     if settings.name == "least_squares":
         return LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
-    conditions = conditions_from(settings, robot, source)
     estimator = Consistent(
         settings.ridge, settings.prior, conditions, settings.method, settings.certify, settings.rank_tolerance
     )

@@ -13,12 +13,12 @@ from rich.progress import Progress
 
 from torchid.config import ExperimentConfig
 from torchid.errors import NumericalWarning, SensorError
-from torchid.estimators import Estimate
-from torchid.parameters import Array
+from torchid.estimators import Estimate, violations
+from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.states import check_base, state_reports
 from torchid.report.metrics import Evaluation, Metrics
-from torchid.run.estimation import estimate_parameters, with_frozen
+from torchid.run.estimation import estimate_parameters, stated_conditions, with_frozen
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
@@ -65,17 +65,20 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
             states = state_reports(logs["train"], builder)
             check_base(states, config.sensors.on_base_lost)
             problem = _compressed(experiment, builder, logs["train"], bars, source)
+            conditions = stated_conditions(config.estimator, experiment.robot, source)
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device)
         with clock("solve"):
             if training is None:
-                estimate = estimate_parameters(problem, config.estimator, experiment.robot, source)
+                estimate = estimate_parameters(problem, config.estimator, conditions)
             else:
                 evaluate = partial(_identified_metrics, evaluation, logs)
                 estimate = training.run(problem, builder, logs, evaluate, bars, resume)
             _check_sense(estimate, source)
         with clock("evaluate"):
             metrics = _metrics(evaluation, logs, estimate.phi, bars)
-        run = Identification(experiment, estimate, states, metrics, clock.seconds, sum(map(len, logs["train"])))
+        broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
+        samples = sum(map(len, logs["train"]))
+        run = Identification(experiment, estimate, states, metrics, broken, clock.seconds, samples)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], training)
     return run

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchid.config import ExperimentConfig, dump_config
-from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
+from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate, Violation
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Samples
 from torchid.problem.predict import force_series
@@ -33,14 +33,20 @@ _PLOTTED_SAMPLES = 3000
 
 @dataclass(frozen=True)
 class Identification:
-    """A finished run: the fit, and nominal and identified metrics by set of logs ("train", "test")."""
+    """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken."""
 
     experiment: Experiment
     estimate: Estimate
     states: list[StateReport]
     metrics: dict[str, tuple[Metrics, Metrics]]
+    violations: list[Violation]
     seconds: dict[str, float]
     samples: int
+
+    def violations_by_name(self) -> list[dict[str, object]]:
+        """Conditions that the identified parameters break, the body by its name."""
+        names = self.experiment.robot.body_names
+        return [asdict(x) | {"body": None if x.body is None else names[x.body]} for x in self.violations]
 
     @property
     def phi(self) -> Array:
@@ -112,6 +118,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "total_mass": float(run.phi[:, 0].sum()),
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
+        "violations": run.violations_by_name(),
         "solution": _solution_document(estimate),
         "contact_states": [asdict(state) for state in run.states],
         "seconds": run.seconds,
@@ -151,8 +158,9 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figur
         events.fit(last, estimate, above)
         final = {
             f"{name}_{group}": value
-            for name, (_, identified) in run.metrics.items()
-            for group, value in identified.relative.items()
+            for name in reversed(SETS)  # unseen logs first: TensorBoard shows the first few
+            if name in run.metrics
+            for group, value in run.metrics[name][1].relative.items()
             if value is not None
         }
         final |= {"rank": float(estimate.rank)} | ({} if above is None else {"objective_above_least": above})
@@ -161,31 +169,28 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figur
 
 def objective_above_least(estimate: Estimate) -> float | None:
     """Share by which the objective is above the least without conditions; None where that is not known."""
-    if not isinstance(estimate, (ConsistentEstimate, SgdEstimate)) or not estimate.unconstrained:
-        return None
-    return estimate.objective / estimate.unconstrained - 1.0
+    if not isinstance(estimate, (ConsistentEstimate, SgdEstimate)):
+        return 0.0
+    return estimate.objective / estimate.unconstrained - 1.0 if estimate.unconstrained else None
 
 
 def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
-    estimator = config.estimator
-    values: dict[str, str | float | bool] = {
+    """The same keys for every estimator: TensorBoard compares runs by the keys of the first that it finds."""
+    estimator, training = config.estimator, config.estimator.training
+    descent = estimator.name == "sgd"
+    return {
         "sensors": config.sensors.set or "by name",
         "estimator": estimator.name,
         "ridge": estimator.ridge,
         "friction": estimator.friction,
         "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
+        "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,
+        "prior": estimator.prior,
+        "consistency": estimator.consistency if descent else estimator.name,
+        "optimizer": training.optimizer["name"] if descent else "none",
+        "lr": float(training.optimizer.get("lr", 0.0)) if descent else 0.0,
+        "schedule": (training.schedule or {}).get("name", "none") if descent else "none",
+        "batch_size": training.batch_size if descent else 0,
+        "epochs": training.epochs if descent else 0,
+        "seed": training.seed if descent else 0,
     }
-    if estimator.name == "consistent":
-        values |= {"prior": estimator.prior, "margin": estimator.margin}
-    if estimator.name == "sgd":
-        training = estimator.training
-        values |= {
-            "consistency": estimator.consistency,
-            "optimizer": training.optimizer["name"],
-            "lr": float(training.optimizer.get("lr", 0.0)),
-            "schedule": (training.schedule or {}).get("name", "none"),
-            "batch_size": training.batch_size,
-            "epochs": training.epochs,
-            "seed": training.seed,
-        }
-    return values

@@ -58,7 +58,7 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
     elif waiting and not resume and not config.overwrite:
         raise ConfigError(folder, "output", "an unfinished training", "--resume, overwrite=true, or another output")
     if not waiting or not resume:
-        check_free(folder, config.overwrite, TRAINING)
+        check_free(folder, True, TRAINING)  # without a checkpoint there is nothing to lose
 
 
 class Training:
@@ -73,6 +73,7 @@ class Training:
         self.config, self.robot, self.source = config, robot, source
         self.folder = training_folder(config.output)
         self.settings = descent_settings(config, source)
+        self._saved = 0
 
     def run(
         self,
@@ -106,12 +107,14 @@ class Training:
         trainer = Trainer(self.settings, problem, train, held_out)
         self._prepare(trainer, resume)
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
-        with RunEvents(self.folder, self.robot.body_names, True, trainer.epoch + 1) as events:
+        with (
+            self._interruptible(trainer),
+            RunEvents(self.folder, self.robot.body_names, True, trainer.epoch + 1) as events,
+        ):
             if trainer.epoch == 0:
                 self._evaluate(0, trainer.phi(), evaluate, events)
                 self._save(trainer)
-            with self._interruptible(trainer):
-                self._train(trainer, evaluate, events, lambda text: bars.update(bar, advance=1, description=text))
+            self._train(trainer, evaluate, events, lambda text: bars.update(bar, advance=1, description=text))
         return trainer.estimate()
 
     def copy_curves(self, folder: Path) -> None:
@@ -146,6 +149,7 @@ class Training:
             state = load_checkpoint(self.folder)
             self._check(state, trainer)
             trainer.load_state_dict(state["trainer"])
+            self._saved = trainer.epoch
             return
         if self.folder.exists():
             check_free(self.folder, True, TRAINING)
@@ -156,7 +160,7 @@ class Training:
     def _save(self, trainer: Trainer) -> None:
         state = {"config": dump_config(self.config), "logs": _fingerprint(trainer), "trainer": trainer.state_dict()}
         save_checkpoint(self.folder, state)
-        self.saved = trainer.epoch
+        self._saved = trainer.epoch
 
     def _check(self, state: Mapping[str, Any], trainer: Trainer) -> None:
         path = self.folder / CHECKPOINT
@@ -175,7 +179,7 @@ class Training:
         try:
             yield
         except KeyboardInterrupt as error:
-            stopped = f"interrupted in epoch {trainer.epoch}; --resume goes on after epoch {self.saved}"
+            stopped = f"interrupted in epoch {trainer.epoch}; --resume goes on after epoch {self._saved}"
             raise KeyboardInterrupt(stopped) from error
 
 
@@ -190,6 +194,7 @@ def descent_settings(config: ExperimentConfig, source: object = "experiment") ->
     try:
         return Sgd(
             ridge=estimator.ridge,
+            rank_tolerance=estimator.rank_tolerance,
             consistency=estimator.consistency,
             margin=estimator.margin,
             penalties=PenaltyWeights(**vars(estimator.penalties)),

@@ -1,0 +1,91 @@
+"""A small network beside the rigid body: what do rigid bodies and friction not explain?
+
+    python scripts/train_residual.py                                     # on the log that comes with torchid
+    python scripts/train_residual.py my.yaml estimator.friction=false    # yours; friction is left to the network
+
+The logs under `test` are only looked at in the end. Curves go to TensorBoard: `tensorboard --logdir runs/residual`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor, nn
+
+import torchid
+from torchid.cli import guarded
+from torchid.config import load_config
+from torchid.errors import ConfigError
+from torchid.estimators import Sgd, Trainer
+from torchid.problem import MiniBatches
+from torchid.report.tensorboard import RunEvents
+from torchid.run.experiment import set_up
+
+DEMO = Path(torchid.__file__).parent / "demo" / "quadruped.yaml"
+
+
+class JointNetworks(nn.Module):
+    """r(q, v, a): a small network for every joint's torque, from that joint's own motion; no force on the base."""
+
+    def __init__(self, n: int, hidden: int = 16) -> None:
+        """Start at no force at all."""
+        super().__init__()
+        self.n = n
+        self.weight = nn.Parameter(torch.randn(n, hidden, 3, dtype=torch.float64))
+        self.bias = nn.Parameter(torch.randn(n, hidden, dtype=torch.float64))
+        self.out = nn.Parameter(torch.zeros(n, hidden, dtype=torch.float64))
+
+    def forward(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """Generalized forces, (B, nv) [N m]."""
+        motion = torch.stack([q[:, -self.n :], v[:, -self.n :], 0.1 * a[:, -self.n :]], dim=2)  # (B, n, 3)
+        features = torch.tanh((self.weight @ motion[..., None])[..., 0] + self.bias)  # (B, n, hidden)
+        return nn.functional.pad((features * self.out).sum(2), (v.shape[1] - self.n, 0))
+
+
+def main() -> int:
+    """Train without and with the networks, and print what they change."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", nargs="?", default=DEMO, help="experiment file")
+    parser.add_argument("overrides", nargs="*", help="key.subkey=value")
+    parser.add_argument("--mode", choices=["joint", "parameters_first", "alternating"], default="joint")
+    parser.add_argument("--epochs", type=int, default=100, help="passes over the training logs")
+    parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="folder for TensorBoard")
+    options = parser.parse_args()
+    return guarded("train_residual", lambda: compare(options))
+
+
+def compare(options: argparse.Namespace) -> None:
+    """Train twice on the same batches."""
+    config = load_config(options.file, options.overrides)
+    if not config.logs.test:
+        raise ConfigError(options.file, "logs.test", "none", "logs to judge the networks by")
+    experiment = set_up(config, options.file)
+    robot = experiment.robot
+    builder = torchid.RowBuilder(robot, experiment.contacts, experiment.sensors)
+    train, test = (experiment.read(paths, required=True) for paths in (config.logs.train, config.logs.test))
+    problem = torchid.linear_problem(torchid.compress(train, builder), builder, robot, config.estimator.friction)
+    settings = Sgd(ridge=config.estimator.ridge, epochs=options.epochs, residual=options.mode, residual_lr=0.01)
+    torch.manual_seed(0)
+
+    table = Table(title="rms of the projected residual, in standard deviations of the stated sensor noise")
+    for name in ("", "training logs", "unseen logs", "share of rigid bodies", "share of networks"):
+        table.add_column(name, justify="right" if name else "left")
+    for name, networks in (("rigid bodies alone", None), ("with networks", JointNetworks(robot.n))):
+        trainer = Trainer(settings, problem, MiniBatches(train, builder), residual=networks)
+        with RunEvents(options.curves / name.replace(" ", "_"), robot.body_names, descent=True) as events:
+            for _ in track(range(options.epochs), description=name):
+                epoch = trainer.run_epoch()
+                events.epoch(epoch)
+        seen, unseen = (trainer.loss.mean_square(MiniBatches(logs, builder)) ** 0.5 for logs in (train, test))
+        shares = (f"{100.0 * epoch.shares.get(of, 0.0):.3g} %" for of in ("rigid_body", "residual"))
+        table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)
+    Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

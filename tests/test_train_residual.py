@@ -1,0 +1,35 @@
+"""`scripts/train_residual.py`: networks beside the rigid body."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import torch
+from script_calls import ROOT, call, script
+
+DEMO = str(ROOT / "torchid" / "demo" / "quadruped.yaml")
+
+
+def test_networks_find_the_friction_that_the_model_lacks(tmp_path: Path) -> None:
+    status, printed, _ = call(
+        "train_residual", DEMO, "estimator.friction=false", "--epochs", "25", "--curves", str(tmp_path)
+    )
+    assert status == 0
+    rows = [line for line in printed.splitlines() if "│" in line]
+    alone, beside = (float(re.findall(r"\d+\.\d+", row)[1]) for row in rows)
+    assert beside < 0.5 * alone
+    assert {path.name for path in tmp_path.iterdir()} == {"rigid_bodies_alone", "with_networks"}
+
+
+def test_networks_start_at_no_force() -> None:
+    q, v, a = (torch.randn(5, size, dtype=torch.float64) for size in (11, 10, 10))
+    force = script("train_residual").JointNetworks(4)(q, v, a)
+    assert force.shape == (5, 10)
+    assert not force.any()
+
+
+def test_without_unseen_logs_there_is_nothing_to_compare() -> None:
+    status, _, told = call("train_residual", DEMO, "logs.test=[]")
+    assert status == 2
+    assert "logs.test: none" in told
