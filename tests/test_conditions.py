@@ -324,7 +324,8 @@ def test_a_projection_is_the_nearest_parameters_that_meet_the_conditions(prior: 
 def test_parameters_that_meet_the_conditions_are_their_own_projection(method: Method, prior: Prior) -> None:
     before = GOOD.copy()
     found = project(GOOD, SCALE, Conditions(1e-4), prior=prior, method=method)
-    np.testing.assert_allclose(found / SCALE, GOOD / SCALE, rtol=0.0, atol=1e-6)
+    accuracy = 1e-5 if (method, prior) == ("certified", "entropic") else 1e-6  # sqrt(gap), an exponential cone's 1e-10
+    np.testing.assert_allclose(found / SCALE, GOOD / SCALE, rtol=0.0, atol=accuracy)
     np.testing.assert_array_equal(GOOD, before)
 
 

@@ -46,7 +46,7 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
 
 
 def _follow(problem: ConicProblem, tolerance: float) -> Solution:
-    x, steps = _interior(problem)
+    x, steps = interior(problem)
     path = _Path(problem)
     kappa = max(problem.objective(x), problem.floor) / max(problem.degree, 1)
     best = Solution(x, problem.objective(x), np.inf, steps)
@@ -59,14 +59,18 @@ def _follow(problem: ConicProblem, tolerance: float) -> Solution:
         if gap <= tolerance * max(best.objective, problem.floor):
             break
         kappa *= _SHRINK
-    if not best.gap <= _LOOSE * max(best.objective, problem.floor):
+    if not best.gap <= max(_LOOSE, tolerance) * max(best.objective, problem.floor):
         message = f"estimator: the barrier method stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
         warnings.warn(message, NumericalWarning, stacklevel=5)
     return best
 
 
-def _interior(problem: ConicProblem) -> tuple[Array, int]:
-    """A strictly feasible x, near 0 if that is one, and the Newton steps it took to find."""
+def interior(problem: ConicProblem) -> tuple[Array, int]:
+    """A strictly feasible x, near 0 if that is one, and the Newton steps it took to find.
+
+    Raises:
+        InputError: there is none.
+    """
     x = problem.E.T @ problem.e
     worst = float(problem.slack(x).min(initial=np.inf))
     if worst > _INSIDE:
@@ -87,7 +91,7 @@ def _interior(problem: ConicProblem) -> tuple[Array, int]:
 
 
 def _relaxed(problem: ConicProblem, kappa: float) -> ConicProblem:
-    """Min s, with s added to every eigenvalue and slack: negative s is what `_interior` looks for.
+    """Min s, with s added to every eigenvalue and slack: negative s is what `interior` looks for.
 
     A pull to 0 that fades with the barrier, and a bound on s, keep what would grow for ever at its place.
     """

@@ -11,10 +11,13 @@ except ImportError as error:
 import numpy as np
 
 from torchid.errors import InputError, NumericalWarning
+from torchid.estimators.barrier import interior
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.parameters import Array
+from torchid.problem.threads import one_thread
 
 _LOOSE = 1e-6  # relative gap that is worth another try, and in the end a warning
+_OUTSIDE = 1e-7  # how far conditions may be missed, in units of the scale
 _TRIES = (1.0, 10.0, 0.1, 100.0)  # units of the objective: Clarabel stalls on an exponential cone now and then
 
 
@@ -22,19 +25,29 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
     """Solve with Clarabel, a primal-dual interior-point method: its multipliers certify what it finds.
 
     Raises:
-        InputError: the conditions exclude each other, or the solver gave up.
+        InputError: the conditions exclude each other, or the solver found nothing.
 
     Warns:
         NumericalWarning: the solver stopped short.
     """
     size = max(problem.constant, problem.floor, 10.0 * float(problem.weights.max(initial=0.0)))
-    best = Solution(np.zeros(len(problem.linear)), np.inf, np.inf, 0)
+    found, status = [], ""
     for unit in _TRIES:
-        best = min(best, _solve(problem, unit * size, tolerance), key=lambda found: found.gap)
-        if best.gap <= _LOOSE * max(best.objective, problem.floor):
-            return best
+        try:
+            found.append(_solve(problem, unit * size, tolerance))
+        except cp.SolverError as error:
+            status = str(error)
+            continue
+        outside = -float(problem.slack(found[-1].x).min(initial=0.0))
+        if found[-1].gap <= _LOOSE * max(found[-1].objective, problem.floor) and outside <= _OUTSIDE:
+            return found[-1]
+    if not found:
+        with one_thread():
+            interior(problem)  # names what is excluded
+        raise InputError("estimator", "method", f"certified, but Clarabel says {status}", "barrier")
+    best = min(found, key=lambda solution: solution.gap)
     message = f"estimator: the conic solver stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
-    warnings.warn(message, NumericalWarning, stacklevel=4)
+    warnings.warn(message + f", {outside:.1g} outside the conditions", NumericalWarning, stacklevel=4)
     return best
 
 
@@ -65,17 +78,11 @@ def _solve(problem: ConicProblem, size: float, tolerance: float) -> Solution:
 def _run(programme: cp.Problem, tolerance: float) -> None:
     """Solve, accepting what is not quite optimal: the gap says by how much."""
     accuracy = {"tol_gap_abs": tolerance, "tol_gap_rel": tolerance, "tol_feas": tolerance}
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of an inaccurate solution
-            programme.solve(solver=cp.CLARABEL, accept_unknown=True, **accuracy)
-    except cp.SolverError as error:
-        raise InputError("estimator", "method", f"certified, but Clarabel gave up: {error}", "barrier") from error
-    if programme.status in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE):
-        found = "they exclude each other"
-        raise InputError("estimator", "conditions", found, "conditions that some robot can meet")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of an inaccurate solution
+        programme.solve(solver=cp.CLARABEL, accept_unknown=True, **accuracy)
     if programme.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-        raise InputError("estimator", "method", f"certified, but Clarabel says {programme.status}", "barrier")
+        raise cp.SolverError(programme.status)
 
 
 def _positive(Z: Array) -> Array:

@@ -39,7 +39,7 @@ def make_optimizer(name: str, options: Mapping[str, Any], groups: Sequence[Group
     """
     found = dict(_classes(torch.optim, Optimizer)).get(name)
     if found is None:
-        raise UnknownNameError("estimator", "optimizer", name, optimizer_names())
+        raise _unknown("optimizer", name, optimizer_names())
     try:
         return found(list(groups), **options)
     except _FAILURES as error:
@@ -59,7 +59,7 @@ def make_schedule(
         return None
     found = dict(_classes(lr_scheduler, LRScheduler)).get(name)
     if found is None:
-        raise UnknownNameError("estimator", "schedule", name, schedule_names())
+        raise _unknown("schedule", name, schedule_names())
     lengths = {key: epochs for key in _WHOLE_RUN if key in inspect.signature(found).parameters}
     try:
         return found(optimizer, **{**lengths, **options})
@@ -113,6 +113,12 @@ def try_out(
 def _classes(module: Any, base: type) -> list[tuple[str, Any]]:
     found = inspect.getmembers(module, inspect.isclass)
     return [(name, x) for name, x in found if issubclass(x, base) and x is not base and not name.startswith("_")]
+
+
+def _unknown(field: str, name: str, names: Sequence[str]) -> UnknownNameError:
+    """The refusal of a name; one that is right but for its case is the nearest (`sgd` is like no name to difflib)."""
+    same = [known for known in names if known.lower() == name.lower()]
+    return UnknownNameError("estimator", field, name, same or names)
 
 
 def _accepted(found: Any) -> str:

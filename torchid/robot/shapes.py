@@ -208,7 +208,9 @@ def _inertia_box(inertial: Inertial) -> _Shape:
 def _extent(shapes: list[_Shape]) -> Extent | None:
     """Of one body's shapes, None if they are a point."""
     boxes = [_box(shapes, axes) for axes in (np.eye(3), *(shape.axes for shape in shapes))]
-    centre, axes, half = min(boxes, key=lambda box: float(np.prod(box[2])) * (1.0 - 1e-9 * (box is boxes[0])))
+    volumes = [float(np.prod(half)) for _, _, half in boxes]
+    best = next(i for i, volume in enumerate(volumes) if volume <= min(volumes) * (1.0 + 1e-9))  # the link's if as good
+    centre, axes, half = boxes[best]
     if not half.any():
         return None
     half = np.maximum(half, _THINNEST * half.max())

@@ -13,7 +13,8 @@ from torchid.estimators.conditions import Conditions, Enclosure, Mirror
 from torchid.parameters import PARAMETERS, Array
 from torchid.robot import Robot, body_extents, mirror_pairs
 
-_POSITIVE = [parameters.MASS, *(4 + i for i, (row, column) in enumerate(parameters.INERTIA_AXES) if row == column)]
+_FRICTION = PARAMETERS[parameters.FRICTION]
+_POSITIVE = ("m", "Ixx", "Iyy", "Izz")
 
 
 def conditions_from(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> Conditions:
@@ -99,16 +100,18 @@ def _bounds(settings: EstimatorConfig, robot: Robot, source: object) -> tuple[Ar
             if parameter not in PARAMETERS:
                 raise UnknownNameError(source, field, parameter, PARAMETERS)
             number, field = PARAMETERS.index(parameter), f"{field}.{parameter}"
-            _check_fitted(settings, robot, body, number, source, field)
+            _check_fitted(settings, robot, body, parameter, source, field)
+            _check_interval(parameter, low, high, source, field)
             lower[body, number] = -np.inf if low is None else low
             upper[body, number] = np.inf if high is None else high
-            _check_interval(number, low, high, source, field)
     return lower, upper
 
 
-def _check_fitted(settings: EstimatorConfig, robot: Robot, body: int, number: int, source: object, field: str) -> None:
+def _check_fitted(
+    settings: EstimatorConfig, robot: Robot, body: int, parameter: str, source: object, field: str
+) -> None:
     """Refuse a bound on what stays as it is in the URDF."""
-    name, friction = robot.body_names[body], number in range(*parameters.FRICTION.indices(len(PARAMETERS)))
+    name, friction = robot.body_names[body], parameter in _FRICTION
     if name in settings.frozen:
         raise ConfigError(source, field, "a bound on a body that is frozen", "one of the two")
     if friction and robot.bodies[body].joint is None:
@@ -119,12 +122,12 @@ def _check_fitted(settings: EstimatorConfig, robot: Robot, body: int, number: in
         raise ConfigError(source, field, f"a bound, but {name} has no mass in the URDF", "a body that has")
 
 
-def _check_interval(number: int, low: float | None, high: float | None, source: object, field: str) -> None:
+def _check_interval(parameter: str, low: float | None, high: float | None, source: object, field: str) -> None:
     """Refuse what no number, or no body, is within."""
     if low is not None and high is not None and low > high:
         raise ConfigError(source, field, f"{low:g} above {high:g}", "[lower, upper], null for an open side")
     negative = min(x for x in (low, high, 0.0) if x is not None) < 0.0
-    if number in range(*parameters.FRICTION.indices(len(PARAMETERS))) and negative:
+    if parameter in _FRICTION and negative:
         raise ConfigError(source, field, f"[{low}, {high}]", "bounds of at least 0: friction resists")
-    if number in _POSITIVE and high is not None and high <= 0.0:
+    if parameter in _POSITIVE and high is not None and high <= 0.0:
         raise ConfigError(source, field, f"at most {high:g}", "an upper bound above 0")
