@@ -56,6 +56,8 @@ def test_both_solvers_find_the_same_optimum_and_meet_every_condition(seed: int, 
     for estimate, outside in ((fast, 1e-12), (sure, 1e-7)):  # Clarabel's iterates end up to 1e-8 outside
         phi = estimate.phi.reshape(case.truth.shape)
         assert violations(phi, case.scale, case.conditions, max(outside, 1e-9)) == []
+        off = [violation.condition for violation in violations(phi, case.scale, case.conditions)]
+        assert not [condition for condition in off if "mirror" in condition or "total" in condition]
         least = least_eigenvalues(phi, case.scale)
         assert (least >= case.conditions.margin - outside).all()
         np.testing.assert_allclose(estimate.eigenvalues, least, rtol=0.0, atol=1e-12)

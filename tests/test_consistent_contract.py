@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from torchid.errors import InputError, NumericalWarning
 from torchid.estimators import certified
 from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror, violations
+from torchid.estimators.conic import Solution
 from torchid.estimators.consistent import Consistent, Method, Prior
 from torchid.estimators.formulate import conic_problem
 from torchid.problem.linear import parameter_scale
@@ -137,20 +139,36 @@ def test_a_body_can_be_symmetric(method: Method) -> None:
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), prior=st.sampled_from(PRIORS))
 def test_no_multipliers_claim_a_gap_that_is_too_small(seed: int, prior: Prior) -> None:
-    """Weak duality: near the best point and far from it, with multipliers near the best ones and at random."""
+    """Weak duality: at the best point and far from it, with multipliers of that point, of another, and at random."""
     rng = np.random.default_rng(seed)
     case = random_case(rng)
-    conic = conic_problem(case.problem, case.conditions, 10.0 ** rng.uniform(-6.0, -1.0), prior)
+    ridge = 0.0 if prior == "euclidean" else 10.0 ** rng.uniform(-6.0, -1.0)
+    conic = conic_problem(case.problem, case.conditions, ridge, prior)
     best = solve_barrier(conic)
     inside = solve_barrier(conic, tolerance=1.0).x
-    for share in (1e-6, 1e-3, 0.1, 1.0):
-        x = (1.0 - share) * best.x + share * inside
+    for here, there in ((0.0, 1e-3), (0.0, 1.0), (1e-3, 1e-3), (0.1, 0.0), (1.0, 0.1), (1.0, 1.0)):
+        x, elsewhere = ((1.0 - share) * best.x + share * inside for share in (here, there))
         kappa = 10.0 ** rng.uniform(-12.0, 0.0)
-        Z = (kappa + conic.weights)[:, None, None] * np.linalg.inv(conic.blocks(x))
+        Z = (kappa + conic.weights)[:, None, None] * np.linalg.inv(conic.blocks(elsewhere))
+        y = kappa / (conic.G @ elsewhere - conic.h)
         root = rng.normal(size=Z.shape)
         for noise in (0.0, kappa):
-            gap = conic.gap(x, Z + noise * root @ root.mT, kappa / (conic.G @ x - conic.h))
+            gap = conic.gap(x, Z + noise * root @ root.mT, y)
             assert gap >= conic.objective(x) - best.objective - 1e-12
+
+
+def test_multipliers_that_push_where_the_data_say_nothing_certify_nothing() -> None:
+    """Data on the mass alone, and the multiplier of a face of the box that its centre of mass lies on."""
+    nominal = random_bodies(np.random.default_rng(14), 1)
+    box = Enclosure(0, "box", nominal[0, 1:4] / nominal[0, 0], np.eye(3), np.full(3, 0.1))
+    problem = replace(nothing_seen(nominal), A=np.eye(12)[:1])  # a mass of 0
+    conic = conic_problem(problem, Conditions(enclosures=(box,)), 0.0, "euclidean")
+    face = conic.names.index("centre of mass of body 0") - len(conic.base)
+    x = np.zeros(12)
+    x[1] = (conic.h[face] - conic.G[face] @ x) / conic.G[face, 1]
+    y = np.zeros(len(conic.h))
+    y[face] = conic.gradient(x)[0] / conic.G[face, 0]
+    assert conic.gap(x, np.zeros_like(conic.base), y) >= conic.objective(x) - solve_barrier(conic).objective > 0.0
 
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-6])
@@ -174,6 +192,26 @@ def test_a_solver_that_stops_short_says_so(method: Method, monkeypatch: pytest.M
     with pytest.warns(NumericalWarning, match="stopped at a gap of"):
         estimate = Consistent(1e-3, method=method).solve(problem)
     assert estimate.gap > 1e-6 * estimate.objective
+
+
+def test_a_conic_solver_that_ends_outside_the_conditions_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, _ = active_case(4)
+    solve = certified._solve
+
+    def outside(*arguments: Any) -> Solution:
+        found = solve(*arguments)
+        return replace(found, x=1.1 * found.x)
+
+    monkeypatch.setattr(certified, "_solve", outside)
+    with pytest.warns(NumericalWarning, match="outside the conditions"):
+        Consistent(1e-3, method="certified").solve(problem)
+
+
+def test_outside_the_domain_of_an_entropic_prior_nothing_is_an_objective() -> None:
+    problem, _ = active_case(4)
+    conic = conic_problem(problem, Conditions(), 1e-3, "entropic")
+    assert np.isfinite(conic.objective(np.zeros(24)))
+    assert conic.objective(-2.0 * problem.nominal / problem.scale) == np.inf
 
 
 # --------------------------------------------------------------------------------------------------------- the contract

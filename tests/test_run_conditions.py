@@ -19,7 +19,7 @@ from urdfs import INERTIAL, inertial, joint, link, table, write
 
 import torchid
 from torchid.config import dump_config, load_config
-from torchid.config.experiment import EstimatorConfig
+from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError
 from torchid.estimators.conditions import Conditions, mirrored_parameters, violations
 from torchid.parameters import PARAMETERS

@@ -24,7 +24,7 @@ _SIMULATE = "let a robot move in simulation and write the logs of its sensors (n
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
-    options = _parser().parse_args(arguments)
+    options = _options(arguments)
     return guarded("torchid", lambda: options.command(options), options.debug)
 
 
@@ -53,6 +53,17 @@ def guarded(program: str, command: Callable[[], None], debug: bool = False) -> i
             print(f"{program}: {type(error).__name__}: {what} (--debug shows where)", file=sys.stderr)
             return 1
     return 0
+
+
+def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """What the command line says; overrides may also come after options, where argparse takes them for strangers."""
+    parser = _parser()
+    options, late = parser.parse_known_args(arguments)
+    if late and (not hasattr(options, "overrides") or any(text.startswith("-") for text in late)):
+        parser.error(f"unrecognized arguments: {' '.join(late)}")
+    if late:
+        options.overrides = [*options.overrides, *late]
+    return options
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -112,10 +123,9 @@ def _interrupt_held_back() -> Iterator[None]:
 def _identify(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
         from torchid.config import load_config
-        from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate
+        from torchid.estimators import BoundEstimate, ConsistentEstimate, Estimate, SgdEstimate
         from torchid.report.tables import error_tables, print_tables, state_table, violation_table
         from torchid.run import identify
-        from torchid.run.results import objective_above_least
         from torchid.run.training import body_eigenvalues
 
     run = identify(load_config(options.file, options.overrides), options.file, options.resume)
@@ -131,9 +141,8 @@ def _identify(options: argparse.Namespace) -> None:
     print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
-    above = objective_above_least(estimate)
-    if above:
-        print(f"objective     {100.0 * above:.3g} % above the least without conditions")
+    if isinstance(estimate, BoundEstimate) and estimate.relative_price is not None:
+        print(f"objective     {100.0 * estimate.relative_price:.3g} % above the least without conditions")
     if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
         print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
     if isinstance(estimate, SgdEstimate):

@@ -1,14 +1,16 @@
-"""The settings of a descent in an experiment file."""
+"""The settings of the estimators in an experiment file."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
-from torchid.config.types import STRICT, NotNegative, Positive, Seed, no_flag
+from torchid.config.types import STRICT, NotNegative, Number, Positive, Seed, no_flag
+from torchid.errors import ConfigError
 
 
 def _with_name(value: dict[str, Any]) -> dict[str, Any]:
@@ -20,6 +22,19 @@ def _with_name(value: dict[str, Any]) -> dict[str, Any]:
 Count = Annotated[int, BeforeValidator(no_flag), Field(ge=1)]
 Named = Annotated[dict[str, Any], AfterValidator(_with_name)]
 """A class of `torch.optim` and what it takes: `{name: Adam, lr: 0.05}`."""
+
+
+Interval = Annotated[list[Number | None], Field(min_length=2, max_length=2)]
+"""[lower, upper], None where it is open."""
+
+
+@dataclass(config=STRICT, frozen=True)
+class SymmetryConfig:
+    """Bodies whose names differ in `left` and `right` are mirror images along the base link's axis `normal`."""
+
+    left: Annotated[str, Field(min_length=1)]
+    right: Annotated[str, Field(min_length=1)]
+    normal: Literal["x", "y", "z"] = "y"
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -51,3 +66,62 @@ class TrainingConfig:
     seed: Seed = 0
     evaluate_every: Count = 10
     checkpoint_seconds: NotNegative = 5.0
+
+
+@dataclass(config=STRICT, frozen=True)
+class EstimatorConfig:
+    """How parameters are found.
+
+    `ridge` pulls to the URDF, `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of
+    theirs; `margin` of the scaled pseudo-inertias.
+
+    For `consistent`: `prior` that the ridge is in, `total_mass` [kg] if known, `method` and whether to `certify` with
+    the other; `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry` makes left
+    and right mirror images, `bounds` are [lower, upper] by body and parameter, null for none.
+
+    For `sgd`: `consistency` kept by log-Cholesky parameters or sought by `penalties`, and `training`.
+    """
+
+    name: Literal["least_squares", "consistent", "sgd"] = "least_squares"
+    ridge: NotNegative = 0.0
+    rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
+    friction: bool = True
+    frozen: list[str] = dataclasses.field(default_factory=list)
+    margin: Annotated[Number, Field(ge=0.0, lt=1.0)] = 1e-4
+    prior: Literal["euclidean", "pullback", "entropic"] = "euclidean"
+    method: Literal["barrier", "certified"] = "barrier"
+    certify: bool = False
+    total_mass: Positive | None = None
+    com_inside: Literal["box", "ellipsoid"] | None = None
+    com_shapes: Literal["visual", "collision"] = "visual"
+    symmetry: SymmetryConfig | None = None
+    bounds: dict[str, dict[str, Interval]] | None = None
+    consistency: Literal["log_cholesky", "penalties"] = "log_cholesky"
+    penalties: PenaltiesConfig = dataclasses.field(default_factory=PenaltiesConfig)
+    training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
+
+
+_ALL = ("name", "ridge", "rank_tolerance", "friction", "frozen")
+_PHYSICAL = ("prior", "method", "certify", "total_mass", "com_inside", "com_shapes", "symmetry", "bounds")
+_KEYS = {
+    "least_squares": _ALL,
+    "consistent": (*_ALL, "margin", *_PHYSICAL),
+    "sgd": (*_ALL, "margin", "consistency", "penalties", "training"),
+}
+
+
+def check_keys(estimator: EstimatorConfig, path: Path) -> None:
+    """Refuse a setting that the estimator has not: it would be ignored in silence.
+
+    Raises:
+        ConfigError: names the estimators that have it.
+    """
+    defaults = EstimatorConfig()
+    for key, value in vars(estimator).items():
+        if key not in _KEYS[estimator.name] and value != getattr(defaults, key):
+            having = [name for name, keys in _KEYS.items() if key in keys]
+            found = f"set, which {estimator.name} has not"
+            raise ConfigError(path, f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
+    if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
+        found = f"set, which consistency: {estimator.consistency} has not"
+        raise ConfigError(path, "estimator.penalties", found, "consistency: penalties, or no such key")

@@ -11,9 +11,9 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
-from torchid.config.estimator import PenaltiesConfig, TrainingConfig
+from torchid.config.estimator import EstimatorConfig, check_keys
 from torchid.config.reading import FileKind, Settings, dump, load
-from torchid.config.types import STRICT, Device, NotNegative, Number, Positive
+from torchid.config.types import STRICT, Device, Positive
 from torchid.errors import ConfigError, TorchidWarning
 from torchid.sensing.sensors import SensorNoise
 
@@ -81,48 +81,6 @@ class SensorsConfig:
     on_base_lost: Literal["error", "warn"] = "error"
 
 
-Interval = Annotated[list[Number | None], Field(min_length=2, max_length=2)]
-
-
-@dataclass(config=STRICT, frozen=True)
-class SymmetryConfig:
-    """Bodies whose names differ in `left` and `right` are mirror images along the base link's axis `normal`."""
-
-    left: Annotated[str, Field(min_length=1)]
-    right: Annotated[str, Field(min_length=1)]
-    normal: Literal["x", "y", "z"] = "y"
-
-
-@dataclass(config=STRICT, frozen=True)
-class EstimatorConfig:
-    """How parameters are found from the compressed logs.
-
-    `ridge` pulls to the URDF, `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of
-    theirs. The rest is for `consistent`, which returns what a physical robot can have: `margin` of the scaled
-    pseudo-inertias, `prior` that the ridge is in, `total_mass` [kg] if known, `method` and whether to `certify` it with
-    the other one; `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry` makes left
-    and right mirror images, `bounds` are [lower, upper] by body and parameter, null for none.
-    """
-
-    name: Literal["least_squares", "consistent", "sgd"] = "least_squares"
-    ridge: NotNegative = 0.0
-    rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
-    friction: bool = True
-    frozen: list[str] = dataclasses.field(default_factory=list)
-    margin: Annotated[Number, Field(ge=0.0, lt=1.0)] = 1e-4
-    prior: Literal["euclidean", "pullback", "entropic"] = "euclidean"
-    method: Literal["barrier", "certified"] = "barrier"
-    certify: bool = False
-    total_mass: Positive | None = None
-    com_inside: Literal["box", "ellipsoid"] | None = None
-    com_shapes: Literal["visual", "collision"] = "visual"
-    symmetry: SymmetryConfig | None = None
-    bounds: dict[str, dict[str, Interval]] | None = None
-    consistency: Literal["log_cholesky", "penalties"] = "log_cholesky"
-    penalties: PenaltiesConfig = dataclasses.field(default_factory=PenaltiesConfig)
-    training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
-
-
 def _spelled_out(value: object) -> object:
     return {"set": value} if isinstance(value, str) else value
 
@@ -180,7 +138,8 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     path = Path(path)
     config = load(_EXPERIMENT, path, overrides)
     _check_sensors(path, config.sensors)
-    _check_estimator(path, config)
+    check_keys(config.estimator, path)
+    _check_held_out(path, config)
     logs = {key: _matching(path, f"logs.{key}", getattr(config.logs, key)) for key in ("train", "test", "validation")}
     for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
         both = sorted({*logs[key]} & {*logs["test"]})
@@ -215,26 +174,9 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
     return out
 
 
-_ALL = ("name", "ridge", "rank_tolerance", "friction", "frozen")
-_PHYSICAL = ("prior", "method", "certify", "total_mass", "com_inside", "com_shapes", "symmetry", "bounds")
-_KEYS = {
-    "least_squares": _ALL,
-    "consistent": (*_ALL, "margin", *_PHYSICAL),
-    "sgd": (*_ALL, "margin", "consistency", "penalties", "training"),
-}
-
-
-def _check_estimator(path: Path, config: ExperimentConfig) -> None:
-    """Refuse a setting that the estimator has not: it would be ignored in silence."""
-    estimator, defaults = config.estimator, EstimatorConfig()
-    for key, value in vars(estimator).items():
-        if key not in _KEYS[estimator.name] and value != getattr(defaults, key):
-            having = [name for name, keys in _KEYS.items() if key in keys]
-            found = f"set, which {estimator.name} has not"
-            raise ConfigError(path, f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
-    if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
-        found = f"set, which consistency: {estimator.consistency} has not"
-        raise ConfigError(path, "estimator.penalties", found, "consistency: penalties, or no such key")
+def _check_held_out(path: Path, config: ExperimentConfig) -> None:
+    """Held-out logs are for a descent, and patience needs some."""
+    estimator = config.estimator
     if config.logs.validation and estimator.name != "sgd":
         raise ConfigError(path, "logs.validation", f"set, which {estimator.name} has no use for", "estimator.name: sgd")
     if estimator.training.patience is not None and not config.logs.validation:

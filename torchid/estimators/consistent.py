@@ -13,39 +13,28 @@ from torchid.estimators.conditions import Conditions, check_parameters
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.estimators.formulate import Prior, conic_problem
 from torchid.estimators.least_squares import LeastSquares
-from torchid.estimators.result import Estimate
-from torchid.parameters import PER_BODY, Array
+from torchid.estimators.result import BoundEstimate
+from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 
 Method = Literal["barrier", "certified"]
 
 
 @dataclass(frozen=True)
-class ConsistentEstimate(Estimate):
-    """An estimate that meets its conditions.
+class ConsistentEstimate(BoundEstimate):
+    """An estimate that meets its conditions; the entropic prior, which has no other domain, has no unconstrained one.
 
     Attributes:
-        objective: mean squared whitened residual plus prior.
-        unconstrained: the least objective without conditions; None for the entropic prior, which has no other domain.
         gap: to the dual objective; no parameters that meet the conditions have an objective lower by more.
         certified_gap: difference from the other solver's objective, None unless asked for. Relative to the objective;
             where data without noise leave next to none, relative to 1e-8 of the mean square of the data or 1e-3 of the
             ridge, whichever is larger.
-        eigenvalues: (L,), smallest eigenvalue of every body's scaled pseudo-inertia, NaN for bodies without mass.
         steps: Newton steps, or iterations of the conic solver.
     """
 
-    objective: float
-    unconstrained: float | None
     gap: float
     certified_gap: float | None
-    eigenvalues: Array
     steps: int
-
-    @property
-    def price(self) -> float | None:
-        """What the conditions cost: objective less the unconstrained one; None for the entropic prior."""
-        return None if self.unconstrained is None else self.objective - self.unconstrained
 
 
 @dataclass(frozen=True)
@@ -53,7 +42,7 @@ class Consistent:
     """min ||A phi - b||^2 / rows + ridge * prior(phi) over all phi that a physical robot can have.
 
     What is not free stays nominal, whether or not it meets the conditions: `violations` tells. "barrier" stays inside
-    them; "certified" meets them to the accuracy of its solver, 1e-8 of their natural size.
+    them; "certified" meets them to the accuracy of its solver, mostly 1e-9 of the scale, and warns beyond 1e-7.
 
     Attributes:
         ridge: weight of the prior against the mean square of the whitened residual.
@@ -96,23 +85,14 @@ class Consistent:
             certified_gap = abs(other.objective - solution.objective) / compared
         phi = problem.nominal.copy()
         phi[problem.free] += problem.scale[problem.free] * solution.x
-        scaled = (phi / problem.scale).reshape(-1, PER_BODY)
-        eigenvalues = np.asarray(np.linalg.eigvalsh(parameters.pseudo_inertia(scaled))[:, 0], dtype=np.float64)
-        eigenvalues[~scaled[:, parameters.INERTIAL].any(axis=1)] = np.nan
         return ConsistentEstimate(
-            phi=phi,
-            standard_error=plain.standard_error,
-            identifiable=plain.identifiable,
-            rank=plain.rank,
-            condition_number=plain.condition_number,
-            cost=problem.cost(phi),
-            nominal_cost=plain.nominal_cost,
-            rows=problem.rows,
+            **(vars(plain) | {"phi": phi, "cost": problem.cost(phi)}),
             objective=solution.objective,
             unconstrained=conic.unconstrained,
+            distance=problem.distance(phi, plain.phi),
+            eigenvalues=parameters.least_eigenvalues(phi, problem.scale),
             gap=solution.gap,
             certified_gap=certified_gap,
-            eigenvalues=eigenvalues,
             steps=solution.steps,
         )
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchid import parameters
 from torchid.parameters import PER_BODY
 from torchid.problem.linear import LinearProblem
+from torchid.problem.threads import one_thread
 
 _LEAST_FRICTION = 0.01  # of its scale: where friction starts if the URDF has none, since 0 is out of reach
 _LEAST_EIGENVALUE = 1e-3  # above the margin, where the URDF's body is not that far inside
@@ -50,6 +51,7 @@ class LearnableParameters(nn.Module, ABC):
         """phi, (12 L,)."""
         return self.constrained(self.preconditioner @ self.raw)
 
+    @one_thread()  # with two on a busy machine 1.4 s were seen instead of 3 ms
     def precondition(self, problem: LinearProblem, ridge: float, damping: float) -> None:
         """Set the preconditioner to (H + damping I)^(-1/2).
 

@@ -36,6 +36,7 @@ class LeastSquares:
         if not 0.0 < self.rank_tolerance < 1.0:
             raise ValueError(f"rank_tolerance: found {self.rank_tolerance}; accepted: a number between 0 and 1")
 
+    @one_thread()  # twice as fast as two on some hundred columns
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters.
 
@@ -80,6 +81,5 @@ def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:
     """Minimum-norm inverse, singular values and rank, from one call of `torch.linalg.lstsq`."""
     identity = torch.eye(A.shape[0], dtype=torch.float64)
     rcond = max(tolerance, np.finfo(float).eps * max(A.shape))
-    with one_thread():  # twice as fast as two on some hundred columns
-        solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
+    solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
     return solved.solution.numpy(), solved.singular_values.numpy(), int(solved.rank)

@@ -36,3 +36,30 @@ class Estimate:
     def residual_std(self) -> float:
         """Standard deviation of the whitened residual: 1 where the stated sensor noise explains everything."""
         return float(np.sqrt(self.cost / max(self.rows - self.rank, 1)))
+
+
+@dataclass(frozen=True)
+class BoundEstimate(Estimate):
+    """An estimate that is bound by conditions, beside what is best without.
+
+    Attributes:
+        objective: mean squared whitened residual plus prior.
+        unconstrained: the least objective without conditions; None where it is not known.
+        distance: rms difference of the projected whitened forces from those of `LeastSquares` with the same ridge.
+        eigenvalues: (L,), smallest eigenvalue of every body's scaled pseudo-inertia, NaN for bodies without mass.
+    """
+
+    objective: float
+    unconstrained: float | None
+    distance: float
+    eigenvalues: Array
+
+    @property
+    def price(self) -> float | None:
+        """What the conditions cost: objective less the unconstrained one; None where that is not known."""
+        return None if self.unconstrained is None else self.objective - self.unconstrained
+
+    @property
+    def relative_price(self) -> float | None:
+        """The price as a share of the unconstrained objective; None where that is not known or 0."""
+        return None if self.price is None or not self.unconstrained else self.price / self.unconstrained

@@ -18,7 +18,7 @@ from torchid.estimators.learnable import FreeParameters, LearnableParameters, Lo
 from torchid.estimators.least_squares import LeastSquares
 from torchid.estimators.loss import Loss, Terms
 from torchid.estimators.optimizers import make_optimizer, make_schedule, step_schedule
-from torchid.estimators.result import Estimate
+from torchid.estimators.result import BoundEstimate
 from torchid.estimators.sgd import Sgd
 from torchid.parameters import Array
 from torchid.problem.batches import Batch, MiniBatches
@@ -59,20 +59,14 @@ class Epoch:
 
 
 @dataclass(frozen=True)
-class SgdEstimate(Estimate):
-    """What a descent arrived at.
+class SgdEstimate(BoundEstimate):
+    """What a descent arrived at; objective and distance are those of the parameters alone.
 
     Attributes:
-        objective: mean squared whitened residual plus prior, of the parameters alone.
-        unconstrained: the least objective without conditions, that of `LeastSquares`.
-        eigenvalues: (L,), smallest eigenvalue of every body's scaled pseudo-inertia, NaN for bodies without mass.
         epochs: that were run.
         best_epoch: whose parameters these are.
     """
 
-    objective: float
-    unconstrained: float
-    eigenvalues: Array
     epochs: int
     best_epoch: int
 
@@ -171,14 +165,13 @@ class Trainer:
         if held_out is None or held_out < self.best_loss * (1.0 - _BETTER):
             self.best_epoch, self.best_loss = self.epoch, losses["total"] if held_out is None else held_out
             self._best = self._learned()
-        away = self.problem.A @ (phi - self.closed_form.phi)
         return Epoch(
             number=self.epoch,
             losses=losses,
             held_out=held_out,
             objective=self._objective(phi),
             closed_form=self._objective(self.closed_form.phi),
-            distance=float(np.sqrt(away @ away / max(self.problem.rows, 1))),
+            distance=self.problem.distance(phi, self.closed_form.phi),
             shares={name: float(np.sqrt(x / size)) if size else 0.0 for name, x in squares.items()},
             learning_rate=rate,
             samples_per_second=self.batches.samples / elapsed,
@@ -197,16 +190,10 @@ class Trainer:
         self._learn(self._best)
         plain, phi = self.closed_form, self.phi()
         return SgdEstimate(
-            phi=phi,
-            standard_error=plain.standard_error,
-            identifiable=plain.identifiable,
-            rank=plain.rank,
-            condition_number=plain.condition_number,
-            cost=self.problem.cost(phi),
-            nominal_cost=plain.nominal_cost,
-            rows=plain.rows,
+            **(vars(plain) | {"phi": phi, "cost": self.problem.cost(phi)}),
             objective=self._objective(phi),
             unconstrained=self._objective(plain.phi),
+            distance=self.problem.distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, self.problem.scale),
             epochs=self.epoch,
             best_epoch=self.best_epoch,
@@ -229,13 +216,23 @@ class Trainer:
         """Go on where `state_dict` was called."""
         self._learn(state["learned"])
         self._best = state["best"]
-        self.optimizer.load_state_dict(copy.deepcopy(state["optimizer"]))
+        self._load_optimizer(copy.deepcopy(state["optimizer"]))
         if self.schedule is not None:
             self.schedule.load_state_dict(copy.deepcopy(state["schedule"]))
         torch.set_rng_state(state["random"][0])
         torch.cuda.set_rng_state_all(state["random"][1:])
         self.epoch = state["epoch"]
         self.best_epoch, self.best_loss = state["best_epoch"], state["best_loss"]
+
+    def _load_optimizer(self, state: dict[str, Any]) -> None:
+        """Load an optimizer's state, scalars in the precision they had (torch would widen those of NAdam)."""
+        self.optimizer.load_state_dict(state)
+        trained = [x for group in self.optimizer.param_groups for x in group["params"]]
+        for index, saved in state["state"].items():
+            own = self.optimizer.state[trained[index]]
+            for name, value in saved.items():
+                if isinstance(value, Tensor):
+                    own[name] = own[name].to(value.dtype)
 
     def _learned(self) -> dict[str, Tensor]:
         return {name: x.detach().clone() for name, x in self.loss.state_dict().items()}
@@ -287,7 +284,7 @@ class Trainer:
 
         try:
             self.optimizer.step(closure)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
-        except torch.linalg.LinAlgError:  # eigenvalues of what is not finite
+        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]  # eigenvalues of what is not finite
             self._check(float("nan"))
         self._check(float(found[0].losses["data"]))
         return found[0]

@@ -50,6 +50,11 @@ class LinearProblem:
         misfit = self.A @ phi - self.b
         return float(misfit @ misfit + self.residual)
 
+    def distance(self, phi: Array, other: Array) -> float:
+        """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""
+        away = self.A @ (phi - other)
+        return float(np.sqrt(away @ away / max(self.rows, 1)))
+
 
 def parameter_scale(nominal: Array) -> Array:
     """Size of a plausible deviation of each parameter, (L, 12): what the pull to the URDF is measured in.

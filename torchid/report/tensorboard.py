@@ -9,7 +9,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
-from torchid.estimators import Epoch, Estimate
+from torchid.estimators import BoundEstimate, Epoch, Estimate
 from torchid.report.metrics import GROUPS, Metrics
 
 _SETS = ("train", "test")
@@ -74,15 +74,30 @@ class RunEvents:
         for tag, value in scalars.items():
             self._writer.add_scalar(tag, value, epoch.number)
 
-    def fit(self, step: int, estimate: Estimate, objective_above_least: float | None) -> None:
-        """Figures of the fit; `objective_above_least`: share by which its objective is above that of least squares."""
+    def solution(self, estimate: Estimate, samples_per_second: float) -> None:
+        """What a fit in one go says of itself, in the charts of a descent.
+
+        Args:
+            estimate: the fit.
+            samples_per_second: of the stream through the logs.
+        """
+        rows = max(estimate.rows, 1)
+        self._writer.add_scalar("loss/data", estimate.nominal_cost / rows, 0)
+        self._writer.add_scalar("loss/data", estimate.cost / rows, 1)
+        self._writer.add_scalar("descent/samples_per_second", samples_per_second, 1)
+        if isinstance(estimate, BoundEstimate):
+            self._writer.add_scalar("loss/prior", estimate.objective - estimate.cost / rows, 1)
+            self._writer.add_scalar("closed_form/distance", estimate.distance, 1)
+            if estimate.relative_price is not None:
+                self._writer.add_scalar("closed_form/objective_above_least", estimate.relative_price, 1)
+
+    def fit(self, step: int, estimate: Estimate) -> None:
+        """Statistics of the problem."""
         scalars = {"residual_std": estimate.residual_std, "rank": estimate.rank}
         if estimate.rank:
             scalars["condition_number"] = estimate.condition_number
         for name, value in scalars.items():
             self._writer.add_scalar(f"fit/{name}", value, step)
-        if objective_above_least is not None:
-            self._writer.add_scalar("closed_form/objective_above_least", objective_above_least, step)
 
     def close_with(
         self,

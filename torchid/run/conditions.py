@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 from torchid import parameters
-from torchid.config.experiment import EstimatorConfig
+from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, TorchidWarning, UnknownNameError
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror
 from torchid.parameters import PARAMETERS, Array

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchid.config.experiment import EstimatorConfig
+from torchid.config.estimator import EstimatorConfig
 from torchid.errors import UnknownNameError
 from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares
 from torchid.parameters import PER_BODY

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchid.config import ExperimentConfig, dump_config
-from torchid.estimators import ConsistentEstimate, Estimate, SgdEstimate, Violation
+from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Samples
 from torchid.problem.predict import force_series
@@ -127,35 +127,23 @@ def metrics_document(run: Identification) -> dict[str, object]:
 
 def _solution_document(estimate: Estimate) -> dict[str, object] | None:
     """What is known of the optimum, or of the descent."""
-    if isinstance(estimate, ConsistentEstimate):
-        return {
-            "objective": estimate.objective,
-            "unconstrained_objective": estimate.unconstrained,
-            "gap": estimate.gap,
-            "certified_gap": estimate.certified_gap,
-            "steps": estimate.steps,
-        }
-    if isinstance(estimate, SgdEstimate):
-        return {
-            "objective": estimate.objective,
-            "unconstrained_objective": estimate.unconstrained,
-            "epochs": estimate.epochs,
-            "best_epoch": estimate.best_epoch,
-        }
-    return None
+    if not isinstance(estimate, BoundEstimate):
+        return None
+    names = ("objective", "unconstrained", "distance", "gap", "certified_gap", "steps", "epochs", "best_epoch")
+    return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}
 
 
 def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figure]) -> None:
     estimate, robot, config = run.estimate, run.experiment.robot, run.experiment.config
-    above = objective_above_least(estimate)
-    descent = isinstance(estimate, SgdEstimate)
-    last = estimate.epochs if isinstance(estimate, SgdEstimate) else 1
-    with RunEvents(folder, robot.body_names, descent) as events:
-        if not descent:
+    epochs = estimate.epochs if isinstance(estimate, SgdEstimate) else None
+    last = 1 if epochs is None else epochs
+    with RunEvents(folder, robot.body_names, epochs is not None) as events:
+        if epochs is None:
             for step, phi in enumerate(candidates(robot, estimate.phi)):
                 events.errors(step, {name: pair[step] for name, pair in run.metrics.items()})
                 events.eigenvalues(step, body_eigenvalues(robot, phi))
-        events.fit(last, estimate, above)
+            events.solution(estimate, run.samples / run.seconds["compress"])
+        events.fit(last, estimate)
         final = {
             f"{name}_{group}": value
             for name in reversed(SETS)  # unseen logs first: TensorBoard shows the first few
@@ -163,15 +151,9 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figur
             for group, value in run.metrics[name][1].relative.items()
             if value is not None
         }
-        final |= {"rank": float(estimate.rank)} | ({} if above is None else {"objective_above_least": above})
+        price = estimate.relative_price if isinstance(estimate, BoundEstimate) else 0.0
+        final |= {"rank": float(estimate.rank)} | ({} if price is None else {"objective_above_least": price})
         events.close_with(dump_config(config), _hyperparameters(config), final, figures, last)
-
-
-def objective_above_least(estimate: Estimate) -> float | None:
-    """Share by which the objective is above the least without conditions; None where that is not known."""
-    if not isinstance(estimate, (ConsistentEstimate, SgdEstimate)):
-        return 0.0
-    return estimate.objective / estimate.unconstrained - 1.0 if estimate.unconstrained else None
 
 
 def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:

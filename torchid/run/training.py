@@ -73,7 +73,7 @@ class Training:
         self.config, self.robot, self.source = config, robot, source
         self.folder = training_folder(config.output)
         self.settings = descent_settings(config, source)
-        self._saved = 0
+        self._text, self._saved = dump_config(config), 0
 
     def run(
         self,
@@ -107,10 +107,8 @@ class Training:
         trainer = Trainer(self.settings, problem, train, held_out)
         self._prepare(trainer, resume)
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
-        with (
-            self._interruptible(trainer),
-            RunEvents(self.folder, self.robot.body_names, True, trainer.epoch + 1) as events,
-        ):
+        since = trainer.epoch + 1 if trainer.epoch else 0
+        with self._interruptible(trainer), RunEvents(self.folder, self.robot.body_names, True, since) as events:
             if trainer.epoch == 0:
                 self._evaluate(0, trainer.phi(), evaluate, events)
                 self._save(trainer)
@@ -155,10 +153,10 @@ class Training:
             check_free(self.folder, True, TRAINING)
             shutil.rmtree(self.folder)
         self.folder.mkdir(parents=True)
-        (self.folder / "config.yaml").write_text(dump_config(self.config))
+        (self.folder / "config.yaml").write_text(self._text)
 
     def _save(self, trainer: Trainer) -> None:
-        state = {"config": dump_config(self.config), "logs": _fingerprint(trainer), "trainer": trainer.state_dict()}
+        state = {"config": self._text, "logs": _fingerprint(trainer), "trainer": trainer.state_dict()}
         save_checkpoint(self.folder, state)
         self._saved = trainer.epoch
 
@@ -166,7 +164,7 @@ class Training:
         path = self.folder / CHECKPOINT
         if set(state) != {"config", "logs", "trainer"}:
             raise InputError(path, "file", "not a checkpoint of a run", "one that torchid identify wrote")
-        before, now = (yaml.safe_load(text) for text in (state["config"], dump_config(self.config)))
+        before, now = (yaml.safe_load(text) for text in (state["config"], self._text))
         for place, old, new in _differences(before, now):
             if place not in _FREE_TO_CHANGE:
                 raise ConfigError(self.source, place, f"{new}, but the checkpoint has {old}", "the same settings")
