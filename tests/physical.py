@@ -8,8 +8,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from synthetic import Array
 
+from torchid import parameters
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror
+from torchid.estimators.consistent import Method, Prior
 from torchid.problem.linear import LinearProblem, parameter_scale
+
+PRIORS: tuple[Prior, ...] = ("euclidean", "pullback", "entropic")
+METHODS: tuple[Method, ...] = ("barrier", "certified")
 
 
 def of_points(mass: Array, place: Array) -> Array:
@@ -175,3 +180,16 @@ def nothing_seen(nominal: Array, free: np.ndarray | None = None) -> LinearProble
     free = np.ones(nominal.size, dtype=bool) if free is None else free
     row = np.zeros((1, nominal.size))
     return LinearProblem(row, np.zeros(1), 0.0, 1, nominal.ravel(), parameter_scale(nominal).ravel(), free)
+
+
+turned = Rotation.from_euler("xyz", [0.3, -0.5, 0.7]).as_matrix()
+
+
+def body(mass: float, centre: Array, principal: list[float], friction: tuple[float, float] = (0.1, 0.2)) -> Array:
+    """One body, (1, 12), of principal inertias about its centre of mass in turned axes."""
+    ten = parameters.inertial_vector(mass, np.asarray(centre, dtype=float), turned @ np.diag(principal) @ turned.T)
+    return np.append(ten, friction)[None]
+
+
+GOOD = body(2.0, np.array([0.1, -0.2, 0.3]), [0.3, 0.4, 0.5])
+SCALE = parameter_scale(GOOD)

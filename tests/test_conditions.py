@@ -1,8 +1,7 @@
-"""Conditions on bodies: what the checker finds, mirror images, enclosures, the nearest parameters that meet them."""
+"""Conditions on bodies: what the checker finds, mirror images, enclosures."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,41 +9,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physical import (
-    Case,
+    GOOD,
+    SCALE,
+    body,
     com,
     least_eigenvalues,
     of_points,
-    prior_value,
     random_bodies,
     random_case,
-    random_parameters_within,
     random_points,
     random_reflection,
+    turned,
 )
-from scipy.spatial.transform import Rotation
 from synthetic import Array
 
-from torchid import parameters
-from torchid.errors import InputError
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror, Violation, mirrored_parameters, violations
-from torchid.estimators.consistent import Method, Prior, project
+from torchid.estimators.consistent import project
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)
-PRIORS: tuple[Prior, ...] = ("euclidean", "pullback", "entropic")
-METHODS: tuple[Method, ...] = ("barrier", "certified")
 few = settings(max_examples=50, deadline=None, derandomize=True)
-turned = Rotation.from_euler("xyz", [0.3, -0.5, 0.7]).as_matrix()
-
-
-def body(mass: float, centre: Array, principal: list[float], friction: tuple[float, float] = (0.1, 0.2)) -> Array:
-    """One body, (1, 12), of principal inertias about its centre of mass in turned axes."""
-    ten = parameters.inertial_vector(mass, np.asarray(centre, dtype=float), turned @ np.diag(principal) @ turned.T)
-    return np.append(ten, friction)[None]
-
-
-GOOD = body(2.0, np.array([0.1, -0.2, 0.3]), [0.3, 0.4, 0.5])
-SCALE = parameter_scale(GOOD)
 
 
 def only(phi: Array, conditions: Conditions, scale: Array = SCALE) -> Violation:
@@ -278,120 +262,3 @@ def test_the_mirror_image_is_that_of_its_points(seed: int) -> None:
         expected = of_points(mass, place @ S.T) + np.repeat([0.0, 0.3], [10, 2])
         np.testing.assert_allclose(mirrored_parameters(S) @ phi, expected, rtol=0.0, atol=1e-13 * np.abs(phi).max())
         np.testing.assert_allclose(mirrored_parameters(S.T) @ mirrored_parameters(S), np.eye(12), rtol=0.0, atol=1e-14)
-
-
-# --------------------------------------------------------------------------------------------------------- projection
-
-
-def drawn(rng: np.random.Generator, prior: Prior) -> tuple[Case, Array | None]:
-    """Parameters to project, with the conditions, and the bodies whose pseudo-inertias measure deviations."""
-    case = random_case(rng)
-    nominal = case.problem.nominal.reshape(case.truth.shape)
-    if prior == "entropic":  # from bodies that exist
-        return replace(case, truth=random_bodies(rng, len(nominal))), None
-    return case, nominal if prior == "pullback" else None
-
-
-@pytest.mark.parametrize("prior", PRIORS)
-@settings(max_examples=10, deadline=None, derandomize=True)
-@given(seed=seeds)
-def test_a_projection_is_the_nearest_parameters_that_meet_the_conditions(prior: Prior, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    case, reference = drawn(rng, prior)
-    phi, scale, conditions = case.truth, case.scale, case.conditions
-
-    def distance(other: Array) -> float:
-        return prior_value(prior, other, phi, scale, reference)
-
-    near, sure = (project(phi, scale, conditions, prior=prior, nominal=reference, method=method) for method in METHODS)
-    assert violations(near, scale, conditions) == []
-    assert violations(sure, scale, conditions, 1e-7) == []  # Clarabel's iterates end up to 1e-8 outside
-    nearest = distance(near)
-    assert nearest == pytest.approx(distance(sure), rel=1e-6, abs=1e-9)
-    np.testing.assert_allclose(near / scale, sure / scale, rtol=0.0, atol=1e-4)  # sqrt(gap)
-    nominal = case.problem.nominal.reshape(phi.shape)
-    if not violations(nominal, scale, conditions):
-        for share in (1e-4, 1e-2, 1.0):
-            assert distance((1.0 - share) * near + share * nominal) >= nearest * (1.0 - 1e-8)
-    if not (conditions.enclosures or conditions.mirrors or conditions.total_mass or conditions.lower is not None):
-        for size in np.repeat([1e-4, 1e-2, 1e-1], 20):
-            other = random_parameters_within(rng, near, scale, conditions, size)
-            assert other is None or distance(other) >= nearest * (1.0 - 1e-8)
-
-
-@pytest.mark.parametrize("prior", PRIORS)
-@pytest.mark.parametrize("method", METHODS)
-def test_parameters_that_meet_the_conditions_are_their_own_projection(method: Method, prior: Prior) -> None:
-    before = GOOD.copy()
-    found = project(GOOD, SCALE, Conditions(1e-4), prior=prior, method=method)
-    accuracy = 1e-5 if (method, prior) == ("certified", "entropic") else 1e-6  # sqrt(gap), an exponential cone's 1e-10
-    np.testing.assert_allclose(found / SCALE, GOOD / SCALE, rtol=0.0, atol=accuracy)
-    np.testing.assert_array_equal(GOOD, before)
-
-
-def test_a_projection_projects_no_further() -> None:
-    found = project(body(2.0, np.zeros(3), [0.1, 0.2, 0.4]), SCALE, Conditions(1e-3))
-    assert violations(found, SCALE, Conditions(1e-3)) == []
-    again = project(found, SCALE, Conditions(1e-3))
-    np.testing.assert_allclose(again / SCALE, found / SCALE, rtol=0.0, atol=1e-6)
-
-
-def test_the_metric_of_a_projection_matters() -> None:
-    """A light body's parameters move least where its own pseudo-inertia measures them."""
-    broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
-    measure = parameters.perturbed(GOOD, 0.3, np.random.default_rng(0))
-    near = {
-        "euclidean": project(broken, SCALE, Conditions()),
-        "pullback": project(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD),
-        "other": project(broken, SCALE, Conditions(), prior="pullback", nominal=measure),
-    }
-    for name, reference in (("pullback", GOOD), ("other", measure)):
-        apart = {other: prior_value("pullback", phi, broken, SCALE, reference) for other, phi in near.items()}
-        assert min(apart, key=lambda other: apart[other]) == name
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_bodies_without_mass_get_none_by_projection(method: Method) -> None:
-    phi = np.concatenate([body(1.0, np.zeros(3), [0.1, 0.2, 0.4]), np.zeros((2, 12))])
-    phi[2, 10] = 0.3  # a joint's friction, whatever hangs on it
-    found = project(phi, np.repeat(SCALE, 3, axis=0), Conditions(1e-4), method=method)
-    np.testing.assert_array_equal(found[1:, :10], 0.0)
-    np.testing.assert_array_equal(found[1, 10:], 0.0)
-    assert found[2, 10] == pytest.approx(0.3, abs=1e-6)
-    assert found[2, 11] == 0.0
-
-
-def test_friction_of_zero_moves_only_to_a_mirror_image_or_a_bound() -> None:
-    phi = np.repeat(GOOD, 3, axis=0)
-    phi[:, :10] = body(2.0, np.zeros(3), [0.3, 0.4, 0.5])[:, :10]
-    phi[:, 10], phi[:, 11] = (0.0, 0.3, 0.0), (0.0, 0.0, 0.0)
-    lower = np.full(phi.shape, -np.inf)
-    lower[2, 11] = 0.2
-    mirror = Mirror(0, 1, np.eye(3))
-    found = project(phi, np.repeat(SCALE, 3, axis=0), Conditions(mirrors=(mirror,), lower=lower))
-    np.testing.assert_allclose(found[:, 10], [0.15, 0.15, 0.0], rtol=0.0, atol=1e-7)
-    np.testing.assert_allclose(found[:, 11], [0.0, 0.0, 0.2], rtol=0.0, atol=1e-7)
-    assert found[2, 10] == 0.0
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_distances_that_are_not_defined_are_refused(method: Method) -> None:
-    broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
-    for arguments in ({"prior": "entropic"}, {"prior": "pullback"}, {"prior": "pullback", "nominal": broken}):
-        with pytest.raises(InputError, match=f"{arguments['prior']}, but no density of matter has .* body 0"):
-            project(broken, SCALE, Conditions(), method=method, **arguments)
-    assert violations(project(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD), SCALE, Conditions()) == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"prior": "riemannian"}, "prior: found 'riemannian'; accepted: euclidean, pullback, entropic"),
-        ({"method": "sdp"}, "method: found 'sdp'; accepted: barrier, certified"),
-        ({"nominal": GOOD}, "nominal: found parameters for the euclidean prior"),
-        ({"prior": "pullback", "nominal": GOOD[:, :10]}, "nominal: found shape"),
-    ],
-)
-def test_arguments_of_a_projection_that_make_no_sense_are_refused(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        project(GOOD, SCALE, Conditions(), **arguments)

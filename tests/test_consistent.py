@@ -9,6 +9,8 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from physical import (
+    METHODS,
+    PRIORS,
     active_case,
     as_good_as_none,
     data,
@@ -33,8 +35,6 @@ from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=10, deadline=None, derandomize=True)
-PRIORS: tuple[Prior, ...] = ("euclidean", "pullback", "entropic")
-METHODS: tuple[Method, ...] = ("barrier", "certified")
 both = pytest.mark.parametrize("method", METHODS)
 all_priors = pytest.mark.parametrize("prior", PRIORS)
 

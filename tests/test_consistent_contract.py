@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physical import (
+    METHODS,
+    PRIORS,
     active_case,
     nothing_seen,
     of_points,
@@ -30,8 +32,6 @@ from torchid.estimators.consistent import Consistent, Method, Prior
 from torchid.estimators.formulate import conic_problem
 from torchid.problem.linear import parameter_scale
 
-PRIORS: tuple[Prior, ...] = ("euclidean", "pullback", "entropic")
-METHODS: tuple[Method, ...] = ("barrier", "certified")
 both = pytest.mark.parametrize("method", METHODS)
 all_priors = pytest.mark.parametrize("prior", PRIORS)
 

@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from torchid import parameters
 from torchid.config import ExperimentConfig, dump_config
-from torchid.errors import ConfigError, InputError, TorchidWarning
+from torchid.errors import ConfigError, InputError, SensorError, TorchidWarning
 from torchid.estimators import Epoch, PenaltyWeights, Sgd, SgdEstimate, Trainer
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, MiniBatches, RowBuilder, Samples
@@ -95,6 +95,7 @@ class Training:
             resume: whether to go on from the checkpoint, if there is one.
 
         Raises:
+            SensorError: nothing to learn.
             InputError: the checkpoint belongs to other settings or logs; the descent diverged.
             KeyboardInterrupt: says how to go on.
         """
@@ -105,6 +106,8 @@ class Training:
         )
         assert train is not None  # noqa: S101  # an experiment has training logs
         trainer = Trainer(self.settings, problem, train, held_out)
+        if not trainer.closed_form.rank:
+            raise SensorError(self.source, "sensors", "no parameter is in reach of them", "other sensors or contacts")
         self._prepare(trainer, resume)
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
         since = trainer.epoch + 1 if trainer.epoch else 0
@@ -179,6 +182,9 @@ class Training:
         except KeyboardInterrupt as error:
             stopped = f"interrupted in epoch {trainer.epoch}; --resume goes on after epoch {self._saved}"
             raise KeyboardInterrupt(stopped) from error
+        except InputError:  # it would diverge again; the curves stay, to be looked at
+            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+            raise
 
 
 def descent_settings(config: ExperimentConfig, source: object = "experiment") -> Sgd:
