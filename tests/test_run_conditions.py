@@ -29,7 +29,7 @@ from torchid.robot import Robot
 from torchid.robot.shapes import body_extents
 from torchid.run import identify
 from torchid.run.conditions import conditions_from
-from torchid.run.estimation import estimate_parameters
+from torchid.run.estimation import batch_estimator
 from torchid.sensing import Contact, named_sensors
 
 DEMO = Path(torchid.__file__).parent / "demo"
@@ -305,10 +305,10 @@ def test_all_conditions_hold_together_where_least_squares_breaks_each(kind: str,
             "bounds": {"base_link": {"m": [1.2, 1.3]}, "FL_SHOULDER": {"fc": [0.05, 0.1]}}}  # fmt: skip
     settings = settings_of(tmp_path, ridge=1e-3, margin=1e-3, **keys)
     wanted, scale = conditions_from(settings, robot), parameter_scale(robot.nominal)
-    phi = estimate_parameters(problem, settings, wanted).phi.reshape(robot.nominal.shape)
+    phi = batch_estimator(settings, wanted).solve(problem).phi.reshape(robot.nominal.shape)
     assert violations(phi, scale, wanted, 1e-7) == []
     assert phi[:, 0].sum() == pytest.approx(2.5)
-    plain = estimate_parameters(problem, replace(settings, name="least_squares"), wanted).phi
+    plain = batch_estimator(replace(settings, name="least_squares"), wanted).solve(problem).phi
     broken = " ".join(found.condition for found in violations(plain.reshape(phi.shape), scale, wanted))
     for word in (f"outside its {kind}", "no mirror image", "total mass", "m beyond its bounds", "fc beyond", "margin"):
         assert word in broken

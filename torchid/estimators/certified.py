@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import warnings
 
-try:
-    import cvxpy as cp
-except ImportError as error:
-    raise ImportError("the certified method needs CVXPY and Clarabel: pip install 'torchid[certified]'") from error
+import cvxpy as cp
 import numpy as np
 
 from torchid.errors import InputError, NumericalWarning

@@ -76,6 +76,7 @@ class Conditions:
         enclosures: of centres of mass.
         mirrors: left and right.
         lower, upper: bounds (L, 12), infinite where there are none; friction is never negative.
+        names: of the bodies, for messages; numbers if empty.
     """
 
     margin: float = 1e-4
@@ -84,6 +85,7 @@ class Conditions:
     mirrors: tuple[Mirror, ...] = ()
     lower: Array | None = None
     upper: Array | None = None
+    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -91,6 +93,10 @@ class Conditions:
             raise ValueError(f"margin: found {self.margin}; accepted: a number from 0 to 1, without 1")
         if self.total_mass is not None and not (np.isfinite(self.total_mass) and self.total_mass > 0.0):
             raise ValueError(f"total_mass: found {self.total_mass}; accepted: a positive number")
+
+    def called(self, body: int) -> str:
+        """What messages call a body."""
+        return self.names[body] if self.names else f"body {body}"
 
     def check_bodies(self, bodies: int) -> None:
         """Make sure that they are about a robot of that many bodies.
@@ -174,7 +180,9 @@ def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: floa
         image = mirrored_parameters(mirror.reflection) @ phi[mirror.body]
         off = float(np.max(np.abs(image - phi[mirror.image]) / scale[mirror.image]))
         if off > tolerance:
-            out.append(Violation(mirror.image, f"no mirror image of body {mirror.body}", off, "of its scale"))
+            out.append(
+                Violation(mirror.image, f"no mirror image of {conditions.called(mirror.body)}", off, "of its scale")
+            )
     if conditions.total_mass is not None:
         off = float(abs(phi[:, parameters.MASS].sum() - conditions.total_mass))
         if off > tolerance * conditions.total_mass:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Literal, get_args
 
 import numpy as np
 
 from torchid import parameters
+from torchid.errors import InputError
 from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, check_parameters
 from torchid.estimators.conic import ConicProblem, Solution
@@ -63,8 +65,16 @@ class Consistent:
     rank_tolerance: float = 1e-10
 
     def __post_init__(self) -> None:
-        """Check names and weights."""
+        """Check names and weights.
+
+        Raises:
+            ValueError: one that cannot be.
+            InputError: the certified method without CVXPY and Clarabel.
+        """
         _check_names(self.prior, self.method)
+        if (self.certify or self.method == "certified") and not (find_spec("cvxpy") and find_spec("clarabel")):
+            found = "needs CVXPY and Clarabel, which are not installed"
+            raise InputError("estimator", "certified", found, "pip install 'torchid[certified]', or barrier alone")
         LeastSquares(self.ridge, self.rank_tolerance)
 
     def solve(self, problem: LinearProblem) -> ConsistentEstimate:

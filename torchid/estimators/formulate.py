@@ -34,7 +34,8 @@ class _Block:
 class _Variables:
     """Which entry of x every free parameter is, and what the others are worth, all in units of their scale."""
 
-    def __init__(self, problem: LinearProblem) -> None:
+    def __init__(self, problem: LinearProblem, conditions: Conditions) -> None:
+        self.called = conditions.called
         self.free, self.count = problem.free.reshape(-1, PER_BODY), int(problem.free.sum())
         self.place = (np.cumsum(problem.free) - 1).reshape(-1, PER_BODY)
         self.scale = problem.scale.reshape(-1, PER_BODY)
@@ -69,7 +70,7 @@ def conic_problem(
         reference: (12 L,), whose pseudo-inertias measure a pull-back prior's deviations; None for the nominal ones.
     """
     conditions.check_bodies(len(problem.nominal) // PER_BODY)
-    x = _Variables(problem)
+    x = _Variables(problem, conditions)
     blocks = [_matter(x, body, conditions.margin) for body in x.bodies]
     enclosures = [enclosure for enclosure in conditions.enclosures if enclosure.body in x.bodies]
     blocks += [_ellipsoid(x, enclosure) for enclosure in enclosures if enclosure.kind == "ellipsoid"]
@@ -126,7 +127,7 @@ def _floor(problem: LinearProblem, ridge: float) -> float:
 def _matter(x: _Variables, body: int, margin: float) -> _Block:
     """Scaled pseudo-inertia of a body, less the margin."""
     base = parameters.pseudo_inertia(x.nominal[body]) - margin * np.eye(4)
-    return _Block(f"pseudo-inertia of body {body}", base, _TEN, x.ten(body))
+    return _Block(f"pseudo-inertia of {x.called(body)}", base, _TEN, x.ten(body))
 
 
 def _ellipsoid(x: _Variables, enclosure: Enclosure) -> _Block:
@@ -140,7 +141,7 @@ def _ellipsoid(x: _Variables, enclosure: Enclosure) -> _Block:
         slopes[number, :3, 3] = slopes[number, 3, :3] = column
     slopes /= mass
     base = np.einsum("v,vij->ij", x.nominal[body, parameters.INERTIAL], slopes)
-    return _Block(f"centre of mass of body {body}", base, slopes, x.ten(body))
+    return _Block(f"centre of mass of {x.called(body)}", base, slopes, x.ten(body))
 
 
 def _box(x: _Variables, enclosure: Enclosure) -> list[Row]:
@@ -152,7 +153,7 @@ def _box(x: _Variables, enclosure: Enclosure) -> list[Row]:
             weights[parameters.MASS] = 1.0 - sign * (axis @ enclosure.centre) / half
             weights[parameters.FIRST_MOMENT] = sign * axis / half
             row, constant = x.row(enclosure.body, weights / x.scale[enclosure.body, parameters.MASS])
-            out.append(Row(f"centre of mass of body {enclosure.body}", row, -constant))
+            out.append(Row(f"centre of mass of {x.called(enclosure.body)}", row, -constant))
     return out
 
 
@@ -165,7 +166,7 @@ def _bounds(x: _Variables, conditions: Conditions) -> list[Row]:
             row = np.zeros(x.count)
             row[x.place[body, number]] = sign
             limit = sign * (bound[body, number] / x.scale[body, number] - x.nominal[body, number])
-            out.append(Row(f"{word} bound of {parameters.PARAMETERS[number]} of body {body}", row, float(limit)))
+            out.append(Row(f"{word} bound of {parameters.PARAMETERS[number]} of {x.called(body)}", row, float(limit)))
     return out
 
 
@@ -187,12 +188,12 @@ def _equalities(x: _Variables, conditions: Conditions) -> tuple[Array, Array]:
         for number, unit in enumerate(np.eye(PER_BODY)):
             size = x.scale[mirror.image, number]
             (left, known), (right, fixed) = x.row(mirror.body, reflected[number]), x.row(mirror.image, unit)
-            name = f"body {mirror.image} as mirror image of body {mirror.body}"
+            name = f"{x.called(mirror.image)} as mirror image of {x.called(mirror.body)}"
             out.append(Row(name, (left - right) / size, (fixed - known) / size))
     lower, upper = conditions.bounds(len(x.free))
     for body, number in zip(*np.nonzero(_meet(x, lower, upper) & x.free), strict=True):
         least, most, scale = lower[body, number], upper[body, number], x.scale[body, number]
-        name = f"bounds of {parameters.PARAMETERS[number]} of body {body}"
+        name = f"bounds of {parameters.PARAMETERS[number]} of {x.called(body)}"
         if least - most > SAME * scale:
             raise InputError("estimator", name, f"{least:g} above {most:g}", "a lower bound below the upper one")
         value = 0.5 * (least + most) / scale - x.nominal[body, number]
@@ -206,22 +207,22 @@ def _pull_back(x: _Variables, reference: Array) -> Array:
     rows = [np.eye(x.count)[x.place[:, parameters.FRICTION][x.free[:, parameters.FRICTION]]]]
     for body in x.bodies:
         row = np.zeros((16, x.count))
-        row[:, x.ten(body)] = _whitened(scaled[body], body, "pullback").reshape(10, 16).T
+        row[:, x.ten(body)] = _whitened(scaled[body], x.called(body), "pullback").reshape(10, 16).T
         rows.append(row)
     return np.concatenate(rows)
 
 
 def _relative(x: _Variables, body: int) -> _Block:
     """J_0^-1/2 J J_0^-1/2 of a body."""
-    slopes = _whitened(x.nominal[body], body, "entropic")
-    return _Block(f"pseudo-inertia of body {body}", np.eye(4), slopes, x.ten(body))
+    slopes = _whitened(x.nominal[body], x.called(body), "entropic")
+    return _Block(f"pseudo-inertia of {x.called(body)}", np.eye(4), slopes, x.ten(body))
 
 
-def _whitened(scaled: Array, body: int, prior: Prior) -> Array:
+def _whitened(scaled: Array, called: str, prior: Prior) -> Array:
     """L^-1 dJ L^-T for each of ten numbers, (10, 4, 4), of the pseudo-inertia J = L L^T of scaled parameters (12,)."""
     J = parameters.pseudo_inertia(scaled)
     if np.linalg.eigvalsh(J)[0] <= 0.0:
-        found = f"{prior}, but no density of matter has the parameters of body {body} that it measures from"
+        found = f"{prior}, but no density of matter has the parameters of {called} that it measures from"
         raise InputError("estimator", "prior", found, "euclidean, or bodies that can exist")
     inverse = np.linalg.inv(np.linalg.cholesky(J))
     return np.asarray(inverse @ _TEN @ inverse.T)

@@ -45,6 +45,7 @@ def conditions_from(settings: EstimatorConfig, robot: Robot, source: object = "e
         mirrors=_mirrors(settings, robot, source),
         lower=lower,
         upper=upper,
+        names=robot.body_names,
     )
 
 

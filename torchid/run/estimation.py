@@ -8,7 +8,7 @@ import numpy as np
 
 from torchid.config.estimator import EstimatorConfig
 from torchid.errors import UnknownNameError
-from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares
+from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem
 from torchid.robot import Robot
@@ -39,23 +39,17 @@ def stated_conditions(settings: EstimatorConfig, robot: Robot, source: object = 
     """
     if settings.name == "consistent":
         return conditions_from(settings, robot, source)
-    return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0)
+    return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0, names=robot.body_names)
 
 
-def estimate_parameters(problem: LinearProblem, settings: EstimatorConfig, conditions: Conditions) -> Estimate:
-    """Solve a compressed problem in one go.
-
-    Args:
-        problem: in the parameters of all bodies of the robot.
-        settings: the estimator, `least_squares` or `consistent`.
-        conditions: that a consistent estimate meets.
+def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
+    """What solves a compressed problem in one go, `least_squares` or `consistent`.
 
     Raises:
-        InputError: conditions that exclude each other.
+        InputError: the certified method without CVXPY and Clarabel.
     """
     if settings.name == "least_squares":
-        return LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
-    estimator = Consistent(
+        return LeastSquares(settings.ridge, settings.rank_tolerance)
+    return Consistent(
         settings.ridge, settings.prior, conditions, settings.method, settings.certify, settings.rank_tolerance
     )
-    return estimator.solve(problem)

@@ -18,7 +18,7 @@ from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.states import check_base, state_reports
 from torchid.report.metrics import Evaluation, Metrics
-from torchid.run.estimation import estimate_parameters, stated_conditions, with_frozen
+from torchid.run.estimation import batch_estimator, stated_conditions, with_frozen
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
@@ -58,21 +58,22 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
     with progress_bars() as bars:
         with clock("read"):
             experiment = set_up(config, source)
+            conditions = stated_conditions(config.estimator, experiment.robot, source)
             training = Training(config, experiment.robot, source) if config.estimator.name == "sgd" else None
+            estimator = training or batch_estimator(config.estimator, conditions)
             logs = _read(experiment, bars)
         with clock("compress"):
             builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(config.device)
             states = state_reports(logs["train"], builder)
             check_base(states, config.sensors.on_base_lost)
             problem = _compressed(experiment, builder, logs["train"], bars, source)
-            conditions = stated_conditions(config.estimator, experiment.robot, source)
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device)
         with clock("solve"):
-            if training is None:
-                estimate = estimate_parameters(problem, config.estimator, conditions)
-            else:
+            if isinstance(estimator, Training):
                 evaluate = partial(_identified_metrics, evaluation, logs)
-                estimate = training.run(problem, builder, logs, evaluate, bars, resume)
+                estimate: Estimate = estimator.run(problem, builder, logs, evaluate, bars, resume)
+            else:
+                estimate = estimator.solve(problem)
             _check_sense(estimate, source)
         with clock("evaluate"):
             metrics = _metrics(evaluation, logs, estimate.phi, bars)

@@ -12,7 +12,7 @@ from torchid.problem.chunks import by_state
 from torchid.problem.plan import State
 from torchid.problem.streaming import compress_by_state, merged
 from torchid.problem.triangular import TriangularFactor
-from torchid.run.estimation import estimate_parameters, stated_conditions, with_frozen
+from torchid.run.estimation import batch_estimator, stated_conditions, with_frozen
 from torchid.run.experiment import Experiment
 
 
@@ -57,7 +57,7 @@ class CompressedLogs:
         robot = replace(self.experiment.robot, nominal=nominal)
         settings = self.experiment.config.estimator
         problem = with_frozen(linear_problem(factor, self.builder, robot, friction), settings, robot)
-        return estimate_parameters(problem, settings, stated_conditions(settings, robot))
+        return batch_estimator(settings, stated_conditions(settings, robot)).solve(problem)
 
 
 def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
