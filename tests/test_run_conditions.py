@@ -72,8 +72,10 @@ def biped() -> Robot:
 
 def test_without_keys_there_are_the_margin_and_friction_that_is_not_negative(tmp_path: Path, biped: Robot) -> None:
     found = conditions(tmp_path, biped)
-    assert found == Conditions(margin=1e-4)
-    assert conditions(tmp_path, biped, margin=0.01, total_mass=66) == Conditions(margin=0.01, total_mass=66.0)
+    names = biped.body_names
+    assert found == Conditions(margin=1e-4, names=names)
+    found = conditions(tmp_path, biped, margin=0.01, total_mass=66)
+    assert found == Conditions(margin=0.01, total_mass=66.0, names=names)
 
 
 def test_bounds_stand_at_their_bodies_and_parameters(tmp_path: Path, biped: Robot) -> None:

@@ -47,6 +47,10 @@ class RunEvents:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
+    def flush(self) -> None:
+        """Write what is still held in memory."""
+        self._writer.flush()
+
     def errors(self, step: int, sets: Mapping[str, Metrics]) -> None:
         """Errors by group of rows of one parameter vector on sets of logs."""
         for name, metrics in sets.items():

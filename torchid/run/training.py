@@ -101,11 +101,9 @@ class Training:
         """
         training = self.config.estimator.training
         train, held_out = (
-            MiniBatches(logs[name], builder, training.batch_size, training.seed) if logs[name] else None
-            for name in ("train", "validation")
+            MiniBatches(logs[name], builder, training.batch_size, training.seed) for name in ("train", "validation")
         )
-        assert train is not None  # noqa: S101  # an experiment has training logs
-        trainer = Trainer(self.settings, problem, train, held_out)
+        trainer = Trainer(self.settings, problem, train, held_out if held_out.samples else None)
         if not trainer.closed_form.rank:
             raise SensorError(self.source, "sensors", "no parameter is in reach of them", "other sensors or contacts")
         self._prepare(trainer, resume)
@@ -114,7 +112,7 @@ class Training:
         with self._interruptible(trainer), RunEvents(self.folder, self.robot.body_names, True, since) as events:
             if trainer.epoch == 0:
                 self._evaluate(0, trainer.phi(), evaluate, events)
-                self._save(trainer)
+                self._save(trainer, events)
             self._train(trainer, evaluate, events, lambda text: bars.update(bar, advance=1, description=text))
         return trainer.estimate()
 
@@ -136,7 +134,7 @@ class Training:
             if epoch.number % training.evaluate_every == 0 or trainer.finished:
                 self._evaluate(epoch.number, trainer.phi(), evaluate, events)
             if time.monotonic() - saved >= training.checkpoint_seconds or trainer.finished:
-                self._save(trainer)
+                self._save(trainer, events)
                 saved = time.monotonic()
             progress(_described(epoch))
 
@@ -158,7 +156,8 @@ class Training:
         self.folder.mkdir(parents=True)
         (self.folder / "config.yaml").write_text(self._text)
 
-    def _save(self, trainer: Trainer) -> None:
+    def _save(self, trainer: Trainer, events: RunEvents) -> None:
+        events.flush()  # first: a resumed run's curves start where the checkpoint is
         state = {"config": self._text, "logs": _fingerprint(trainer), "trainer": trainer.state_dict()}
         save_checkpoint(self.folder, state)
         self._saved = trainer.epoch
