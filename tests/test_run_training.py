@@ -25,6 +25,7 @@ from matplotlib.figure import Figure
 from refusals import files_in, refusal
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
+from tensorboard.summary.writer import event_file_writer
 
 import torchid
 from torchid import parameters
@@ -41,6 +42,14 @@ EPOCHS, EVERY = 16, 5
 FIGURES = ("forces_of", "error_figure", "parameter_figure")
 EVALUATED = sorted({*range(0, EPOCHS + 1, EVERY), EPOCHS})
 BY_EPOCH = list(range(1, EPOCHS + 1))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _event_files_in_order() -> Iterator[None]:
+    """Event files of one second and one process sort by a number that is not padded, so that 10 comes before 9."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(1000))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -295,6 +304,7 @@ def killed(server: subprocess.Popen[str], arguments: list[str], output: Path, af
         time.sleep(0.002)
     time.sleep(after)
     os.kill(child, signal.SIGKILL)
+    time.sleep(1.0 - time.time() % 1.0)  # event files of several processes sort by the second they were made in
     while not (line := server.stdout.readline()).startswith(("-", "0", "1", "2")):  # tables of a run that was done
         pass
     return int(line)
