@@ -18,7 +18,7 @@ from torchid.problem import LinearProblem
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=15, deadline=None, derandomize=True)
+few = settings(max_examples=10, deadline=None, derandomize=True)
 Kind = Callable[[LinearProblem], LearnableParameters]
 KINDS: dict[str, Kind] = {"free": FreeParameters, "log_cholesky": LogCholeskyParameters}
 kinds = pytest.mark.parametrize("kind", KINDS)

@@ -18,7 +18,7 @@ from torchid.estimators.penalties import penalties, pseudo_inertias
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=50, deadline=None, derandomize=True)
+few = settings(max_examples=25, deadline=None, derandomize=True)
 ALL = PenaltyWeights(eigenvalue=2.0, log_det=0.3, mass=5.0, friction=7.0)
 NONE = {"eigenvalue": 0.0, "log_det": 0.0, "mass": 0.0, "friction": 0.0}
 SQUARES = ("eigenvalue", "mass", "friction")

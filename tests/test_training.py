@@ -175,27 +175,28 @@ def test_the_figures_of_an_estimate_are_those_of_its_parameters(
 
 
 def test_penalties_pull_nearly_as_near_and_nearly_into_what_can_exist() -> None:
-    """1.0041 was found, and eigenvalues down to -1e-5."""
-    estimate, _ = trained(demo(), consistency="penalties", epochs=40, optimizer_options={"lr": 0.1})
+    """1.0049 was found, and eigenvalues down to -1e-5."""
+    estimate, _ = trained(demo(), consistency="penalties", epochs=30, optimizer_options={"lr": 0.1})
     assert ratio(estimate) <= 1.02
     assert np.nanmin(estimate.eigenvalues) > -1e-3
     assert estimate.phi.reshape(-1, 12)[1:, 10:].min() > -1e-3
 
 
-OTHERS = {"SGD": {"lr": 0.2, "momentum": 0.9}, "RMSprop": {"lr": 0.02}}
+MOMENTUM: dict[str, Any] = {"optimizer": "SGD", "optimizer_options": {"lr": 0.2, "momentum": 0.9}, "epochs": 40}
+RMSPROP: dict[str, Any] = {"optimizer": "RMSprop", "optimizer_options": {"lr": 0.02}, "epochs": 30}
 
 
-@pytest.mark.parametrize("optimizer", OTHERS)
-def test_other_optimizers_get_near_as_well(optimizer: str) -> None:
-    """SGD with momentum 1.023, RMSprop 1.009."""
-    estimate, _ = trained(demo(), optimizer=optimizer, optimizer_options=OTHERS[optimizer], epochs=40)
+@pytest.mark.parametrize("settings", [MOMENTUM, RMSPROP], ids=["SGD with momentum", "RMSprop"])
+def test_other_optimizers_get_near_as_well(settings: dict[str, Any]) -> None:
+    """SGD with momentum 1.023, RMSprop 1.012."""
+    estimate, _ = trained(demo(), **settings)
     assert ratio(estimate) < 1.05
     assert np.nanmin(estimate.eigenvalues) >= ABOVE
 
 
 def test_without_the_preconditioner_the_same_descent_hardly_leaves_the_urdf() -> None:
     """32 times the closed form after as many epochs; so it was with steps of 0.03, 0.1 and 0.3."""
-    estimate, _ = trained(demo(), True, optimizer="SGD", optimizer_options=OTHERS["SGD"], epochs=40)
+    estimate, _ = trained(demo(), True, **MOMENTUM)
     assert ratio(estimate) > 20.0
 
 

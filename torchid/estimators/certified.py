@@ -15,7 +15,7 @@ from torchid.problem.threads import one_thread
 
 _LOOSE = 1e-6  # relative gap that is worth another try, and in the end a warning
 _OUTSIDE = 1e-7  # how far conditions may be missed, in units of the scale; most solutions are within 1e-8
-_TRIES = ((1.0, 1.0), (10.0, 10.0), (0.1, 100.0), (100.0, 1000.0))
+_TRIES = ((1.0, 1.0), (0.1, 1.0), (0.01, 10.0), (10.0, 10.0), (0.1, 100.0), (100.0, 1000.0))
 """Units of the objective and of the tolerance: Clarabel stalls on one in 300 problems with an entropic prior."""
 
 
