@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -128,4 +129,5 @@ def _accepted(found: Any) -> str:
 
 def _short(error: Exception) -> str:
     text = str(error.args[0] if error.args else error)  # a KeyError's own text is a repr
-    return (text.splitlines() or [""])[0].replace("__init__()", "").strip() or type(error).__name__
+    first = (text.splitlines() or [""])[0]
+    return re.sub(r"\w+\.__init__\(\)", "", first).strip() or type(error).__name__
