@@ -71,6 +71,10 @@ def pseudo_inertia(phi: Array) -> Array:
     return pseudo
 
 
+PSEUDO_BASIS = pseudo_inertia(np.eye(INERTIAL.stop))
+"""Change of a pseudo-inertia with each of the ten inertial numbers, (10, 4, 4): it is linear in them."""
+
+
 def _from_pseudo_inertia(pseudo: Array) -> Array:
     second_moment = pseudo[..., :3, :3]
     trace = np.trace(second_moment, axis1=-2, axis2=-1)[..., None, None]
@@ -85,8 +89,7 @@ def change_of_frame(T_new_old: Array) -> Array:
     Args:
         T_new_old: pose of the old frame in the new one, (4, 4) [m].
     """
-    pseudo = pseudo_inertia(np.eye(10))
-    return _from_pseudo_inertia(T_new_old @ pseudo @ T_new_old.T).T
+    return _from_pseudo_inertia(T_new_old @ PSEUDO_BASIS @ T_new_old.T).T
 
 
 POSSIBLE_MARGIN = -1e-9

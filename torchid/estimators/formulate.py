@@ -18,8 +18,6 @@ Prior = Literal["euclidean", "pullback", "entropic"]
 
 _LITTLE, _CHEAP = 1e-8, 1e-3  # of the mean square of the data, of the ridge
 
-_TEN = parameters.pseudo_inertia(np.eye(10))  # (10, 4, 4), change of a pseudo-inertia with each number
-
 
 @dataclass(frozen=True)
 class _Block:
@@ -40,10 +38,7 @@ class _Variables:
         self.place = (np.cumsum(problem.free) - 1).reshape(-1, PER_BODY)
         self.scale = problem.scale.reshape(-1, PER_BODY)
         self.nominal = problem.nominal.reshape(-1, PER_BODY) / self.scale
-        inertial = self.free[:, parameters.INERTIAL]
-        if (inertial.any(axis=1) != inertial.all(axis=1)).any():
-            raise ValueError("free: found a body of which part is free; accepted: inertial parameters body by body")
-        self.bodies = [int(body) for body in np.flatnonzero(inertial.all(axis=1))]
+        self.bodies = [int(body) for body in problem.free_bodies()]
 
     def ten(self, body: int) -> np.ndarray:
         """Variables of a body's inertial parameters, (10,)."""
@@ -127,7 +122,7 @@ def _floor(problem: LinearProblem, ridge: float) -> float:
 def _matter(x: _Variables, body: int, margin: float) -> _Block:
     """Scaled pseudo-inertia of a body, less the margin."""
     base = parameters.pseudo_inertia(x.nominal[body]) - margin * np.eye(4)
-    return _Block(f"pseudo-inertia of {x.called(body)}", base, _TEN, x.ten(body))
+    return _Block(f"pseudo-inertia of {x.called(body)}", base, parameters.PSEUDO_BASIS, x.ten(body))
 
 
 def _ellipsoid(x: _Variables, enclosure: Enclosure) -> _Block:
@@ -225,4 +220,4 @@ def _whitened(scaled: Array, called: str, prior: Prior) -> Array:
         found = f"{prior}, but no density of matter has the parameters of {called} that it measures from"
         raise InputError("estimator", "prior", found, "euclidean, or bodies that can exist")
     inverse = np.linalg.inv(np.linalg.cholesky(J))
-    return np.asarray(inverse @ _TEN @ inverse.T)
+    return np.asarray(inverse @ parameters.PSEUDO_BASIS @ inverse.T)

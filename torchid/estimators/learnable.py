@@ -108,10 +108,7 @@ class LogCholeskyParameters(LearnableParameters):
             ValueError: inertial parameters that are not free body by body.
         """
         free = problem.free.reshape(-1, PER_BODY)
-        inertial = free[:, parameters.INERTIAL]
-        if (inertial.any(axis=1) != inertial.all(axis=1)).any():
-            raise ValueError("free: found a body of which part is free; accepted: inertial parameters body by body")
-        bodies = np.flatnonzero(inertial.all(axis=1))
+        bodies = problem.free_bodies()
         super().__init__(problem, parameters.INERTIAL.stop * len(bodies) + int(free[:, parameters.FRICTION].sum()))
         self.margin = margin
         scaled = (problem.nominal / problem.scale).reshape(-1, PER_BODY)
@@ -149,4 +146,4 @@ class LogCholeskyParameters(LearnableParameters):
 
 def _from_pseudo_inertia() -> np.ndarray:
     """Matrix (10, 16) that takes a flattened pseudo-inertia to ten inertial numbers."""
-    return np.linalg.pinv(parameters.pseudo_inertia(np.eye(parameters.INERTIAL.stop)).reshape(-1, 16).T)
+    return np.linalg.pinv(parameters.PSEUDO_BASIS.reshape(-1, 16).T)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchid import parameters
 from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.penalties import penalties
 from torchid.estimators.sgd import Sgd
-from torchid.parameters import PER_BODY
 from torchid.problem.batches import Batch, MiniBatches
 from torchid.problem.linear import LinearProblem
 
@@ -51,9 +48,9 @@ class Loss(nn.Module):
         self.learnable, self.residual = learnable, residual
         self._columns = batches.columns
         self._per_row = batches.samples / max(problem.rows, 1)
-        free = problem.free.reshape(-1, PER_BODY)
-        bodies = np.flatnonzero(free[:, parameters.INERTIAL].all(axis=1))
-        self.register_buffer("_bodies", torch.from_numpy(bodies).to(batches.columns.device), persistent=False)
+        self.register_buffer(
+            "_bodies", torch.from_numpy(problem.free_bodies()).to(batches.columns.device), persistent=False
+        )
 
     def forward(self, batch: Batch) -> Terms:
         """Terms of one batch."""

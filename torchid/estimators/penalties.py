@@ -10,8 +10,6 @@ from torch import Tensor
 
 from torchid import parameters
 
-_TEN = torch.from_numpy(parameters.pseudo_inertia(np.eye(parameters.INERTIAL.stop)))  # (10, 4, 4)
-
 
 @dataclass(frozen=True)
 class PenaltyWeights:
@@ -44,7 +42,7 @@ class PenaltyWeights:
 
 def pseudo_inertias(scaled: Tensor) -> Tensor:
     """Pseudo-inertias (L, 4, 4) of parameters (L, 12), differentiable (`parameters.pseudo_inertia` is not)."""
-    return torch.tensordot(scaled[:, parameters.INERTIAL], _TEN.to(scaled), dims=1)
+    return torch.tensordot(scaled[:, parameters.INERTIAL], torch.from_numpy(parameters.PSEUDO_BASIS).to(scaled), dims=1)
 
 
 def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWeights) -> dict[str, Tensor]:

@@ -45,6 +45,17 @@ class LinearProblem:
         if not (self.scale > 0.0).all():
             raise ValueError("scale: found a number that is not positive; accepted: positive numbers")
 
+    def free_bodies(self) -> np.ndarray:
+        """Bodies whose inertial parameters are free, (L',) int, where the parameters are those of bodies.
+
+        Raises:
+            ValueError: of some body only a part is free.
+        """
+        inertial = self.free.reshape(-1, parameters.PER_BODY)[:, parameters.INERTIAL]
+        if (inertial.any(axis=1) != inertial.all(axis=1)).any():
+            raise ValueError("free: found a body of which part is free; accepted: inertial parameters body by body")
+        return np.flatnonzero(inertial.all(axis=1))
+
     def cost(self, phi: Array) -> float:
         """Sum of squared whitened residuals over all rows at parameters `phi`, (P,)."""
         misfit = self.A @ phi - self.b

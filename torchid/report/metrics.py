@@ -26,6 +26,9 @@ GROUPS = {
 }
 """Groups of rows that errors are given for, with a name and unit to show."""
 
+SETS = ("train", "test")
+"""Sets of logs that errors are given for."""
+
 BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")
 """Names of the six base rows."""
 

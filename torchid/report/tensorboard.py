@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
 from torchid.estimators import BoundEstimate, Epoch, Estimate
-from torchid.report.metrics import GROUPS, Metrics
+from torchid.report.metrics import GROUPS, SETS, Metrics
 
-_SETS = ("train", "test")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
 
 
@@ -32,7 +31,7 @@ class RunEvents:
             since: step from which on what earlier event files in the folder say is void.
         """
         self._writer = SummaryWriter(str(folder), purge_step=since)
-        groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in _SETS]] for group in GROUPS}
+        groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in SETS]] for group in GROUPS}
         loss = {
             "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
             "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
@@ -71,7 +70,8 @@ class RunEvents:
         if epoch.held_out is not None:
             scalars["loss_held_out/data"] = epoch.held_out
         scalars |= {f"share_of_force/{name}": value for name, value in epoch.shares.items()}
-        scalars["closed_form/objective_above_least"] = epoch.objective / epoch.closed_form - 1.0
+        if epoch.closed_form:  # 0 where data without noise are explained in full
+            scalars["closed_form/objective_above_least"] = epoch.objective / epoch.closed_form - 1.0
         scalars["closed_form/distance"] = epoch.distance
         scalars["descent/learning_rate"] = epoch.learning_rate
         scalars["descent/samples_per_second"] = epoch.samples_per_second

@@ -17,12 +17,12 @@ from torchid.estimators import Estimate, violations
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.states import check_base, state_reports
-from torchid.report.metrics import Evaluation, Metrics
+from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.run.estimation import batch_estimator, stated_conditions, with_frozen
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
-from torchid.run.results import SETS, Identification, candidates, write_run
+from torchid.run.results import Identification, candidates, write_run
 from torchid.run.training import Training, check_training
 
 _IMPLAUSIBLE = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
@@ -110,11 +110,9 @@ def _metrics(
     """Nominal and identified metrics by set of logs."""
     sets = {name: logs[name] for name in SETS if logs[name]}
     bar = bars.add_task("evaluating", total=sum(len(log) for same in sets.values() for log in same))
-    out = {}
+    both, out = candidates(evaluation.robot, phi), {}
     for name, same in sets.items():
-        nominal, identified = evaluation.metrics(
-            same, candidates(evaluation.robot, phi), lambda n: bars.advance(bar, n)
-        )
+        nominal, identified = evaluation.metrics(same, both, lambda n: bars.advance(bar, n))
         out[name] = (nominal, identified)
     return out
 

@@ -16,7 +16,7 @@ from torchid.problem import Samples
 from torchid.problem.predict import force_series
 from torchid.problem.states import StateReport
 from torchid.report.figures import ForceSeries, error_figure, force_figure, parameter_figure
-from torchid.report.metrics import Evaluation, Metrics
+from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.report.parameters_json import parameters_document
 from torchid.report.tensorboard import RunEvents
 from torchid.report.urdf_export import identified_urdf
@@ -24,9 +24,6 @@ from torchid.robot import Robot
 from torchid.run.experiment import Experiment
 from torchid.run.folder import new_folder, write_json
 from torchid.run.training import Training, body_eigenvalues
-
-SETS = ("train", "test")
-"""Sets of logs that errors are given for."""
 
 _PLOTTED_SAMPLES = 3000
 
