@@ -11,8 +11,6 @@ from pydantic.dataclasses import dataclass
 
 from torchid.config.types import STRICT, NotNegative, Number, Positive, Seed, no_flag
 from torchid.errors import ConfigError
-from torchid.estimators.penalties import PenaltyWeights
-from torchid.estimators.sgd import Sgd
 
 
 def _with_name(value: dict[str, Any]) -> dict[str, Any]:
@@ -43,10 +41,10 @@ class SymmetryConfig:
 class PenaltiesConfig:
     """Weights of what pulls a descent towards bodies that can exist."""
 
-    eigenvalue: NotNegative = PenaltyWeights.eigenvalue
-    log_det: NotNegative = PenaltyWeights.log_det
-    mass: NotNegative = PenaltyWeights.mass
-    friction: NotNegative = PenaltyWeights.friction
+    eigenvalue: NotNegative = 10.0
+    log_det: NotNegative = 0.0
+    mass: NotNegative = 10.0
+    friction: NotNegative = 10.0
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -58,13 +56,13 @@ class TrainingConfig:
     written after `checkpoint_seconds` and the end of the epoch.
     """
 
-    epochs: Count = Sgd.epochs
+    epochs: Count = 200
     batch_size: Count = 256
     optimizer: Named = dataclasses.field(default_factory=lambda: {"name": "Adam", "lr": 0.05})
     schedule: Named | None = dataclasses.field(default_factory=lambda: {"name": "CosineAnnealingLR"})
     patience: Count | None = None
-    clip: Positive = Sgd.clip
-    damping: Positive = Sgd.damping
+    clip: Positive = 1.0
+    damping: Positive = 1.0
     seed: Seed = 0
     evaluate_every: Count = 10
     checkpoint_seconds: NotNegative = 5.0
