@@ -34,6 +34,17 @@ ALL: dict[str, Any] = {
         "on_base_lost": "warn",
     },
     "estimator": {"name": "least_squares", "ridge": 1e-5, "rank_tolerance": 1e-7, "friction": False},
+    "analysis": {
+        "scenarios": {"stand": [["l_sole", "r_sole"]], "step": [["l_sole"], ["r_sole"], []]},
+        "candidates": {"joint_torques": ["hip", "knee"], "contacts": "axis"},
+        "keep": ["knee"],
+        "exclude": ["l_sole.fx"],
+        "costs": {"joint_torque": 2.0, "l_sole.fz": 0.5},
+        "criterion": "stack",
+        "compare": {"legs": {"joint_torques": ["hip"], "contact_wrenches": {"l_sole": ["fz"]}}},
+        "prior_error": 0.1,
+        "seed": 3,
+    },
     "output": "runs/all",
     "device": "cuda:1",
     "overwrite": True,
@@ -100,7 +111,10 @@ def test_every_key_of_the_file_arrives(file: Path) -> None:
     config = dataclasses.asdict(load(file, ALL))
     assert config["sensors"].pop("set") is None
     assert config["sensors"].pop("ft_sensors") == []
-    for name in ("contacts", "preprocessing", "sensors", "estimator", "device", "overwrite"):
+    (compared,) = config["analysis"]["compare"].values()
+    assert compared.pop("set") is None
+    assert compared.pop("ft_sensors") == []
+    for name in ("contacts", "preprocessing", "sensors", "estimator", "analysis", "device", "overwrite"):
         expected = ALL[name]
         if name == "contacts":
             expected = [{"line_axis": "y"} | contact for contact in expected]

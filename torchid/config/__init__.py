@@ -1,6 +1,6 @@
 """Settings files: typed dataclasses, YAML, and overrides from the command line."""
 
-from torchid.config.experiment import ExperimentConfig, dump_config, load_config
+from torchid.config.experiment import AnalyzeConfig, ExperimentConfig, dump_config, load_analysis, load_config
 from torchid.config.simulation import (
     BoundsConfig,
     FootConfig,
@@ -13,6 +13,7 @@ from torchid.config.simulation import (
 )
 
 __all__ = [
+    "AnalyzeConfig",
     "BoundsConfig",
     "ExperimentConfig",
     "FootConfig",
@@ -22,6 +23,7 @@ __all__ = [
     "SimulationConfig",
     "StepsConfig",
     "dump_config",
+    "load_analysis",
     "load_config",
     "load_simulation",
 ]

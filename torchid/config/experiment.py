@@ -8,16 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from torchid.config.analysis import AnalysisConfig
 from torchid.config.estimator import EstimatorConfig, check_keys
 from torchid.config.reading import FileKind, Settings, dump, load
+from torchid.config.sensors import Sensors, SensorsConfig, check_choice, spelled_out
 from torchid.config.types import STRICT, Device, Positive
 from torchid.errors import ConfigError, TorchidWarning
-from torchid.sensing.sensors import SensorNoise
-
-Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -58,46 +57,34 @@ class PreprocessingConfig:
     sample_rate_hz: Positive | None = None
 
 
-@dataclass(config=STRICT, frozen=True)
-class NoiseConfig:
-    """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m] (None: one contact's)."""
-
-    joint_torque: Positive = SensorNoise.joint_torque
-    contact_force: Positive = SensorNoise.contact_force
-    contact_moment: Positive = SensorNoise.contact_moment
-    base_force: Positive | None = None
-    base_moment: Positive | None = None
-
-
-@dataclass(config=STRICT, frozen=True)
-class SensorsConfig:
-    """A named set, or sensors by name; `sensors: full` is short for `sensors: {set: full}`."""
-
-    set: Literal["full", "contacts", "joints"] | None = None
-    joint_torques: list[str] = dataclasses.field(default_factory=list)
-    contact_wrenches: dict[str, list[Component]] = dataclasses.field(default_factory=dict)
-    ft_sensors: Annotated[list[str], Field(max_length=0)] = dataclasses.field(default_factory=list)
-    noise: NoiseConfig = dataclasses.field(default_factory=NoiseConfig)
-    on_base_lost: Literal["error", "warn"] = "error"
-
-
-def _spelled_out(value: object) -> object:
-    return {"set": value} if isinstance(value, str) else value
-
-
 @dataclass(config=STRICT, frozen=True, kw_only=True)
-class ExperimentConfig:
-    """One identification run."""
+class _Common:
+    """What identification and analysis of a robot share."""
 
     robot: RobotConfig
-    logs: LogsConfig
     output: Path
-    sensors: Annotated[SensorsConfig, BeforeValidator(_spelled_out)]
     contacts: list[ContactConfig] = dataclasses.field(default_factory=list)
     preprocessing: PreprocessingConfig = dataclasses.field(default_factory=PreprocessingConfig)
     estimator: EstimatorConfig = dataclasses.field(default_factory=EstimatorConfig)
+    analysis: AnalysisConfig = dataclasses.field(default_factory=AnalysisConfig)
     device: Device = "cpu"
     overwrite: bool = False
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class ExperimentConfig(_Common):
+    """One identification run."""
+
+    logs: LogsConfig
+    sensors: Sensors
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class AnalyzeConfig(_Common):
+    """The same file, for questions that need neither logs nor sensors; without sensors by name, `noise` alone."""
+
+    logs: LogsConfig | None = None
+    sensors: Sensors = dataclasses.field(default_factory=SensorsConfig)
 
 
 def _with_sensors_spelled_out(settings: Settings, overriding: Settings) -> Settings:
@@ -107,9 +94,10 @@ def _with_sensors_spelled_out(settings: Settings, overriding: Settings) -> Setti
     sensors = settings["sensors"]
     if isinstance(overriding.get("sensors"), str) and isinstance(sensors, dict):
         sensors = {key: x for key, x in sensors.items() if key in ("noise", "on_base_lost")}
-    return settings | {"sensors": _spelled_out(sensors)}
+    return settings | {"sensors": spelled_out(sensors)}
 
 
+_REFUSED = ("limb-mounted sensors, which are not supported yet", "an empty list")
 _EXPERIMENT = FileKind(
     settings=ExperimentConfig,
     name="experiment",
@@ -117,8 +105,9 @@ _EXPERIMENT = FileKind(
     list_example="contacts=[{frame: l_sole, type: flat}]",
     paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*", "output"),
     prepare=_with_sensors_spelled_out,
-    refusals={"sensors.ft_sensors": ("limb-mounted sensors, which are not supported yet", "an empty list")},
+    refusals={"sensors.ft_sensors": _REFUSED},
 )
+_ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": "robot, contacts, output"}))
 
 
 def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentConfig:
@@ -137,22 +126,41 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     """
     path = Path(path)
     config = load(_EXPERIMENT, path, overrides)
-    _check_sensors(path, config.sensors)
+    check_choice(path, "sensors", config.sensors)
+    return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
+
+
+def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeConfig:
+    """Read an experiment file for `torchid analyze`: as `load_config`, but logs and sensors may be left out."""
+    path = Path(path)
+    config = load(_ANALYSIS, path, overrides)
+    check_choice(path, "sensors", config.sensors, may_be_empty=True)
+    for name, choice in config.analysis.compare.items():
+        check_choice(path, f"analysis.compare.{name}", choice)
+    if config.logs is None:
+        if config.analysis.compare:
+            raise ConfigError(path, "analysis.compare", "set, without logs to predict accuracy from", "logs.train too")
+        return config
+    return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
+
+
+def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
+    """The logs with patterns resolved, after checks of what they are used for."""
     check_keys(config.estimator, path)
-    _check_held_out(path, config)
-    logs = {key: _matching(path, f"logs.{key}", getattr(config.logs, key)) for key in ("train", "test", "validation")}
+    _check_held_out(path, config.estimator, logs)
+    found = {key: _matching(path, f"logs.{key}", getattr(logs, key)) for key in ("train", "test", "validation")}
     for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
-        both = sorted({*logs[key]} & {*logs["test"]})
+        both = sorted({*found[key]} & {*found["test"]})
         if both:
             message = f"{path}: logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion"
-            warnings.warn(message, TorchidWarning, stacklevel=2)
-    both = sorted({*logs["train"]} & {*logs["validation"]})
+            warnings.warn(message, TorchidWarning, stacklevel=3)
+    both = sorted({*found["train"]} & {*found["validation"]})
     if both:
         raise ConfigError(path, "logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
-    return dataclasses.replace(config, logs=LogsConfig(**logs))
+    return LogsConfig(**found)
 
 
-def dump_config(config: ExperimentConfig) -> str:
+def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
     """The resolved configuration as YAML; `load_config` reads it back."""
     return dump(config)
 
@@ -174,19 +182,9 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
     return out
 
 
-def _check_held_out(path: Path, config: ExperimentConfig) -> None:
+def _check_held_out(path: Path, estimator: EstimatorConfig, logs: LogsConfig) -> None:
     """Held-out logs are for a descent, and patience needs some."""
-    estimator = config.estimator
-    if config.logs.validation and estimator.name != "sgd":
+    if logs.validation and estimator.name != "sgd":
         raise ConfigError(path, "logs.validation", f"set, which {estimator.name} has no use for", "estimator.name: sgd")
-    if estimator.training.patience is not None and not config.logs.validation:
+    if estimator.training.patience is not None and not logs.validation:
         raise ConfigError(path, "estimator.training.patience", "set, without logs to hold out", "logs.validation too")
-
-
-def _check_sensors(path: Path, sensors: SensorsConfig) -> None:
-    chosen = bool(sensors.joint_torques or sensors.contact_wrenches)
-    if sensors.set is not None and chosen:
-        raise ConfigError(path, "sensors", f"set: {sensors.set} together with sensors by name", "one of the two")
-    if sensors.set is None and not chosen:
-        accepted = "full, contacts, joints, or joint_torques and contact_wrenches by name"
-        raise ConfigError(path, "sensors", "no sensor", accepted)

@@ -1,0 +1,72 @@
+"""Sensors in a settings file: a named set or sensors by name, and their noise."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field
+from pydantic.dataclasses import dataclass
+
+from torchid.config.types import STRICT, Positive
+from torchid.errors import ConfigError
+from torchid.sensing.sensors import SensorNoise
+
+Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
+
+
+@dataclass(config=STRICT, frozen=True)
+class NoiseConfig:
+    """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m] (None: one contact's)."""
+
+    joint_torque: Positive = SensorNoise.joint_torque
+    contact_force: Positive = SensorNoise.contact_force
+    contact_moment: Positive = SensorNoise.contact_moment
+    base_force: Positive | None = None
+    base_moment: Positive | None = None
+
+
+@dataclass(config=STRICT, frozen=True)
+class ChoiceConfig:
+    """A named set, or sensors by name; `full` is short for `{set: full}`."""
+
+    set: Literal["full", "contacts", "joints"] | None = None
+    joint_torques: list[str] = dataclasses.field(default_factory=list)
+    contact_wrenches: dict[str, list[Component]] = dataclasses.field(default_factory=dict)
+    ft_sensors: Annotated[list[str], Field(max_length=0)] = dataclasses.field(default_factory=list)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is chosen."""
+        return self.set is None and not (self.joint_torques or self.contact_wrenches)
+
+
+@dataclass(config=STRICT, frozen=True)
+class SensorsConfig(ChoiceConfig):
+    """The sensors of a run, their noise, and what to do where they lose the base."""
+
+    noise: NoiseConfig = dataclasses.field(default_factory=NoiseConfig)
+    on_base_lost: Literal["error", "warn"] = "error"
+
+
+def spelled_out(value: object) -> object:
+    """A choice as a mapping, where it may be a name alone."""
+    return {"set": value} if isinstance(value, str) else value
+
+
+Choice = Annotated[ChoiceConfig, BeforeValidator(spelled_out)]
+Sensors = Annotated[SensorsConfig, BeforeValidator(spelled_out)]
+
+
+def check_choice(path: Path, field: str, sensors: ChoiceConfig, may_be_empty: bool = False) -> None:
+    """Refuse a named set with sensors by name beside it, and a choice of nothing.
+
+    Raises:
+        ConfigError: either.
+    """
+    if sensors.set is not None and (sensors.joint_torques or sensors.contact_wrenches):
+        raise ConfigError(path, field, f"set: {sensors.set} together with sensors by name", "one of the two")
+    if sensors.empty and not may_be_empty:
+        accepted = "full, contacts, joints, or joint_torques and contact_wrenches by name"
+        raise ConfigError(path, field, "no sensor", accepted)
