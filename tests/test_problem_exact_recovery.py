@@ -3,86 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from synthetic import G1, ROBOTS, Array, Oracle, load, make_log, random_states
+from true_robots import EXACT, KINDS, SAMPLES, World, driving, fit, hide, predicted, unseen, world, worst
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
-from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
 from torchid.problem.states import check_base, state_reports
-from torchid.regressor import Regressor
-from torchid.robot import Robot
-from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors
-
-ANYMAL_B = ROBOTS / "anymal_b_simple_description/robots/anymal.urdf"
-TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
-SAMPLES, UNSEEN = 900, 200
-EXACT = 1e-12  # of the largest force; 3e-15 measured
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A robot, its feet, and the joints of the leg above the first foot."""
-
-    urdf: Path
-    feet: tuple[str, ...]
-    foot: str
-    leg: tuple[str, ...]
-
-    @property
-    def contacts(self) -> tuple[Contact, ...]:
-        return tuple(Contact(frame, self.foot) for frame in self.feet)
-
-    @property
-    def states(self) -> list[list[bool]]:
-        """Every foot down, each lifted in turn, a trot for a quadruped, flight."""
-        count = len(self.feet)
-        one_lifted = [[foot != lifted for foot in range(count)] for lifted in range(count)]
-        trot = [[True, False, False, True]] if count == 4 else []
-        return [[True] * count, *one_lifted, *trot, [False] * count]
-
-
-LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
-KINDS = {
-    "G1": Kind(
-        G1, ("left_ankle_roll_link", "right_ankle_roll_link"), "flat", tuple(f"left_{part}_joint" for part in LEG)
-    ),
-    "ANYmal": Kind(ANYMAL_B, ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT"), "point", ("LF_HAA", "LF_HFE", "LF_KFE")),
-    "Talos": Kind(
-        TALOS_FULL, ("left_sole_link", "right_sole_link"), "flat", tuple(f"leg_left_{k}_joint" for k in range(1, 7))
-    ),
-}
-
-
-@dataclass(frozen=True)
-class World:
-    """A true robot that differs from its URDF, and what was recorded of it."""
-
-    kind: Kind
-    robot: Robot
-    oracle: Oracle
-    logs: list[Samples]
-
-
-@cache
-def world(name: str) -> World:
-    """Made once per robot: the oracle's Python loops cost more than the fits."""
-    kind, rng = KINDS[name], np.random.default_rng(len(name))
-    robot = load(kind.urdf)
-    oracle = Oracle.of(robot)
-    oracle.perturb(rng, 0.2)
-    size = 3 if kind.foot == "point" else 6
-    contacts = [(frame, size) for frame in kind.feet]
-    logs = [make_log(oracle, contacts, kind.states, n, rng, f"{n}.npz") for n in (SAMPLES // 3, SAMPLES * 2 // 3)]
-    return World(kind, robot, oracle, [bind(log, robot, kind.contacts) for log in logs])
+from torchid.sensing import SensorSet, chosen_sensors, named_sensors
 
 
 def sensors_of(w: World, name: str) -> SensorSet:
@@ -94,48 +29,9 @@ def sensors_of(w: World, name: str) -> SensorSet:
     return chosen_sensors(w.robot.joint_names, w.kind.contacts, torques, {contact.frame: contact.component_names})
 
 
-def fit(w: World, sensors: SensorSet, logs: Sequence[Samples] | None = None, **options: int) -> Estimate:
-    """Least squares on logs whose unmeasured forces are not even numbers."""
-    builder = RowBuilder(w.robot, w.kind.contacts, sensors)
-    hidden = [hide(samples, sensors) for samples in logs or w.logs]
-    factor = compress(hidden, builder, **options)  # type: ignore[arg-type]
-    return LeastSquares().solve(linear_problem(factor, builder, w.robot))
-
-
-def hide(samples: Samples, sensors: SensorSet) -> Samples:
-    """NaN for all that the sensors do not measure: nothing can leak into the fit."""
-    assert samples.torque is not None
-    assert samples.wrench is not None
-    torque, wrench = samples.torque.clone(), samples.wrench.clone()
-    torque[:, ~torch.from_numpy(sensors.torque)] = torch.nan
-    wrench[:, ~torch.from_numpy(sensors.wrench)] = torch.nan
-    return replace(samples, torque=torque, wrench=wrench)
-
-
 @cache
 def found(name: str, sensors: str) -> Estimate:
     return fit(world(name), sensors_of(world(name), sensors))
-
-
-@cache
-def unseen(name: str) -> tuple[Array, Array, Array]:
-    return random_states(np.random.default_rng(99), world(name).robot.n, UNSEEN)
-
-
-def predicted(robot: Robot, phi: Array, q: Array, v: Array, a: Array) -> Array:
-    """K phi, (B, nv), by the dense regressor."""
-    return (Regressor(robot)(*map(torch.from_numpy, (q, v, a))) @ torch.from_numpy(phi)).numpy()
-
-
-def driving(robot: Robot) -> set[str]:
-    """Joints that others mimic."""
-    return {body.joint.mimic.master for body in robot.bodies if body.joint and body.joint.mimic}
-
-
-def worst(found: Array, true: Array) -> float:
-    """Largest error over largest force among the base forces, base moments and joint torques."""
-    groups = [g for g in (slice(0, 3), slice(3, 6), slice(6, None)) if true[:, g].size]
-    return max(float(np.abs(found[:, g] - true[:, g]).max() / np.abs(true[:, g]).max()) for g in groups)
 
 
 robots = pytest.mark.parametrize("name", KINDS)

@@ -18,6 +18,7 @@ import torchid
 from torchid.cli import main
 from torchid.config import load_config
 from torchid.errors import TorchidWarning
+from torchid.estimators.result import VERDICTS
 from torchid.parameters import PARAMETERS
 from torchid.problem.states import StateReport
 from torchid.report.tables import print_tables, state_table
@@ -37,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_folder_holds_what_it_promises(run: Path) -> None:
     names = {path.name.split(".")[0] for path in run.iterdir()}
-    assert names >= {"config", "parameters", "metrics", "identified", "events", "forces", "errors"}
+    assert names >= {"config", "parameters", "metrics", "identified", "events", "forces", "errors", "contributions"}
     assert not [path for path in run.parent.iterdir() if path != run], "temporary folders left behind"
 
 
@@ -49,16 +50,20 @@ def test_resolved_config_reads_back_as_itself(run: Path) -> None:
 
 
 def test_parameters_json_names_every_body_and_parameter(run: Path) -> None:
-    bodies = json.loads((run / "parameters.json").read_text())["bodies"]
-    robot = torchid.load_robot(DEMO / "quadruped.urdf")
+    document = json.loads((run / "parameters.json").read_text())
+    bodies, robot = document["bodies"], torchid.load_robot(DEMO / "quadruped.urdf")
     assert [body["name"] for body in bodies] == list(robot.body_names)
     for body, nominal in zip(bodies, robot.nominal, strict=True):
-        for column in ("nominal", "identified", "standard_error", "identifiable"):
+        for column in ("nominal", "identified", "standard_error", "identifiable", "data_share", "verdict"):
             assert tuple(body[column]) == PARAMETERS
         np.testing.assert_allclose([body["nominal"][name] for name in PARAMETERS], nominal)
         for name in PARAMETERS:
             assert body["identifiable"][name] == (body["standard_error"][name] is not None)
-    assert not bodies[0]["identifiable"]["fc"], "the base has no joint"
+            assert (body["verdict"][name] in ("cannot be seen", "fixed")) != body["identifiable"][name]
+            assert (body["verdict"][name] == "fixed") == (body["data_share"][name] is None)
+    verdicts = [verdict for body in bodies for verdict in body["verdict"].values()]
+    assert document["verdicts"] == {verdict: verdicts.count(verdict) for verdict in VERDICTS}
+    assert bodies[0]["verdict"]["fc"] == "fixed", "the base has no joint"
     assert bodies[1]["identifiable"]["fv"]
 
 
@@ -76,6 +81,26 @@ def test_metrics_json_has_the_documented_fields(run: Path) -> None:
     assert metrics["samples"] == 1250
 
 
+def test_metrics_json_says_what_each_log_contact_state_and_sensor_adds(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    found = metrics["identifiability"]
+    values = found["singular_values"]
+    assert values[0] / values[metrics["rank"] - 1] == pytest.approx(metrics["condition_number"])
+    assert found["condition_number"] == metrics["condition_number"]
+    assert found["oversampling"] == pytest.approx(100.0 / 2.0 / (0.898 * 8.0), rel=0.01)  # 100 Hz, filtered at 8 Hz
+    (log,) = found["logs"]
+    assert (Path(log["name"]).name, log["samples"], log["rank"], log["rank_lost"]) == ("sway_train.npz", 1250, 118, 118)
+    assert log["bits"] == pytest.approx(found["bits"])
+    assert 0.0 < found["determined"] < metrics["rank"]
+    for state in metrics["contact_states"]:
+        assert 0 <= state["rank_lost"] <= state["rank"] <= metrics["rank"]
+        assert 0.0 < state["bits"] < found["bits"]
+    sensors = found["sensors"]
+    assert {sensor["name"] for sensor in sensors} == set(torchid.load_robot(DEMO / "quadruped.urdf").joint_names)
+    assert [s["bits"] for s in sensors] == sorted((s["bits"] for s in sensors), reverse=True)
+    assert sensors[-1]["bits"] > 0.0
+
+
 def test_joint_torques_alone_predict_forces_no_sensor_of_the_fit_saw(run: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     for group in ("base_force_rms", "base_moment_rms", "joint_torque_rms", "nullspace_rms"):
@@ -90,7 +115,23 @@ def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
         scalar = events.Scalars(f"relative_error_{name}/base_force")
         assert [event.step for event in scalar] == [0, 1]
         assert scalar[1].value < scalar[0].value
-    assert set(events.Tags()["images"]) == {"forces", "errors", "parameters"}
+    assert set(events.Tags()["images"]) == {"forces", "errors", "parameters", "contributions"}
+
+
+def test_tensorboard_shows_what_is_identified_and_by_what(run: Path) -> None:
+    events = EventAccumulator(str(run), size_guidance={"images": 0, "scalars": 0})
+    events.Reload()
+    metrics = json.loads((run / "metrics.json").read_text())
+    document = json.loads((run / "parameters.json").read_text())
+    for verdict, count in document["verdicts"].items():
+        assert events.Scalars(f"verdicts/{verdict}")[0].value == count
+    for body in document["bodies"]:
+        shares = list(body["data_share"].values())[:10]
+        assert events.Scalars(f"data_share/{body['name']}")[0].value == pytest.approx(np.mean(shares), rel=1e-6)
+    values = events.Scalars("identifiability/singular_value")
+    assert [value.step for value in values] == list(range(len(metrics["identifiability"]["singular_values"])))
+    assert values[0].value == pytest.approx(metrics["identifiability"]["singular_values"][0], rel=1e-6)
+    assert events.Scalars("identifiability/bits")[0].value == pytest.approx(metrics["identifiability"]["bits"])
 
 
 def test_evaluating_the_test_log_again_gives_the_same_figures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

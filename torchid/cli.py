@@ -14,11 +14,16 @@ from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from textwrap import fill
+from typing import TYPE_CHECKING
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning
 
+if TYPE_CHECKING:
+    from torchid.run.analyze import Scenario
+
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
+_ANALYZE = "say what sensors and motion determine, and plan the smallest sensor set"
 _SIMULATE = "let a robot move in simulation and write the logs of its sensors (needs the extra [sim])"
 
 
@@ -82,11 +87,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument("--device", help="where to compute, if not where the run did: cpu, cuda, cuda:0, ...")
     evaluate.set_defaults(command=_evaluate)
+    analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
+    analyze.add_argument("file", help="experiment file (YAML); logs and sensors may be left out")
+    analyze.add_argument("overrides", nargs="*", help="key.subkey=value, for example analysis.candidates.contacts=axis")
+    analyze.set_defaults(command=_analyze)
     simulate = commands.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
     simulate.add_argument("file", help="simulation file (YAML)")
     simulate.add_argument("overrides", nargs="*", help="key.subkey=value, for example sensors.bias.enabled=true")
     simulate.set_defaults(command=_simulate)
-    for command in (identify, evaluate, simulate):
+    for command in (identify, evaluate, analyze, simulate):
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
     return parser
 
@@ -124,19 +133,29 @@ def _identify(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
         from torchid.config import load_config
         from torchid.estimators import BoundEstimate, ConsistentEstimate, Estimate, SgdEstimate
-        from torchid.report.tables import error_tables, print_tables, state_table, violation_table
+        from torchid.report.tables import (
+            contribution_table,
+            error_tables,
+            print_tables,
+            state_table,
+            verdict_table,
+            violation_table,
+        )
         from torchid.run import identify
         from torchid.run.training import body_eigenvalues
 
     run = identify(load_config(options.file, options.overrides), options.file, options.resume)
     estimate, robot = run.estimate, run.experiment.robot
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
+    print_tables(contribution_table(run.adds), verdict_table(robot.body_names, estimate.verdict))
     if run.violations:
         print_tables(violation_table(run.violations_by_name()))
         if type(estimate) is Estimate:
             print("estimator.name=consistent finds the best parameters that break none of them")
     mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in estimate.verdict_counts().items())
+    print(f"verdicts      {counts}")
     print(f"condition     {estimate.condition_number:.3g}")
     print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
@@ -163,6 +182,46 @@ def _evaluate(options: argparse.Namespace) -> None:
     metrics, output = evaluate(options.run, options.log, options.device)
     print_tables(*error_tables(metrics))
     print(f"written to    {output}")
+
+
+def _analyze(options: argparse.Namespace) -> None:
+    with _interrupt_held_back():
+        from torchid.config import load_analysis
+        from torchid.report.accuracy import accuracy_table
+        from torchid.report.tables import print_tables
+        from torchid.run import analyze
+
+    found = analyze(load_analysis(options.file, options.overrides), options.file)
+    for scenario in found.scenarios:
+        _print_scenario(scenario)
+    if found.accuracies:
+        print_tables(accuracy_table(found.accuracies))
+    print(f"written to    {found.output}")
+
+
+def _print_scenario(scenario: Scenario) -> None:
+    from torchid.report.plan_tables import branch_table, check_lines, check_table, removal_table, set_text, sets_table
+    from torchid.report.tables import print_tables
+
+    plan, base = scenario.plan, scenario.base
+    print(f"Scenario {scenario.name}")
+    print_tables(branch_table(plan), *([sets_table(plan.parts)] if plan.parts else []))
+    proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
+    print(fill(f"chosen        {set_text(plan.chosen)}", 100, subsequent_indent=" " * 14))
+    print(f"cost          {plan.cost:g}; {proof}")
+    named = {"Chosen sensors": plan.checks}
+    if scenario.proposed is not None and scenario.proposed is not plan.checks:
+        named["Proposed sensors"] = scenario.proposed
+    for title, checks in named.items():
+        if checks:
+            print_tables(check_table(title, checks))
+        for line in check_lines(checks) if title != "Chosen sensors" or plan.parts else []:
+            print(fill(line, 100, subsequent_indent="  "))
+    print_tables(removal_table(plan))
+    print(
+        f"structure     {base.rank} combinations of {int(base.free.sum())} parameters; base_parameters.txt names them"
+    )
+    print()
 
 
 def _simulate(options: argparse.Namespace) -> None:

@@ -27,9 +27,9 @@ class AnalysisConfig:
     `scenarios`: contact states by scenario, each the frames in contact; None: the states of the training logs, or,
     without logs, all contacts at once. `keep`: candidates that are mounted anyway, `exclude`: that cannot be; `costs`
     by candidate or by kind (joint_torque, contact), a channel. `criterion`: the base survives the projection of every
-    sample, or many samples together determine all that full sensing would. `compare`: sensor sets whose accuracy is
-    predicted from the training logs and measured on the test logs; `prior_error`: how far off the URDF may be, against
-    the size of each body.
+    sample (None, for a floating base), or many samples together determine all that full sensing would (None, for a
+    bolted one). `compare`: sensor sets whose accuracy is predicted from the training logs and measured on the test
+    logs; `prior_error`: how far off the URDF may be, against the size of each body.
     """
 
     scenarios: dict[FileName, Annotated[list[list[str]], Field(min_length=1)]] | None = None
@@ -37,7 +37,7 @@ class AnalysisConfig:
     keep: list[str] = dataclasses.field(default_factory=list)
     exclude: list[str] = dataclasses.field(default_factory=list)
     costs: dict[str, Positive] = dataclasses.field(default_factory=dict)
-    criterion: Literal["per_sample", "stack"] = "per_sample"
+    criterion: Literal["per_sample", "stack"] | None = None
     compare: dict[str, Choice] = dataclasses.field(default_factory=dict)
     prior_error: Positive = 0.2
     seed: Seed = 0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchid.estimators.result import Estimate
+from torchid.estimators.result import Estimate, residual_std
 from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
@@ -40,8 +40,9 @@ class LeastSquares:
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters.
 
-        Standard errors propagate the sensor noise, scaled to the residual that was found, through the estimator; they
-        say nothing of the pull's bias. They are NaN where the data alone do not determine the parameter.
+        Standard errors propagate the sensor noise, scaled to the residual that was found, through the estimator, and
+        count only as many rows as the filtered noise leaves independent; they say nothing of the pull's bias. They are
+        NaN where the data alone do not determine the parameter.
         """
         free, scale = problem.free, problem.scale[problem.free]
         A = problem.A[:, free] * scale
@@ -59,21 +60,25 @@ class LeastSquares:
         phi = problem.nominal.copy()
         phi[free] += scale * step
         cost = problem.cost(phi)
-        noise = cost / max(problem.rows - rank, 1)
+        noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         identifiable = np.zeros(len(phi), dtype=bool)
         identifiable[free] = hidden < _HIDDEN
-        standard_error = np.full(len(phi), np.nan)
-        standard_error[free] = np.sqrt(noise) * scale * np.linalg.norm(gain, axis=1)
+        standard_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
+        standard_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
         standard_error[~identifiable] = np.nan
+        data_share[free] = np.clip(np.einsum("pr,rp->p", gain, A), 0.0, 1.0)  # diagonal of gain @ A
         return Estimate(
             phi=phi,
             standard_error=standard_error,
             identifiable=identifiable,
+            data_share=data_share,
+            singular_values=values,
             rank=rank,
             condition_number=float(values[0] / values[rank - 1]) if rank else float("nan"),
             cost=cost,
             nominal_cost=problem.cost(problem.nominal),
             rows=problem.rows,
+            oversampling=problem.oversampling,
         )
 
 

@@ -8,6 +8,9 @@ import numpy as np
 
 from torchid.parameters import Array
 
+IDENTIFIED, PRIOR, UNSEEN, FIXED = "identified", "dominated by the prior", "cannot be seen", "fixed"
+VERDICTS = (IDENTIFIED, PRIOR, UNSEEN, FIXED)
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -17,25 +20,58 @@ class Estimate:
         phi: (P,) estimated parameters; those that were not free are nominal.
         standard_error: (P,), NaN where the data do not determine the parameter.
         identifiable: (P,) bool, whether the data alone determine the parameter.
-        rank: of the scaled problem without the pull to the nominal parameters.
+        data_share: (P,), diagonal of the resolution matrix of the scaled problem with its Euclidean ridge: 1 where the
+            data alone make the estimate, 0 where the nominal value does, NaN where the parameter was not free. It needs
+            no right-hand side.
+        singular_values: of the scaled problem without the pull to the nominal parameters, descending.
+        rank: its rank.
         condition_number: ratio of its largest singular value to the smallest that is not zero.
         cost, nominal_cost: sum of squared whitened residuals at `phi` and at the nominal parameters.
         rows: number of scalar equations.
+        oversampling: of the rows, as in `LinearProblem`.
     """
 
     phi: Array
     standard_error: Array
     identifiable: np.ndarray
+    data_share: Array
+    singular_values: Array
     rank: int
     condition_number: float
     cost: float
     nominal_cost: float
     rows: int
+    oversampling: float
 
     @property
     def residual_std(self) -> float:
         """Standard deviation of the whitened residual: 1 where the stated sensor noise explains everything."""
-        return float(np.sqrt(self.cost / max(self.rows - self.rank, 1)))
+        return residual_std(self.cost, self.rows, self.rank, self.oversampling)
+
+    @property
+    def verdict(self) -> np.ndarray:
+        """One of `VERDICTS` for every parameter, (P,).
+
+        "identified": the data determine it and have the larger share; "dominated by the prior": they determine it, but
+        the nominal value has the larger share; "cannot be seen": the data alone do not determine it; "fixed": not free.
+        """
+        larger_share = self.data_share >= 0.5
+        decided = [np.isnan(self.data_share), ~self.identifiable, ~larger_share]
+        return np.select(decided, [FIXED, UNSEEN, PRIOR], IDENTIFIED)
+
+    def verdict_counts(self) -> dict[str, int]:
+        """Number of parameters by verdict."""
+        return {verdict: int((self.verdict == verdict).sum()) for verdict in VERDICTS}
+
+
+def residual_std(cost: float, rows: int, rank: int, oversampling: float) -> float:
+    """Standard deviation of whitened residuals whose noise fills 1/oversampling of the band.
+
+    A fit of slow motions removes `oversampling` times the variance of one row for each independent parameter. In a log
+    so short that nothing would be left, some of the motion must lie outside the band, and the residual counts as if its
+    rows were independent but fewer.
+    """
+    return float(np.sqrt(cost / max(rows - oversampling * rank, (rows - rank) / oversampling, 1.0)))
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,8 @@ class Log:
         contact_wrench_local: (N, C, 6) [N, N m] on the robot at the contact frame's origin, in that frame's axes;
             NaN where not measured.
         contact_wrench_world: as `contact_wrench_local` but in world axes; at most one of the two is given.
+        noise_bandwidth_hz: [Hz], up to where `preprocess` has left the sensors' noise white; None if it did not filter.
+            No part of a file.
 
     Raises:
         LogError: a field has a wrong shape or type, or both contact wrenches are given.
@@ -61,6 +63,7 @@ class Log:
     contact_active: BoolArray | None = None
     contact_wrench_local: FloatArray | None = None
     contact_wrench_world: FloatArray | None = None
+    noise_bandwidth_hz: float | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and types."""

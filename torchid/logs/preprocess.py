@@ -38,7 +38,7 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     The filter is a Butterworth low-pass of order 4 run forward and backward (no lag, gain 1/2 at the cutoff) on every
     channel, on a uniform grid: jittered time stamps are first interpolated to their median rate. Filtered logs lose
     2/cutoff_hz seconds at each end; logs differentiated without a filter lose 2 samples at each end, where the
-    spline multiplies noise.
+    spline multiplies noise. `noise_bandwidth_hz` of a filtered log is the filter's equivalent noise bandwidth.
 
     Where a log is filtered or resampled, `contact_active` is held from the previous sample, a wrench counts as 0
     while its contact is inactive, and a torque or wrench channel that is NaN in some samples becomes NaN throughout.
@@ -76,6 +76,10 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
             fields[name] = carry_measured(log, name, timeline)
     if log.contact_active is not None:
         fields["contact_active"] = timeline.active(log.contact_active)
+    if timeline.low_pass is not None:
+        half_rate = 0.5 / float(np.median(np.diff(timeline.grid)))
+        passed = timeline.low_pass.noise_share * half_rate
+        fields["noise_bandwidth_hz"] = min(passed, log.noise_bandwidth_hz or np.inf)
     return dataclasses.replace(log, **fields)
 
 

@@ -13,6 +13,7 @@ from torchid.logs.spline import spline_derivatives
 
 #: Steps that differ by less than this share of the median step count as uniform.
 JITTER = 1e-6
+_FREQUENCIES = 2**16
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,12 @@ class LowPass:
         for column in range(flat.shape[1]):  # one by one: the filter makes several copies of what it is given
             out[:, column] = signal.sosfiltfilt(self.sections, flat[:, column], padlen=self.padding)
         return out.reshape(values.shape)
+
+    @property
+    def noise_share(self) -> float:
+        """Share of the power of white noise that passes: equivalent noise bandwidth over half the sample rate."""
+        _, response = signal.sosfreqz(self.sections, worN=_FREQUENCIES, whole=True)
+        return float(np.mean(np.abs(response) ** 4))  # two passes, and power goes with the amplitude squared
 
 
 @dataclass(frozen=True, eq=False)

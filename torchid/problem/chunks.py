@@ -35,6 +35,19 @@ def by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slic
             yield tuple(active[example].tolist()), piece
 
 
+def spread_by_state(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
+    """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
+    found: dict[State, list[Samples]] = {}
+    for samples in logs:
+        for state, index in by_state(samples):
+            found.setdefault(state, []).append(samples[index])
+    for state, pieces in found.items():
+        total = sum(map(len, pieces))
+        for piece in pieces:
+            share = min(len(piece), max(1, round(count * len(piece) / total)))
+            yield piece[torch.linspace(0, len(piece) - 1, share).long()], state, len(piece) / share
+
+
 def over_chunks(
     logs: Sequence[Samples],
     builder: RowBuilder,

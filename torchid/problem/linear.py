@@ -21,6 +21,8 @@ class LinearProblem:
         nominal: (P,), the prior parameters.
         scale: (P,), > 0, the size a deviation of each parameter is measured in.
         free: (P,) bool, parameters to fit; the others stay nominal.
+        oversampling: rows per independent row, at least 1: a low-pass filter leaves noise correlated, so that rows say
+            less than their number suggests.
     """
 
     A: Array
@@ -30,6 +32,7 @@ class LinearProblem:
     nominal: Array
     scale: Array
     free: np.ndarray
+    oversampling: float = 1.0
 
     def __post_init__(self) -> None:
         """Check that the shapes belong together and that every number is one."""
@@ -44,6 +47,8 @@ class LinearProblem:
                 raise ValueError(f"{name}: found a number that is not finite; accepted: finite numbers")
         if not (self.scale > 0.0).all():
             raise ValueError("scale: found a number that is not positive; accepted: positive numbers")
+        if not 1.0 <= self.oversampling < np.inf:
+            raise ValueError(f"oversampling: found {self.oversampling}; accepted: a finite number of at least 1")
 
     def free_bodies(self) -> np.ndarray:
         """Bodies whose inertial parameters are free, (L',) int, where the parameters are those of bodies.

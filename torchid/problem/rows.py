@@ -19,7 +19,7 @@ from torchid.problem.plan import Columns, Planner, State, StatePlan
 from torchid.problem.samples import Samples
 from torchid.problem.workspace import Workspace
 from torchid.regressor.dynamics import all_wrench_columns, friction_columns, joint_directions, joint_row
-from torchid.regressor.jacobian import generalized_forces, wrenches_at_base
+from torchid.regressor.jacobian import generalized_forces, wrench_map, wrenches_at_base
 from torchid.regressor.kinematics import BodyStates, JointStates, body_states, joint_states
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -146,6 +146,18 @@ class RowBuilder(nn.Module):
         """Orthonormal V_x, (B', base rows + mixed joints, r), with the samples it belongs to, grouped by rank."""
         plan, terms = self.plan(state), self.terms(samples)
         yield from null_space(self._contact_rows(plan, terms)[0])
+
+    def contact_jacobian(self, samples: Samples) -> Tensor:
+        """Jacobian of every contact frame along its own axes, active or not, (B, C, 6, nv)."""
+        motion = samples.motion()
+        states = body_states(self.tree, motion, joint_states(self.tree, motion))
+        directions, joints = joint_directions(self.tree, states), range(len(self.columns.joint_rows))
+        J = motion.joint_position.new_zeros(len(samples), len(self.frames), 6, self.tree.base_rows + len(joints))
+        for contact, (body, T_joint_frame) in enumerate(self.frames):
+            units = J.new_tensor(wrench_map(T_joint_frame).T.copy())
+            at_base = wrenches_at_base(states, body, units)
+            J[:, contact] = generalized_forces(self.tree, directions, body, at_base, joints).permute(2, 0, 1)
+        return J
 
     def local_wrench(self, samples: Samples, contact: int, terms: ChunkTerms) -> Tensor:
         """Recorded wrench of a contact along its frame's axes, (B, 6)."""

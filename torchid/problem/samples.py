@@ -43,6 +43,8 @@ class Samples:
         torque: (N, n) [N m], NaN where not measured, or None.
         wrench: (N, C, 6), NaN where not measured, or None; along world axes if `wrench_in_world`, else the frames'.
         active: (N, C) bool.
+        oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
+            rate over the noise bandwidth of the filter.
     """
 
     source: str
@@ -55,6 +57,7 @@ class Samples:
     wrench: Tensor | None
     wrench_in_world: bool
     active: Tensor
+    oversampling: float = 1.0
 
     def __len__(self) -> int:
         return len(self.time)
@@ -72,6 +75,7 @@ class Samples:
             None if self.wrench is None else self.wrench[index],
             self.wrench_in_world,
             self.active[index],
+            self.oversampling,
         )
 
     def to(self, device: torch.device | str) -> Samples:
@@ -93,6 +97,7 @@ class Samples:
             move(self.wrench),
             self.wrench_in_world,
             self.active.to(device),
+            self.oversampling,
         )
 
     @property
@@ -169,10 +174,19 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
         None if wrench is None else torch.from_numpy(_columns(wrench, chosen)),
         log.contact_wrench_world is not None,
         torch.from_numpy(active),
+        _oversampling(log),
     )
     if required is not None:
-        _check_forces(samples, robot, contacts, required)
+        check_forces(samples, robot, contacts, required)
     return samples
+
+
+def _oversampling(log: Log) -> float:
+    """Half the sample rate over the bandwidth that a filter has left of the noise, at least 1."""
+    if log.noise_bandwidth_hz is None or len(log) < 2:
+        return 1.0
+    rate = 1.0 / float(np.median(np.diff(log.time)))
+    return max(1.0, 0.5 * rate / log.noise_bandwidth_hz)
 
 
 def _joints(log: Log, name: str, order: list[int]) -> Tensor:
@@ -217,7 +231,12 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
     return order, active
 
 
-def _check_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], required: SensorSet) -> None:
+def check_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], required: SensorSet) -> None:
+    """Make sure that every value of some sensors was recorded.
+
+    Raises:
+        LogError: one that is missing.
+    """
     if required.torque.any():
         if samples.torque is None:
             raise LogError(samples.source, "joint_torque", "missing", "the field, or sensors without joint torques")

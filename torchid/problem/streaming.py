@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 
 import numpy as np
 
@@ -12,9 +15,22 @@ from torchid.problem.linear import LinearProblem, parameter_scale
 from torchid.problem.plan import State
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.problem.threads import one_thread
 from torchid.problem.triangular import TriangularFactor
 from torchid.problem.workspace import Workspace
 from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+
+
+@dataclass
+class Part:
+    """What is kept of the samples of one log, by its source, in one contact state."""
+
+    source: str
+    state: State
+    factor: TriangularFactor
+    samples: int
+    oversampling: float
 
 
 def compress(
@@ -39,21 +55,64 @@ def compress_by_state(
     progress: Progress | None = None,
 ) -> dict[State, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
-
-    def fold(chunks: Iterator[tuple[Samples, State]]) -> dict[State, TriangularFactor]:
-        factors: dict[State, TriangularFactor] = {}
-        workspace = Workspace()
-        for samples, state in chunks:
-            factor = factors.setdefault(state, TriangularFactor(builder.columns.count))
-            for support, rows in builder.rows(samples, state, workspace):
-                factor.add(support, rows)
-        return factors
-
-    parts = over_chunks(logs, builder, fold, chunk, threads, progress)
-    states = dict.fromkeys(state for part in parts for state in part)
-    return {state: merged((part[state] for part in parts if state in part), builder) for state in states}
+    found = over_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
+    return {part.state: part.factor for part in _together(found)}
 
 
+def compress_parts(
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    chunk: int = CHUNK,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> list[Part]:
+    """As `compress`, but with a factor for every contact state in every log, in the order of the logs.
+
+    Logs of one source count as one.
+    """
+    parts = _together(over_chunks(logs, builder, partial(_fold, builder, by_log=True), chunk, threads, progress))
+    order = list(dict.fromkeys(samples.source for samples in logs))
+    return sorted(parts, key=lambda part: order.index(part.source))
+
+
+def _fold(builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool) -> list[Part]:
+    """Parts of some chunks, all logs together unless `by_log`."""
+    parts: dict[tuple[str, State], Part] = {}
+    workspace = Workspace()
+    for samples, state in chunks:
+        key = samples.source if by_log else "", state
+        if key not in parts:
+            parts[key] = Part(*key, TriangularFactor(builder.columns.count), 0, samples.oversampling)
+        parts[key].samples += len(samples)
+        for support, rows in builder.rows(samples, state, workspace):
+            parts[key].factor.add(support, rows)
+    return list(parts.values())
+
+
+@one_thread()
+def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
+    """The parts that workers have made of their chunks."""
+    total: dict[tuple[str, State], Part] = {}
+    for part in chain.from_iterable(of_workers):
+        same = total.setdefault((part.source, part.state), part)
+        if same is not part:
+            same.samples += part.samples
+            same.factor.merge(part.factor)
+    return list(total.values())
+
+
+def oversampling(parts: Sequence[Part]) -> float:
+    """Rows per independent row of some logs together."""
+    rows = sum(part.factor.rows for part in parts)
+    return max(1.0, rows / sum(part.factor.rows / part.oversampling for part in parts)) if rows else 1.0
+
+
+def state_name(contacts: Sequence[Contact], state: State) -> str:
+    """Frames in contact, joined by "+"."""
+    return " + ".join(c.frame for c, active in zip(contacts, state, strict=True) if active) or "none"
+
+
+@one_thread()
 def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
     """The factor of all that some factors have seen."""
     out = TriangularFactor(builder.columns.count)
@@ -62,10 +121,13 @@ def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> Triangul
     return out
 
 
-def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
+@one_thread()
+def linear_problem(
+    factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True, oversampling: float = 1.0
+) -> LinearProblem:
     """The problem in all 12 L parameters from the factor of the regrouped columns.
 
-    Inertia of massless bodies stays out, and friction if `friction` is False.
+    Inertia of massless bodies stays out, and friction if `friction` is False. `oversampling` is that of the rows.
     """
     R = factor.triangle().numpy()
     free = np.ones(robot.nominal.shape, dtype=bool)
@@ -81,4 +143,5 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
         nominal=robot.nominal.flatten(),
         scale=parameter_scale(robot.nominal).flatten(),
         free=free.flatten(),
+        oversampling=oversampling,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any
 
 import matplotlib
@@ -121,3 +122,23 @@ _QUANTITIES = {
     "first moment, length": lambda phi: np.linalg.norm(phi[:, parameters.FIRST_MOMENT], axis=1),
     "inertia about origin, trace": lambda phi: np.trace(parameters.inertia_matrix(phi), axis1=1, axis2=2),
 }
+
+
+@matplotlib.rc_context(STYLE)
+def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], most: int = 20) -> Figure:
+    """Bits that would be lost without each member of some groups, by name, those with most first."""
+    shown = {group: sorted(found, key=lambda pair: -pair[1])[:most] for group, found in groups.items() if found}
+    counts = [len(found) for found in shown.values()]
+    figure = Figure(figsize=(9.0, 0.24 * sum(counts) + 0.6 * len(shown) + 0.6), layout="constrained")
+    axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
+    for axis, (group, found) in zip(axes, shown.items(), strict=True):
+        names, bits = zip(*found, strict=True)
+        bars = axis.barh(range(len(found)), bits, 0.7, color=_IDENTIFIED)
+        axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
+        axis.set_yticks(range(len(found)), [fill(name, 60) for name in names], fontsize=7)
+        axis.set_ylim(len(found) - 0.4, -0.6)
+        axis.grid(visible=False, axis="y")
+        hidden = len(groups[group]) - len(found)
+        axis.set_title(group + (f", {hidden} more not shown" if hidden else ""), loc="left", fontsize=9)
+    axes[-1].set_xlabel("information lost without it [bits]")
+    return figure

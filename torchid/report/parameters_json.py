@@ -15,25 +15,27 @@ from torchid.robot import Robot
 
 
 def parameters_document(robot: Robot, estimate: Estimate) -> dict[str, Any]:
-    """What `parameters.json` holds; a standard error that the data do not give is null."""
+    """What `parameters.json` holds; a standard error or a share that the data do not give is null."""
 
     def named(values: Array) -> dict[str, Any]:
         return {name: _plain(x) for name, x in zip(PARAMETERS, values, strict=True)}
 
-    columns = (estimate.phi, estimate.standard_error, estimate.identifiable)
-    per_body = [x.reshape(-1, PER_BODY) for x in columns]
+    columns = {
+        "identified": estimate.phi,
+        "standard_error": estimate.standard_error,
+        "identifiable": estimate.identifiable,
+        "data_share": estimate.data_share,
+        "verdict": estimate.verdict,
+    }
+    per_body = {name: x.reshape(-1, PER_BODY) for name, x in columns.items()}
     return {
         "units": dict(zip(PARAMETERS, UNITS, strict=True)),
         "frame": "each body's link frame, inertia about its origin",
         "massless": list(robot.massless),
+        "verdicts": estimate.verdict_counts(),
         "bodies": [
-            {
-                "name": name,
-                "nominal": named(robot.nominal[body]),
-                "identified": named(per_body[0][body]),
-                "standard_error": named(per_body[1][body]),
-                "identifiable": named(per_body[2][body]),
-            }
+            {"name": name, "nominal": named(robot.nominal[body])}
+            | {column: named(values[body]) for column, values in per_body.items()}
             for body, name in enumerate(robot.body_names)
         ],
     }
@@ -64,7 +66,9 @@ def _number(path: Path, body: dict[str, Any], name: str) -> float:
     return float(value)
 
 
-def _plain(x: Any) -> float | bool | None:
+def _plain(x: Any) -> float | bool | str | None:
+    if isinstance(x, str):
+        return str(x)
     if isinstance(x, np.bool_):
         return bool(x)
     return float(x) if np.isfinite(x) else None

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from torchid.analysis.contributions import Contribution, Contributions, PartContribution
+from torchid.estimators.result import FIXED, IDENTIFIED, PRIOR, UNSEEN
+from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.report.metrics import GROUPS, Metrics
+
+_MARKS = {IDENTIFIED: "*", PRIOR: "p", UNSEEN: ".", FIXED: ""}
 
 
 def print_tables(*tables: Table) -> None:
@@ -74,6 +82,42 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
             "fixed base" if rank is None else f"{rank} of 6",
             "" if smallest is None else f"{smallest:.2g}",
         )
+    return table
+
+
+def verdict_table(body_names: Sequence[str], verdicts: np.ndarray) -> Table:
+    """A mark for the verdict, (12 L,), on every parameter of the bodies with any that is free."""
+    legend = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if mark)
+    table = Table(title=f"Parameters: {legend}", title_justify="left", box=box.SIMPLE_HEAD)
+    table.add_column("body", overflow="fold")
+    for name in PARAMETERS:
+        table.add_column(name, justify="center")
+    for name, found in zip(body_names, verdicts.reshape(-1, PER_BODY), strict=True):
+        if (found != FIXED).any():
+            table.add_row(Text(name), *(_MARKS[verdict] for verdict in found))
+    return table
+
+
+def contribution_table(found: Contributions, most: int = 12) -> Table:
+    """What the fit would lose without each log, contact state and sensor, the first of each kind."""
+    table = Table(title="What each log, contact state and sensor adds: lost without it", title_justify="left")
+    for heading in ("", "samples", "rank alone", "rank lost", "combinations lost", "bits lost"):
+        table.add_column(heading, justify="right" if heading else "left", overflow="fold")
+    kinds: dict[str, Sequence[Contribution]] = {
+        "logs": found.logs, "contact states": found.states, "sensors": found.sensors
+    }  # fmt: skip
+    for kind, each in kinds.items():
+        for one in sorted(each, key=lambda x: -x.bits)[:most]:
+            counts = ("", "", "")
+            if isinstance(one, PartContribution):
+                counts = (str(one.samples), str(one.rank), str(one.rank_lost))
+            name = Path(one.name).name if kind == "logs" else one.name
+            table.add_row(Text(name), *counts, f"{one.determined:.1f}", f"{one.bits:.1f}")
+        if len(each) > most:
+            table.add_row(f"and {len(each) - most} more {kind}")
+        table.add_section()
+    known = found.known
+    table.add_row("everything", "", "", "", f"{known.determined:.1f}", f"{known.bits:.1f}")
     return table
 
 

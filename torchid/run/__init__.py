@@ -1,7 +1,8 @@
 """Commands: whole runs from files to folders."""
 
+from torchid.run.analyze import Analysis, analyze
 from torchid.run.evaluate import evaluate
 from torchid.run.identify import identify
 from torchid.run.results import Identification
 
-__all__ = ["Identification", "evaluate", "identify"]
+__all__ = ["Analysis", "Identification", "analyze", "evaluate", "identify"]

@@ -1,4 +1,4 @@
-"""What identification and evaluation share: robot, contacts, sensors and logs of an experiment file."""
+"""What commands share: robot, contacts, sensors and logs of an experiment file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 import torch
 
-from torchid.config import ExperimentConfig
+from torchid.config import AnalyzeConfig, ExperimentConfig
+from torchid.config.sensors import ChoiceConfig
 from torchid.errors import ConfigError
 from torchid.logs import preprocess, read_log
 from torchid.problem import Samples, bind
@@ -17,36 +18,66 @@ from torchid.sensing import Contact, SensorNoise, SensorSet, check_contacts, cho
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """An experiment file brought to life."""
+class Scene:
+    """Robot and contacts of an experiment file, and what is read or chosen by their names."""
 
-    config: ExperimentConfig
+    config: ExperimentConfig | AnalyzeConfig
     robot: Robot
     contacts: tuple[Contact, ...]
-    sensors: SensorSet
 
-    def read(
-        self, paths: Sequence[Path], required: bool, on_read: Callable[[Path], None] | None = None
+    @property
+    def noise(self) -> SensorNoise:
+        """Of the sensors."""
+        return SensorNoise(**vars(self.config.sensors.noise))
+
+    def sensors_of(self, choice: ChoiceConfig, source: object = "experiment") -> SensorSet:
+        """The sensors of a choice.
+
+        Raises:
+            InputError: names that do not fit the robot.
+        """
+        robot, contacts, noise = self.robot, self.contacts, self.noise
+        if choice.set is not None:
+            return named_sensors(choice.set, robot.n, len(contacts), noise)
+        names = robot.joint_names
+        return chosen_sensors(names, contacts, choice.joint_torques, choice.contact_wrenches, noise, source)
+
+    def read_logs(
+        self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
     ) -> list[Samples]:
         """Read, preprocess and bind logs; each on its own, so that nothing is differentiated across a seam.
 
         Args:
             paths: log files.
-            required: whether every sensor of the set must have been recorded.
+            required: sensors that must have been recorded.
             on_read: called after each file.
         """
         logs = []
         for path in paths:
             settings = self.config.preprocessing
             log = preprocess(read_log(path), settings.cutoff_hz, settings.sample_rate_hz)
-            logs.append(bind(log, self.robot, self.contacts, self.sensors if required else None))
+            logs.append(bind(log, self.robot, self.contacts, required))
             if on_read is not None:
                 on_read(path)
         return logs
 
 
-def set_up(config: ExperimentConfig, source: object = "experiment") -> Experiment:
-    """Load the robot and resolve contacts and sensors by name.
+@dataclass(frozen=True)
+class Experiment(Scene):
+    """An experiment file brought to life."""
+
+    config: ExperimentConfig
+    sensors: SensorSet
+
+    def read(
+        self, paths: Sequence[Path], required: bool, on_read: Callable[[Path], None] | None = None
+    ) -> list[Samples]:
+        """As `read_logs`; `required` says whether every sensor of the set must have been recorded."""
+        return self.read_logs(paths, self.sensors if required else None, on_read)
+
+
+def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "experiment") -> Scene:
+    """Load the robot and look its contacts up.
 
     Raises:
         InputError: whatever in the file does not fit the robot.
@@ -59,14 +90,14 @@ def set_up(config: ExperimentConfig, source: object = "experiment") -> Experimen
         ) from error
     robot = load_robot(config.robot.urdf, config.robot.base_link, config.robot.fixed_base)
     contacts = check_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
-    chosen, levels = config.sensors, config.sensors.noise
-    noise = SensorNoise(
-        levels.joint_torque, levels.contact_force, levels.contact_moment, levels.base_force, levels.base_moment
-    )
-    if chosen.set is not None:
-        sensors = named_sensors(chosen.set, robot.n, len(contacts), noise)
-    else:
-        sensors = chosen_sensors(
-            robot.joint_names, contacts, chosen.joint_torques, chosen.contact_wrenches, noise, source
-        )
-    return Experiment(config, robot, contacts, sensors)
+    return Scene(config, robot, contacts)
+
+
+def set_up(config: ExperimentConfig, source: object = "experiment") -> Experiment:
+    """As `set_up_scene`, with sensors resolved by name.
+
+    Raises:
+        InputError: whatever in the file does not fit the robot.
+    """
+    scene = set_up_scene(config, source)
+    return Experiment(config, scene.robot, scene.contacts, scene.sensors_of(config.sensors, source))

@@ -29,12 +29,15 @@ class FolderKind:
         return sorted(name for name in names if not any(fnmatch(name, pattern) for pattern in own))
 
 
-_RESULTS = ("parameters.json", "metrics.json", "identified.urdf", "forces.png", "errors.png", "parameters.png")
+_FIGURES = ("forces.png", "errors.png", "parameters.png", "contributions.png")
+_RESULTS = ("parameters.json", "metrics.json", "identified.urdf", *_FIGURES)
 EVENTS = "events.out.tfevents*"
 RUN = FolderKind("run", "config.yaml", (*_RESULTS, "hparams", "evaluation", EVENTS))
 TRAINING = FolderKind("training", "config.yaml", ("checkpoint.pt", ".checkpoint.pt", EVENTS))
 SIMULATION = FolderKind("simulation", "simulation.yaml", ("logs", "exact", "nominal.urdf", "stability.json"))
-
+ANALYSIS = FolderKind(
+    "analysis", "analysis.json", ("config.yaml", "base_parameters.txt", "sensors-*.png", "accuracy.png")
+)
 STUDY = FolderKind("study", "results.json", ("tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard"))
 
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer

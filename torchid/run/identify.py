@@ -9,16 +9,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 
+import numpy as np
 from rich.progress import Progress
 
+from torchid.analysis.contributions import Contributions, contributions
 from torchid.config import ExperimentConfig
 from torchid.errors import NumericalWarning, SensorError
 from torchid.estimators import Estimate, violations
 from torchid.parameters import PER_BODY, Array
-from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
+from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.states import check_base, state_reports
+from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
-from torchid.run.estimation import batch_estimator, stated_conditions, with_frozen
+from torchid.run.estimation import batch_estimator, problem_of, stated_conditions
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
@@ -66,7 +69,8 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
             builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(config.device)
             states = state_reports(logs["train"], builder)
             check_base(states, config.sensors.on_base_lost)
-            problem = _compressed(experiment, builder, logs["train"], bars, source)
+            parts = _compressed(builder, logs["train"], bars)
+            problem = problem_of(parts, builder, experiment.robot, config.estimator, source)
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device)
         with clock("solve"):
             if isinstance(estimator, Training):
@@ -75,11 +79,14 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
             else:
                 estimate = estimator.solve(problem)
             _check_sense(estimate, source)
+        with clock("identifiability"):
+            adds = _contributions(experiment, builder, parts, logs["train"], problem, bars)
+            del parts
         with clock("evaluate"):
             metrics = _metrics(evaluation, logs, estimate.phi, bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
         samples = sum(map(len, logs["train"]))
-        run = Identification(experiment, estimate, states, metrics, broken, clock.seconds, samples)
+        run = Identification(experiment, estimate, states, adds, metrics, broken, clock.seconds, samples)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], training)
     return run
@@ -95,13 +102,25 @@ def _read(experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
     }
 
 
-def _compressed(
-    experiment: Experiment, builder: RowBuilder, train: Sequence[Samples], bars: Progress, source: object
-) -> LinearProblem:
-    settings, robot = experiment.config.estimator, experiment.robot
+def _compressed(builder: RowBuilder, train: Sequence[Samples], bars: Progress) -> list[Part]:
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
-    factor = compress(train, builder, progress=lambda n: bars.advance(streaming, n))
-    return with_frozen(linear_problem(factor, builder, robot, settings.friction), settings, robot, source)
+    return compress_parts(train, builder, progress=lambda n: bars.advance(streaming, n))
+
+
+def _contributions(
+    experiment: Experiment,
+    builder: RowBuilder,
+    parts: Sequence[Part],
+    train: Sequence[Samples],
+    problem: LinearProblem,
+    bars: Progress,
+) -> Contributions:
+    """What each log, contact state and sensor adds."""
+    leaving_out = bars.add_task("leaving out each in turn", total=None)
+    tolerance, names = experiment.config.estimator.rank_tolerance, experiment.robot.joint_names
+    found = contributions(parts, train, builder, problem, names, tolerance, lambda n: bars.advance(leaving_out, n))
+    bars.update(leaving_out, total=1, completed=1)
+    return found
 
 
 def _metrics(
@@ -127,7 +146,8 @@ def _check_sense(estimate: Estimate, source: object) -> None:
     """Refuse a fit of nothing, and warn of one that the dynamics cannot explain."""
     if not estimate.rank:
         raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
-    if estimate.residual_std > _IMPLAUSIBLE:
-        found = f"forces differ from any rigid-body model by {estimate.residual_std:.3g} times the stated sensor noise"
+    left = np.sqrt(estimate.cost / max(estimate.rows, 1))  # not corrected for the fit, which may be far from the best
+    if left > _IMPLAUSIBLE:
+        found = f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
         advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
         warnings.warn(f"{source}: {found}; {advice}", NumericalWarning, stacklevel=3)

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from torchid.analysis.contributions import Contributions
 from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Samples
 from torchid.problem.predict import force_series
 from torchid.problem.states import StateReport
-from torchid.report.figures import ForceSeries, error_figure, force_figure, parameter_figure
+from torchid.report.figures import ForceSeries, contribution_figure, error_figure, force_figure, parameter_figure
 from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.report.parameters_json import parameters_document
 from torchid.report.tensorboard import RunEvents
@@ -30,11 +31,15 @@ _PLOTTED_SAMPLES = 3000
 
 @dataclass(frozen=True)
 class Identification:
-    """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken."""
+    """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
+
+    `adds`: what each training log, contact state and sensor adds.
+    """
 
     experiment: Experiment
     estimate: Estimate
     states: list[StateReport]
+    adds: Contributions
     metrics: dict[str, tuple[Metrics, Metrics]]
     violations: list[Violation]
     seconds: dict[str, float]
@@ -44,6 +49,11 @@ class Identification:
         """Conditions that the identified parameters break, the body by its name."""
         names = self.experiment.robot.body_names
         return [asdict(x) | {"body": None if x.body is None else names[x.body]} for x in self.violations]
+
+    def state_entries(self) -> list[dict[str, object]]:
+        """Contact states, with what each of them adds."""
+        adds = {state.name: asdict(state) for state in self.adds.states}
+        return [asdict(state) | adds[state.name] for state in self.states]
 
     @property
     def phi(self) -> Array:
@@ -72,6 +82,7 @@ def write_run(run: Identification, evaluation: Evaluation, shown: Samples, train
         "parameters": parameter_figure(
             robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
         ),
+        "contributions": contribution_figure(_bits(run.adds)),
     }
     with new_folder(config.output, config.overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
@@ -117,8 +128,32 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
         "violations": run.violations_by_name(),
         "solution": _solution_document(estimate),
-        "contact_states": [asdict(state) for state in run.states],
+        "contact_states": run.state_entries(),
+        "identifiability": _identifiability_document(run),
         "seconds": run.seconds,
+    }
+
+
+def _identifiability_document(run: Identification) -> dict[str, object]:
+    """What the data determine, and what each log and sensor adds; contact states have a list of their own."""
+    estimate, adds = run.estimate, run.adds
+    return {
+        "singular_values": estimate.singular_values.tolist(),
+        "condition_number": estimate.condition_number if estimate.rank else None,
+        "oversampling": estimate.oversampling,
+        **asdict(adds.known),
+        "verdicts": estimate.verdict_counts(),
+        "logs": [asdict(log) for log in adds.logs],
+        "sensors": [asdict(sensor) for sensor in adds.sensors],
+    }
+
+
+def _bits(adds: Contributions) -> dict[str, list[tuple[str, float]]]:
+    """Names and bits, by kind."""
+    return {
+        "logs": [(Path(log.name).name, log.bits) for log in adds.logs],
+        "contact states": [(state.name, state.bits) for state in adds.states],
+        "sensors": [(sensor.name, sensor.bits) for sensor in adds.sensors],
     }
 
 
@@ -141,6 +176,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figur
                 events.eigenvalues(step, body_eigenvalues(robot, phi))
             events.solution(estimate, run.samples / run.seconds["compress"])
         events.fit(last, estimate)
+        events.identifiability(last, estimate, run.adds.known, robot.body_names)
         final = {
             f"{name}_{group}": value
             for name in reversed(SETS)  # unseen logs first: TensorBoard shows the first few

@@ -39,6 +39,11 @@ class SensorNoise:
         moment = self.contact_moment if self.base_moment is None else self.base_moment
         return np.array([force] * 3 + [moment] * 3)
 
+    def times(self, factor: float) -> SensorNoise:
+        """All of them, larger by a factor."""
+        scaled = {name: factor * x for name, x in vars(self).items() if x is not None}
+        return SensorNoise(**scaled)
+
     @property
     def wrench(self) -> Array:
         """Of the six wrench components, (6,) [N, N m]."""

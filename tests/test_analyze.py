@@ -1,0 +1,192 @@
+"""`torchid analyze`: answers in a folder, and a slip answered in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from refusals import files_in, refusal
+
+import torchid
+from torchid.cli import main
+
+DEMO = Path(torchid.__file__).parent / "demo"
+LEGS = ("front_left", "front_right", "rear_left", "rear_right")
+FEET = tuple(f"{leg}_foot" for leg in LEGS)
+TORQUES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "thigh", "knee"))
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's robot and shortened logs."""
+    folder = tmp_path_factory.mktemp("analysis") / "experiment"
+    shutil.copytree(DEMO, folder)
+    for name in ("sway_train", "sway_test"):
+        with np.load(folder / f"{name}.npz") as log:
+            short = {key: x if key in ("joint_names", "contact_names") else x[:800] for key, x in log.items()}
+        np.savez(folder / f"{name}.npz", **short)
+    return folder
+
+
+def asked(folder: Path, **settings: Any) -> Path:
+    """An experiment file that asks something of the demo's robot."""
+    content: dict[str, Any] = {
+        "robot": {"urdf": str(folder / "quadruped.urdf")},
+        "contacts": [{"frame": foot, "type": "point"} for foot in FEET],
+        "output": str(folder / "out"),
+    }
+    path = folder / "asked.yaml"
+    path.write_text(yaml.safe_dump(content | settings))
+    return path
+
+
+@pytest.fixture(scope="module")
+def with_logs(experiment: Path) -> tuple[Path, dict[str, Any]]:
+    """The folder and the answers of a run with logs, a proposed set that lacks one knee, and two sets to compare."""
+    file = asked(
+        experiment,
+        logs={"train": ["sway_train.npz"], "test": ["sway_test.npz"]},
+        preprocessing={"cutoff_hz": 8},
+        sensors={"joint_torques": [*TORQUES[:-1]], "noise": {"joint_torque": 0.1, "contact_force": 0.5}},
+        estimator={"name": "least_squares", "ridge": 0.001},
+        analysis={"compare": {"full": "full", "feet": "contacts"}},
+        output=str(experiment / "with_logs"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    folder = experiment / "with_logs.analysis"
+    return folder, json.loads((folder / "analysis.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def without_logs(experiment: Path) -> tuple[Path, dict[str, Any]]:
+    """The answers of a run with neither logs nor sensors, in two scenarios."""
+    scenarios = {"stand": [list(FEET)], "trot": [["front_left_foot", "rear_right_foot"], list(FEET[1:3]), []]}
+    file = asked(
+        experiment,
+        analysis={"scenarios": scenarios, "keep": ["front_left_foot"], "exclude": ["rear_left_knee"]},
+        output=str(experiment / "without_logs"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    folder = experiment / "without_logs.analysis"
+    return folder, json.loads((folder / "analysis.json").read_text())
+
+
+def test_the_folder_holds_answers_words_and_pictures(
+    with_logs: tuple[Path, dict[str, Any]], without_logs: tuple[Path, dict[str, Any]]
+) -> None:
+    always = {"analysis.json", "base_parameters.txt", "config.yaml"}
+    assert set(files_in(with_logs[0])) == always | {"sensors-logs.png", "accuracy.png"}
+    assert set(files_in(without_logs[0])) == always | {"sensors-stand.png", "sensors-trot.png"}
+    words = (with_logs[0] / "base_parameters.txt").read_text()
+    assert max(map(len, words.splitlines())) <= 100
+    assert "m[trunk] + m[front_left_hip_link]" in words
+
+
+def test_a_proposed_set_is_checked_and_its_cure_is_named(with_logs: tuple[Path, dict[str, Any]]) -> None:
+    (scenario,) = with_logs[1]["scenarios"].values()
+    lame = [check for check in scenario["proposed"] if check["lost"] is not None]
+    assert {check["random_postures"]["rank"] for check in lame} == {5}
+    assert all("rear_right_foot" in check["state"] for check in lame)
+    for check in lame:
+        (lacking,) = check["lost"]["lacking"]
+        assert lacking == {"contacts": ["rear_right_foot"], "sensors": 1}
+        assert set(check["lost"]["would_help"]) == {"rear_right_knee", "rear_right_foot"}
+    assert any("rear_right_foot" not in check["state"] for check in scenario["proposed"])
+
+
+def test_the_plan_is_the_smallest_and_says_what_each_sensor_is_for(with_logs: tuple[Path, dict[str, Any]]) -> None:
+    (plan,) = with_logs[1]["scenarios"].values()
+    assert plan["proven"]
+    assert plan["cost"] == plan["lower_bound"] == 12
+    assert {need["sensors"] for need in plan["needs"]} == {3}
+    assert all(check["random_postures"]["rank"] == 6 for check in plan["checks"])
+    for part in plan["parts"]:
+        bits = [found["bits"] for found in part["cheapest"]]
+        assert bits == sorted(bits, reverse=True)
+        assert len(part["minimal_sets"]) == 2
+    assert {without["base_rank"] for without in plan["without"]} == {5}
+
+
+def test_expected_errors_are_of_the_size_of_the_measured_ones(with_logs: tuple[Path, dict[str, Any]]) -> None:
+    accuracy = with_logs[1]["accuracy"]
+    assert set(accuracy) == {"proposed", "full", "feet", "planned for logs"}
+    for found in accuracy.values():
+        for group, expected in found["expected"].items():
+            assert expected / 3.0 < found["measured"][group] < 3.0 * expected, group
+    torque = {name: found["expected"]["joint_torque"] for name, found in accuracy.items()}
+    assert torque["full"] == min(torque.values())
+
+
+def test_scenarios_are_answered_one_by_one_and_sensors_are_kept_and_excluded(
+    without_logs: tuple[Path, dict[str, Any]],
+) -> None:
+    stand, trot = without_logs[1]["scenarios"].values()
+    assert without_logs[1]["accuracy"] is None
+    assert (stand["contact_states"], trot["contact_states"][-1]) == ([list(FEET)], [])
+    for plan in (stand, trot):
+        assert plan["proposed"] is None
+        assert {"front_left_foot", "rear_left_foot"} <= set(plan["sensors"])  # the latter for want of a knee
+        assert "rear_left_knee" not in plan["sensors"]
+    assert stand["stack"]["full"] == 94
+
+
+def test_the_stack_of_all_samples_needs_far_fewer_sensors(experiment: Path) -> None:
+    file = asked(
+        experiment,
+        analysis={"scenarios": {"step": [list(FEET), list(FEET[1:])]}, "criterion": "stack"},
+        output=str(experiment / "stack"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    plan = json.loads((experiment / "stack.analysis" / "analysis.json").read_text())["scenarios"]["step"]
+    assert plan["stack"]["rank"] == plan["stack"]["full"]
+    assert plan["cost"] < 12
+    assert all(without["stack_rank"] < plan["stack"]["full"] for without in plan["without"])
+
+
+REFUSED = {
+    "a scenario with an unknown frame": ({"scenarios": {"stand": [["paw"]]}}, "analysis.scenarios.stand", "'paw'"),
+    "a scenario without states": ({"scenarios": {"stand": []}}, "analysis.scenarios.stand", "an empty list"),
+    "a scenario that is no file name": ({"scenarios": {"a/b": [[]]}}, "analysis.scenarios", "a name of letters"),
+    "a kept sensor that is no candidate": ({"keep": ["knee"]}, "analysis.keep", "'knee'"),
+    "an excluded sensor that is no candidate": ({"exclude": ["front_left_foot.fx"]}, "analysis.exclude", "foot.fx'"),
+    "a sensor kept and excluded": (
+        {"keep": ["rear_left_knee"], "exclude": ["rear_left_knee"]}, "rear_left_knee", "one or the other",
+    ),
+    "a candidate joint that does not exist": (
+        {"candidates": {"joint_torques": ["knee"]}}, "analysis.candidates.joint_torques", "'knee'",
+    ),
+    "a cost of nothing": ({"costs": {"joint_torque": 0}}, "analysis.costs.joint_torque", "greater than 0"),
+    "a cost of an unknown sensor": ({"costs": {"elbow": 2}}, "analysis.costs", "'elbow'"),
+    "an unknown criterion": ({"criterion": "sample"}, "analysis.criterion", "'per_sample' or 'stack'"),
+    "an unknown key": ({"scenario": {}}, "analysis", "scenarios"),
+    "candidates that do not suffice": (
+        {"candidates": {"contacts": "none"}, "exclude": ["rear_left_knee"]}, "candidates", "rear_left_foot",
+    ),
+    "sets to compare without logs": ({"compare": {"full": "full"}}, "analysis.compare", "logs.train"),
+    "a set to compare that is empty": ({"compare": {"none": {}}}, "analysis.compare.none", "no sensor"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_slip_is_answered_in_one_line_and_nothing_is_written(
+    case: str, experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings, field, hint = REFUSED[case]
+    file = asked(experiment, analysis=settings)
+    message = refusal(["analyze", str(file)], experiment, capsys)
+    assert str(file) in message
+    assert field in message
+    assert hint in message
+
+
+def test_a_bolted_robot_cannot_lose_its_base_and_is_told_so(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}
+    file = asked(experiment, robot=robot, analysis={"criterion": "per_sample"})
+    assert "accepted: stack" in refusal(["analyze", str(file)], experiment, capsys)

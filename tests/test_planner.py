@@ -1,0 +1,330 @@
+"""What sensors robots need to know their base, what is lost without one, and what brings it back."""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from planning import MACHINES, Machine, sees_the_base, states_of, tried
+from synthetic import ANYMAL, G1, PANDA, SOLO12, Oracle, load, random_states
+
+from torchid.analysis.base_check import LostBase, base_values, check_set
+from torchid.analysis.branches import branches, needs
+from torchid.analysis.candidates import Candidate, candidates, chosen_from, sensor_set
+from torchid.analysis.demands import closure, contact_groups, demands, missing, random_postures
+from torchid.analysis.least_cost import least_cost
+from torchid.analysis.minimal_sets import all_minimal_sets, cheapest_set, components
+from torchid.analysis.screws import simplest_basis, words
+from torchid.errors import SensorError, UnknownNameError
+from torchid.parameters import Array
+from torchid.problem.plan import State
+from torchid.problem.rows import RowBuilder
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorSet, named_sensors
+from torchid.sensing.nullspace import null_space
+
+SOLES = (Contact("left_ankle_roll_link", "flat"), Contact("right_ankle_roll_link", "flat"))
+HAND = Contact("left_rubber_hand", "point")
+STANDING = states_of("11")
+QUADRUPEDS = {
+    "Solo12": (SOLO12, ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")),
+    "ANYmal": (ANYMAL, ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")),
+}
+
+
+@cache
+def g1() -> Robot:
+    return load(G1)
+
+
+def names(chosen: tuple[Candidate, ...]) -> list[str]:
+    return [candidate.name for candidate in chosen]
+
+
+# ------------------------------------------------------------------------------------------------ what robots need
+
+
+def test_a_standing_humanoid_needs_six_readings_per_leg_and_none_in_arms_or_waist() -> None:
+    choice = candidates(g1(), SOLES, per="axis")
+    wanted = demands(g1(), SOLES, STANDING, choice)
+    least = cheapest_set(wanted, choice)
+    assert (least.cost, least.lower_bound, least.proven) == (12.0, 12.0, True)
+    parts = components(wanted, choice)
+    assert [len(part.candidates) for part in parts] == [12, 12]
+    for part, side in zip(parts, ("left_", "right_"), strict=True):
+        assert all(c.name.startswith(side) and "shoulder" not in c.name for c in part.candidates)
+        assert {len(chosen) for chosen in all_minimal_sets(part.demands, part.candidates) or ()} == {6}
+
+
+def test_a_foots_force_torque_sensor_may_be_traded_for_the_six_torques_of_its_leg_and_for_nothing_else() -> None:
+    choice = candidates(g1(), SOLES)
+    for part in components(demands(g1(), SOLES, STANDING, choice), choice):
+        device, torques = sorted(all_minimal_sets(part.demands, part.candidates) or (), key=len)
+        assert [c.kind for c in device] == ["contact"]
+        assert [c.kind for c in torques] == ["joint_torque"] * 6
+
+
+@pytest.mark.parametrize("name", QUADRUPEDS)
+def test_a_quadruped_on_point_feet_needs_three_readings_per_leg_whatever_its_gait(name: str) -> None:
+    urdf, feet = QUADRUPEDS[name]
+    robot, contacts = load(urdf), tuple(Contact(foot, "point") for foot in feet)
+    gait = states_of("1111", "1001", "0110", "0000")
+    choice = candidates(robot, contacts)
+    least = cheapest_set(demands(robot, contacts, gait, choice), choice)
+    assert (least.cost, least.lower_bound, least.proven) == (12.0, 12.0, True)
+    found = needs(robot, contacts, gait)
+    assert [(need.needed, need.proven, need.contacts) for need in found] == [(3, True, (foot,)) for foot in feet]
+    assert all(len(need.joints) == 3 and len(need.branches) == 1 for need in found)
+
+
+@pytest.mark.parametrize("per", ["device", "axis"])
+def test_walking_with_a_hand_on_a_rail_is_planned_in_seconds(per: str) -> None:
+    contacts = (*SOLES, HAND)
+    states = states_of("110", "101", "011", "111")
+    start = time.perf_counter()
+    choice = candidates(g1(), contacts, per=per)
+    least = cheapest_set(demands(g1(), contacts, states, choice), choice)
+    seconds = time.perf_counter() - start
+    assert (least.cost, least.lower_bound, least.proven) == (15.0, 15.0, True)
+    assert seconds < 8.0, "0.2 s measured"
+    assert sees_the_base(g1(), contacts, states, [sensor_set(g1(), contacts, least.chosen)]).all()
+
+
+def test_two_hands_on_a_rail_share_the_waist_and_need_less_by_axes_than_by_torques() -> None:
+    hands = (Contact("left_rubber_hand", "flat"), Contact("right_rubber_hand", "flat"))
+    costs = {}
+    for per in ("device", "axis"):
+        choice = candidates(g1(), hands, per=per)
+        wanted = demands(g1(), hands, STANDING, choice)
+        assert [demand.contacts for demand in wanted] == [(0, 1)]
+        least = cheapest_set(wanted, choice)
+        assert (least.proven, least_cost(wanted[0], choice).bound) == (True, least.cost)
+        assert sees_the_base(g1(), hands, STANDING, [sensor_set(g1(), hands, least.chosen)]).all()
+        costs[per] = least.cost
+    # Three waist torques answer for the base's rotation; for its translation, three forces at each hand. No three
+    # torques of an arm span a translation, so that torques need nine in both arms, or six and a device.
+    assert costs == {"device": 12.0, "axis": 9.0}
+
+
+def test_six_torques_of_a_planar_leg_do_not_replace_a_foots_force_torque_sensor() -> None:
+    robot, _, _ = tried("a planar leg")
+    contacts = MACHINES["a planar leg"].contacts
+    torques = [c for c in candidates(robot, contacts) if c.kind == "joint_torque"]
+    with pytest.raises(SensorError, match=r"3 of 6 dimensions of leg6 unseen; accepted: ") as refused:
+        cheapest_set(demands(robot, contacts, states_of("1"), torques), torques)
+    assert "\n" not in str(refused.value)
+
+
+def test_contacts_on_one_limb_make_one_group_and_others_their_own() -> None:
+    contacts = (*SOLES, Contact("left_rubber_hand", "point"), Contact("right_rubber_hand", "point"))
+    contacts += (Contact("left_knee_link", "point"), Contact("pelvis", "point"))
+    assert contact_groups(g1(), contacts, (True,) * 6) == [(0, 4), (1,), (2, 3), (5,)]
+    assert contact_groups(g1(), contacts, (False, True, True, False, True, False)) == [(1,), (2,), (4,)]
+    assert contact_groups(g1(), contacts, (False,) * 6) == []
+
+
+def test_a_bolted_base_demands_nothing() -> None:
+    robot = load(PANDA, fixed_base=True)
+    contacts = (Contact("panda_link7", "flat"),)
+    choice = candidates(robot, contacts)
+    wanted = demands(robot, contacts, states_of("1"), choice)
+    assert wanted == []
+    assert cheapest_set(wanted, choice).chosen == ()
+    assert check_set(robot, contacts, states_of("1"), sensor_set(robot, contacts, ()), choice) == []
+
+
+def test_the_closure_adds_no_reach_and_is_its_own_closure() -> None:
+    for name in MACHINES:
+        machine, (robot, choice, _) = MACHINES[name], tried(name)
+        for demand in demands(robot, machine.contacts, machine.states, choice):
+            some = list(choice[::3])
+            closed = closure(demand, some)
+            assert closed >= set(some) & demand.vectors.keys()
+            assert missing(demand, closed) == missing(demand, some)
+            assert closure(demand, closed) == closed
+
+
+# --------------------------------------------------------------------------------------- limbs, candidates, prices
+
+
+def test_a_humanoid_has_five_branches_and_a_contact_constrains_all_on_its_way() -> None:
+    found = branches(g1(), (*SOLES, HAND), states_of("110", "101"))
+    assert [(len(b.joints), b.contacts) for b in found] == [
+        (6, ("left_ankle_roll_link",)), (6, ("right_ankle_roll_link",)), (3, ("left_rubber_hand",)),
+        (7, ("left_rubber_hand",)), (7, ()),
+    ]  # fmt: skip
+    assert found[2].name == "waist_yaw_joint ... waist_pitch_joint"
+    assert [b.constrained for b in branches(g1(), (*SOLES, HAND), states_of("110"))] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+
+
+def test_limbs_part_where_a_body_carries_two_even_if_the_base_carries_one() -> None:
+    robot, _, _ = tried("hands on a trunk")
+    machine = MACHINES["hands on a trunk"]
+    found = branches(robot, machine.contacts, states_of("10"))
+    assert [(b.name, b.constrained) for b in found] == [
+        ("j_trunk1 ... j_trunk2", True), ("j_left1 ... j_left2", True), ("j_right1 ... j_right2", False),
+    ]  # fmt: skip
+    mimicking, _, _ = tried("a joint that mimics another")
+    (leg,) = branches(mimicking, MACHINES["a joint that mimics another"].contacts, states_of("1"))
+    assert leg.joints == ("j_leg1", "j_leg2", "j_leg3", "j_leg5")
+
+
+def test_candidates_are_named_priced_and_turned_into_masks_and_back() -> None:
+    robot, contacts = g1(), (SOLES[0], HAND)
+    torques = ["left_knee_joint", "left_hip_yaw_joint"]
+    device = candidates(robot, contacts, torques, costs={"joint_torque": 3.0, "left_knee_joint": 2.5, "contact": 0.5})
+    assert [(c.name, c.cost, c.channels) for c in device] == [
+        ("left_hip_yaw_joint", 3.0, 1), ("left_knee_joint", 2.5, 1),
+        ("left_ankle_roll_link", 3.0, 6), ("left_rubber_hand", 1.5, 3),
+    ]  # fmt: skip
+    axis = candidates(robot, contacts, [], per="axis")
+    assert names(axis)[4:] == [
+        "left_ankle_roll_link.my", "left_ankle_roll_link.mz",
+        "left_rubber_hand.fx", "left_rubber_hand.fy", "left_rubber_hand.fz",
+    ]  # fmt: skip
+    for chosen in (device[1:3], device[:1], ()):
+        again = chosen_from(robot, contacts, sensor_set(robot, contacts, chosen), device)
+        assert (again.chosen, again.uncovered) == (tuple(chosen), ())
+    partial = sensor_set(robot, contacts, (*axis[1:3], *candidates(robot, contacts, ["waist_yaw_joint"])[:1]))
+    found = chosen_from(robot, contacts, partial, device)
+    assert found.chosen == ()
+    assert found.uncovered == ("waist_yaw_joint", "left_ankle_roll_link.fy", "left_ankle_roll_link.fz")
+    assert chosen_from(robot, contacts, named_sensors("contacts", robot.n, 2), device).chosen == device[2:]
+
+
+def test_what_cannot_be_a_candidate_or_a_price_is_refused_in_one_line() -> None:
+    robot, contacts = g1(), SOLES
+    with pytest.raises(UnknownNameError, match="unknown name 'left_kne_joint'; accepted: left_knee_joint"):
+        candidates(robot, contacts, ["left_kne_joint"])
+    with pytest.raises(UnknownNameError, match="costs: unknown name 'left_knee'; accepted: left_knee_joint"):
+        candidates(robot, contacts, costs={"left_knee": 2.0})
+    with pytest.raises(SensorError, match="candidates.per: 'foot'; accepted: device, axis"):
+        candidates(robot, contacts, per="foot")
+    for price in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(SensorError, match=r"costs.contact: .*; accepted: a positive number"):
+            candidates(robot, contacts, costs={"contact": price})
+    choice = candidates(robot, contacts)
+    with pytest.raises(SensorError, match="'left_knee_joint', which is also excluded"):
+        cheapest_set([], choice, keep=[choice[3]], exclude=choice[3:5])
+
+
+# ------------------------------------------------------------------------------------------- what is lost, and why
+
+
+def bases(robot: Robot, contacts: tuple[Contact, ...], state: State, sensors: SensorSet, posture: Array) -> Array:
+    """S_b V_x, (6, r), with Pinocchio's Jacobian."""
+    q = random_states(np.random.default_rng(0), robot.n, 1)[0]
+    q[0, 7:] = posture
+    rows = [np.eye(robot.nv)[6:][~sensors.torque]]
+    for contact, active, measured in zip(contacts, state, sensors.wrench, strict=True):
+        unmeasured = [k for k in contact.components if active and not measured[k]]
+        rows.append(Oracle.of(robot).jacobian(q, contact.frame)[0][unmeasured])
+    [(_, V)] = null_space(torch.from_numpy(np.vstack(rows))[None])
+    return V[0, :6].numpy()
+
+
+def test_without_any_sensor_of_a_minimal_set_the_base_is_lost_as_told_and_each_cure_brings_it_back() -> None:
+    contacts, states = (*SOLES, HAND), states_of("110", "011")
+    choice = candidates(g1(), contacts)
+    chosen = cheapest_set(demands(g1(), contacts, states, choice), choice).chosen
+    complete = check_set(g1(), contacts, states, sensor_set(g1(), contacts, chosen), choice)
+    assert [(check.generic.rank, check.lost) for check in complete] == [(6, None), (6, None)]
+    for removed in chosen[1::2]:
+        left = tuple(c for c in chosen if c != removed)
+        sensors = sensor_set(g1(), contacts, left)
+        checks = check_set(g1(), contacts, states, sensors, choice, samples=16)
+        lost = [(check.state, check.lost) for check in checks if check.lost is not None]
+        assert lost
+        for state, what in lost:
+            assert isinstance(what, LostBase)
+            kept = bases(g1(), contacts, state, sensors, what.posture)
+            size = what.directions.shape[1]
+            assert size == len(what.words) == 6 - np.linalg.matrix_rank(kept, tol=1e-6) > 0
+            np.testing.assert_allclose(what.directions.T @ what.directions, np.eye(size), atol=1e-12)
+            np.testing.assert_allclose(what.directions.T @ kept, 0.0, atol=1e-9)
+            assert sum(dimensions for _, dimensions in what.culprits) == 1
+            assert removed in what.cures
+            for cure in (removed, what.cures[0], what.cures[-1]):
+                cured = sensor_set(g1(), contacts, (*left, cure))
+                assert sees_the_base(g1(), contacts, (state,), [cured]).all(), cure.name
+
+
+def test_a_planar_leg_loses_what_moves_out_of_its_plane() -> None:
+    robot, _, _ = tried("a planar leg")
+    contacts = MACHINES["a planar leg"].contacts
+    choice = candidates(robot, contacts, per="axis")
+    torques = [c for c in choice if c.kind == "joint_torque"]
+    (check,) = check_set(robot, contacts, states_of("1"), sensor_set(robot, contacts, torques), choice)
+    assert (check.generic.rank, check.coincident) == (3, ())
+    assert check.lost is not None
+    assert sorted(check.lost.words) == ["force along (0, 1, 0)", "moment about (0, 0, 1)", "moment about (1, 0, 0)"]
+    assert check.lost.culprits == ((("leg6",), 3),)
+    assert names(check.lost.cures) == ["leg6.fy", "leg6.mx", "leg6.mz"]
+
+
+def test_straight_legs_make_three_pitch_torques_act_alike() -> None:
+    choice = candidates(g1(), SOLES)
+    torques = [c for c in choice if c.kind == "joint_torque"]
+    bent = random_postures(g1(), 50, seed=5)
+    recorded = {STANDING[0]: np.vstack([bent, np.zeros((1, g1().n))])}
+    sensors = sensor_set(g1(), SOLES, torques)
+    (check,) = check_set(g1(), SOLES, STANDING, sensors, choice, postures=recorded)
+    assert (check.generic.rank, check.lost) == (6, None)
+    assert check.zero.rank < 6
+    assert check.coincident == tuple(
+        tuple(f"{side}_{joint}_joint" for joint in ("hip_pitch", "knee", "ankle_pitch")) for side in ("left", "right")
+    )
+    assert check.recorded is not None
+    assert check.recorded.least == pytest.approx(check.zero.least)
+    values = base_values(RowBuilder(g1(), SOLES, sensors), STANDING[0], bent)[:, -1].numpy()
+    assert check.recorded.median == pytest.approx(np.median([*values, check.zero.least]), rel=1e-9)
+    (measured,) = check_set(g1(), SOLES, STANDING, named_sensors("contacts", g1().n, 2), choice)
+    assert (measured.zero.rank, measured.coincident) == (6, ())
+
+
+def test_the_numbers_of_a_check_do_not_depend_on_the_size_of_its_chunks() -> None:
+    sensors = named_sensors("joints", g1().n, 2)
+    builder = RowBuilder(g1(), SOLES, sensors)
+    postures = random_postures(g1(), 1100, seed=2)
+    together = base_values(builder, STANDING[0], postures)
+    assert together.shape == (1100, 6)
+    np.testing.assert_allclose(together[1050:], base_values(builder, STANDING[0], postures[1050:]), atol=1e-12)
+
+
+def test_flight_sees_the_whole_base_without_a_sensor(tmp_path: Path) -> None:
+    machine = Machine({"leg": ("base", ("x", "z"))}, (Contact("leg2", "point"),), states_of("0"))
+    robot = machine.robot(tmp_path)
+    (check,) = check_set(robot, machine.contacts, machine.states, sensor_set(robot, machine.contacts, ()), ())
+    assert (check.name, check.generic.rank, check.zero.rank, check.generic.least) == ("none", 6, 6, pytest.approx(1.0))
+
+
+@pytest.mark.parametrize(
+    ("wrench", "text"),
+    [
+        ((0, 0, -2, 0, 0, 0), "force along (0, 0, 1)"),
+        ((0, 0, 0, 3, 0, 3), "moment about (0.71, 0, 0.71)"),
+        ((0, 0, 1, 0.2, 0, 0), "force along (0, 0, 1) through (0, 0.2, 0)"),
+        ((0, 0, -1, 0, 0, 0.5), "force along (0, 0, 1) with -0.5 m of pitch"),
+        ((2, 0, 0, 0.5, 0, -0.6), "force along (1, 0, 0) through (0, 0.3, 0) with 0.25 m of pitch"),
+    ],
+)
+def test_a_wrench_is_put_in_words(wrench: tuple[float, ...], text: str) -> None:
+    assert words(np.array(wrench, dtype=float)) == text
+
+
+@pytest.mark.parametrize("kept", [(0, 4), (2, 3, 5), (0, 1, 2, 3, 4, 5)])
+def test_lost_axes_are_found_again_in_a_rotated_basis(kept: tuple[int, ...]) -> None:
+    axes = np.eye(6)[:, kept]
+    turned = axes @ np.linalg.qr(np.random.default_rng(1).normal(size=(len(kept), len(kept))))[0]
+    found = np.array(simplest_basis(turned))
+    np.testing.assert_allclose(found[np.lexsort(found.T)], axes.T[np.lexsort(axes)], atol=1e-12)

@@ -1,0 +1,200 @@
+"""Base parameters: the combinations of parameters that the rows of a problem determine.
+
+Source: Mistry, Schaal, Yamane, Humanoids 2009, eq. (11); how they are found: Gautier, "Numerical calculation of the
+base inertial parameters of robots", J. Robotic Systems 1991.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import torch
+from torch import Tensor, nn
+
+from torchid import parameters
+from torchid.errors import NumericalWarning
+from torchid.parameters import Array
+from torchid.problem.linear import LinearProblem
+from torchid.problem.threads import one_thread
+
+_CLEAR_GAP = 1e3  # a rank is told by a step of many decades (14 on exact motions), not by a slope
+_ROUNDING = 1e-9  # of a coefficient, columns having norm 1; joint angles written as 1.5707963 leave 1e-11
+_LEAST_PREFERENCE = 1e-2  # between 1e-1 and 1e-4 sums are shortest, and conditioning is the same
+
+
+class RankGap(NamedTuple):
+    """Number of singular values that count, and how clear that is: the smallest of them over the next one."""
+
+    rank: int
+    gap: float
+
+
+def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
+    """Rank of a matrix with columns of one size.
+
+    What lies below rounding is not known: the gap takes it for `eps` times the largest value, and is 4.5e15 at most.
+
+    Args:
+        values: singular values, descending.
+        tolerance: a value below this share of the largest counts as zero.
+
+    Warns:
+        NumericalWarning: a gap below 1e3, so that another tolerance finds another rank.
+    """
+    rank = int((values > tolerance * values[:1]).sum())
+    if rank == 0:
+        return RankGap(0, np.inf)
+    dropped = max(float(values[rank]) if rank < len(values) else 0.0, np.finfo(float).eps * float(values[0]))
+    gap = float(values[rank - 1]) / dropped
+    if gap < _CLEAR_GAP:
+        message = f"rank {rank}: the next singular value is only {gap:.3g} times smaller than the last that counts"
+        warnings.warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning, 2)
+    return RankGap(rank, gap)
+
+
+@one_thread()
+def structural_rank(problem: LinearProblem, tolerance: float = 1e-10) -> RankGap:
+    """Rank of a problem's free columns.
+
+    Args, Warns: as `base_parameters`.
+    """
+    columns, _ = _unit_columns(problem, tolerance)
+    return rank_and_gap(scipy.linalg.svd(columns, compute_uv=False, lapack_driver="gesvd"), tolerance)
+
+
+def drop_preference(count: int) -> Array:
+    """How gladly each of `count` parameters is regrouped into others, (count,), from 1 down to 0.01.
+
+    As textbooks do it: limbs into what carries them; of a body the mass first, then first moments, then inertia.
+    """
+    bodies = max(count // parameters.PER_BODY, 1)
+    return np.concatenate(np.array_split(np.geomspace(1.0, _LEAST_PREFERENCE, count), bodies)[::-1])
+
+
+class BaseParameters(nn.Module):
+    """Base parameters phi_B = G phi with `K phi = K_B phi_B` (eq. 11) for every row K of the kind they were made from.
+
+    Attributes:
+        kept: (P_B,) int, ascending; base parameter i is parameter `kept[i]` and what was regrouped into it.
+        combination: G, (P_B, P): the identity in the kept columns, zero in those that are not free.
+        hidden: (P_free - P_B, P), directions h with K h = 0; `hidden / scale` is orthonormal.
+        free: (P,) bool; the others are constants, see `forward`.
+        scale: (P,), the problem's.
+        rank, gap, singular_values: of the columns scaled to norm 1, see `rank_and_gap`.
+    """
+
+    index: Tensor
+
+    def __init__(
+        self,
+        kept: np.ndarray,
+        combination: Array,
+        free: np.ndarray,
+        scale: Array,
+        singular_values: Array,
+        rank_gap: RankGap,
+    ) -> None:
+        """See `base_parameters`, which finds them."""
+        super().__init__()
+        self.kept, self.combination, self.free, self.scale = kept, combination, free, scale
+        self.singular_values = singular_values
+        self.rank, self.gap = rank_gap
+        self.hidden = _hidden(kept, combination, free, scale)
+        self.register_buffer("index", torch.from_numpy(kept), persistent=False)
+
+    def forward(self, K: Tensor) -> Tensor:
+        """K_B, (..., P_B), of a regressor K, (..., P).
+
+        Parameters that are not free have no part in phi_B: `K phi = K_B phi_B + K[..., ~free] @ phi[~free]`.
+        """
+        return K.index_select(-1, self.index)
+
+    def of(self, phi: Array) -> Array:
+        """Base parameters (..., P_B) of parameters (..., P)."""
+        return phi @ self.combination.T
+
+    def lift(self, phi_B: Array, nominal: Array) -> Array:
+        """The parameters (..., P) nearest to `nominal`, (P,), in units of `scale`, with base parameters (..., P_B)."""
+        step = np.zeros((*phi_B.shape[:-1], len(self.scale)))
+        step[..., self.kept] = (phi_B - self.of(nominal)) / self.scale[self.kept]
+        directions = self.hidden / self.scale
+        return nominal + self.scale * (step - step @ directions.T @ directions)
+
+    def problem(self, problem: LinearProblem) -> LinearProblem:
+        """The same problem in the base parameters, all free and seen; constants move to its right-hand side.
+
+        Raises:
+            ValueError: other parameters are free there.
+        """
+        if not np.array_equal(problem.free, self.free):
+            raise ValueError("free: found other parameters than these base parameters were made from; accepted: those")
+        constant = np.where(self.free, 0.0, problem.nominal)
+        return LinearProblem(
+            A=problem.A[:, self.kept],
+            b=problem.b - problem.A @ constant,
+            residual=problem.residual,
+            rows=problem.rows,
+            nominal=self.of(problem.nominal),
+            scale=problem.scale[self.kept],
+            free=np.ones(len(self.kept), dtype=bool),
+        )
+
+
+@one_thread()
+def base_parameters(
+    problem: LinearProblem, tolerance: float = 1e-10, preference: Array | None = None
+) -> BaseParameters:
+    """Base parameters of a problem.
+
+    Columns are scaled to norm 1, so that a finger's inertia counts as much as the torso's mass; a pivoted QR
+    factorization of their null space settles which parameters are regrouped into the others.
+
+    Args:
+        problem: its rows decide what is seen.
+        tolerance: a column below this share of the largest, in units of `problem.scale`, is not seen at all; a singular
+            value of the scaled columns below this share of the largest counts as zero.
+        preference: (P,), > 0, how gladly each parameter is regrouped into others; by default `drop_preference`.
+
+    Warns:
+        NumericalWarning: the rank is a matter of the tolerance.
+    """
+    free, count = np.flatnonzero(problem.free), len(problem.scale)
+    columns, units = _unit_columns(problem, tolerance)
+    _, values, Vh = scipy.linalg.svd(columns, lapack_driver="gesvd")  # gesdd can fail on dozens of null directions
+    rank_gap = rank_and_gap(values, tolerance)
+    null_space = Vh[rank_gap.rank :].T
+    weight = (drop_preference(count) if preference is None else preference)[free]
+    _, order = scipy.linalg.qr((null_space * weight[:, None]).T, mode="r", pivoting=True)
+    hidden_count = len(free) - rank_gap.rank
+    dropped, kept = order[:hidden_count], np.sort(order[hidden_count:])
+    regrouped = -np.linalg.solve(null_space[dropped].T, null_space[kept].T).T
+    regrouped[np.abs(regrouped) < _ROUNDING] = 0.0
+
+    combination = np.zeros((len(kept), count))
+    combination[np.arange(len(kept)), free[kept]] = 1.0
+    combination[:, free[dropped]] = units[kept, None] * regrouped / units[dropped]
+    return BaseParameters(free[kept], combination, problem.free, problem.scale, values, rank_gap)
+
+
+def _unit_columns(problem: LinearProblem, tolerance: float) -> tuple[Array, Array]:
+    """Free columns scaled to norm 1, those not seen to 0, (R, P_free), and their parameters' units, (P_free,)."""
+    scale = problem.scale[problem.free]
+    columns = problem.A[:, problem.free] * scale
+    norms = np.linalg.norm(columns, axis=0)
+    seen = norms > tolerance * norms.max(initial=0.0)
+    norms[~seen] = 1.0
+    return np.where(seen, columns, 0.0) / norms, scale / norms
+
+
+def _hidden(kept: np.ndarray, combination: Array, free: np.ndarray, scale: Array) -> Array:
+    """Null space of G in the free parameters, orthonormal in units of `scale`."""
+    dropped = np.setdiff1d(np.flatnonzero(free), kept)
+    directions = np.zeros((len(scale), len(dropped)))
+    directions[dropped, np.arange(len(dropped))] = 1.0
+    directions[kept] = -combination[:, dropped]
+    hidden = np.zeros((len(dropped), len(scale)))
+    hidden[:, free] = np.linalg.qr(directions[free] / scale[free, None]).Q.T * scale[free]
+    return hidden

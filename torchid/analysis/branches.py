@@ -1,0 +1,95 @@
+"""The robot's limbs, which of them a contact constrains, and how many sensors each group of contacts needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from torchid.analysis.candidates import candidates
+from torchid.analysis.demands import contact_joints, demands
+from torchid.analysis.minimal_sets import cheapest_set
+from torchid.problem.plan import State
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A chain of joints between the base, a body where limbs part, and a tip.
+
+    `joints`: its independent joints, from the base outward. `contacts`: frames beyond it that some state uses.
+    """
+
+    joints: tuple[str, ...]
+    contacts: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """First and last joint."""
+        return self.joints[0] if len(self.joints) == 1 else f"{self.joints[0]} ... {self.joints[-1]}"
+
+    @property
+    def constrained(self) -> bool:
+        """Whether a contact lies beyond it; sensors in other branches say nothing about the base."""
+        return bool(self.contacts)
+
+
+@dataclass(frozen=True)
+class Need:
+    """A group of contacts that share joints, and what it takes to know the base while they touch.
+
+    `joints`: between the base and the contacts. `branches`: names of the branches these belong to. `needed`: the fewest
+    readings (joint torques, contact components) that meet this group's demand alone, a lower bound if not `proven`.
+    """
+
+    contacts: tuple[str, ...]
+    joints: tuple[str, ...]
+    branches: tuple[str, ...]
+    needed: int
+    proven: bool
+
+
+def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State]) -> tuple[Branch, ...]:
+    """All branches with joints of their own, depth first; a finger that only mimics has none."""
+    used = [contact for contact, *active in zip(contacts, *states, strict=True) if any(active)]
+    children: dict[int, list[int]] = {index: [] for index in range(len(robot.bodies))}
+    for index, body in enumerate(robot.bodies[1:], start=1):
+        children[body.parent].append(index)
+    found = []
+    for first, body in enumerate(robot.bodies[1:], start=1):
+        if body.parent > 0 and len(children[body.parent]) == 1:
+            continue
+        chain = [first]
+        while len(children[chain[-1]]) == 1:
+            chain += children[chain[-1]]
+        names = [joint.name for k in chain if (joint := robot.bodies[k].joint) is not None]
+        joints = tuple(name for name in names if name in robot.joint_names)
+        beyond = {first}
+        for index in range(first + 1, len(robot.bodies)):  # bodies are depth first
+            if robot.bodies[index].parent in beyond:
+                beyond.add(index)
+        if joints:
+            found.append(Branch(joints, tuple(c.frame for c in used if robot.link(c.frame)[0] in beyond)))
+    return tuple(found)
+
+
+def needs(robot: Robot, contacts: Sequence[Contact], states: Iterable[State], seed: int = 0) -> tuple[Need, ...]:
+    """What every group of contacts needs if all joint torques and contact components could be measured."""
+    states = tuple(states)
+    limbs = branches(robot, contacts, states)
+    channels = candidates(robot, contacts, per="axis")
+    above = contact_joints(robot, contacts)
+    found = []
+    for demand in demands(robot, contacts, states, channels, seed):
+        least = cheapest_set([demand], channels)
+        path = {robot.joint_names[j] for place in demand.contacts for j in above[place]}
+        found.append(
+            Need(
+                demand.frames,
+                tuple(name for name in robot.joint_names if name in path),
+                tuple(limb.name for limb in limbs if path.intersection(limb.joints)),
+                round(least.lower_bound),
+                least.proven,
+            )
+        )
+    return tuple(found)

@@ -1,0 +1,169 @@
+"""What the contacts demand of the sensors for the base to survive the projection.
+
+In a contact state, let J = [J_b | J_1 ... J_n] be the rows of the contact Jacobian, one per component that an active
+contact can exert. V_x spans the generalized velocities that move no unmeasured joint and no unmeasured component, so
+`rank(S_b V_x) = 6` (Mistry et al. 2009) says: whatever way the base moves, measured joints can keep the unmeasured
+components of the contacts' velocities at zero. That is
+
+    range(J_b)  lies in  span{J_j : torque j measured} + span{e_r : component r measured}.
+
+Every sensor is thus a few vectors of one linear space, and a set suffices if their span contains the target range(J_b).
+Contacts that share no joint have rows of their own in every J_j and e_r, so each connected group of contacts makes
+a demand of its own, the same in every contact state it appears in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from torchid.analysis.candidates import Candidate
+from torchid.parameters import Array
+from torchid.problem.plan import Columns, State
+from torchid.regressor.jacobian import FrameJacobian
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+
+TOLERANCE = 1e-6
+"""A share of unit vectors below this counts as zero, as in the rank of S_b V_x that this stands for.
+
+Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as independent in both.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Demand:
+    """What a group of contacts demands, at one posture.
+
+    Attributes:
+        contacts: places of the group's contacts, ascending; `frames`: their names.
+        rows: (k,) the contact that each row of J belongs to.
+        target: (k, d) orthonormal basis of range(J_b).
+        vectors: (k, w) unit vectors of every candidate that acts on the group; others, and those that act on it with
+            no lever, are absent.
+    """
+
+    contacts: tuple[int, ...]
+    frames: tuple[str, ...]
+    rows: tuple[int, ...]
+    target: Array
+    vectors: Mapping[Candidate, Array]
+
+    def stacked(self, chosen: Iterable[Candidate]) -> Array:
+        """All vectors of some candidates, (k, w)."""
+        return np.hstack([np.zeros((len(self.rows), 0)), *(self.vectors[c] for c in chosen if c in self.vectors)])
+
+    def missing(self, basis: Array) -> Array:
+        """Dimensions of the target outside the span of orthonormal (or zero) columns (..., k, r), int (...)."""
+        return np.asarray((np.linalg.svd(outside(self.target, basis), compute_uv=False) > TOLERANCE).sum(-1))
+
+    def gains(self, basis: Array) -> dict[Candidate, int]:
+        """Dimensions that each candidate adds to a span (k, r)."""
+        values = ((c, np.linalg.svd(outside(x, basis), compute_uv=False)) for c, x in self.vectors.items())
+        return {candidate: int((s > TOLERANCE).sum()) for candidate, s in values}
+
+
+def orthonormal(vectors: Array) -> Array:
+    """Orthonormal basis of the span of unit columns, (..., k, w) to (..., k, min(k, w)), padded with zero columns."""
+    U, values, _ = np.linalg.svd(vectors, full_matrices=False)
+    return U * (values > TOLERANCE * values[..., :1])[..., None, :]
+
+
+def outside(vectors: Array, basis: Array) -> Array:
+    """What of some vectors, (k, w), is orthogonal to a span (..., k, r): (..., k, w)."""
+    return vectors - basis @ (np.swapaxes(basis, -1, -2) @ vectors)
+
+
+def missing(demand: Demand, chosen: Iterable[Candidate]) -> int:
+    """Dimensions of the target that a set of candidates leaves unreached; 0 if it meets the demand."""
+    return int(demand.missing(orthonormal(demand.stacked(chosen))))
+
+
+def closure(demand: Demand, chosen: Iterable[Candidate]) -> frozenset[Candidate]:
+    """The demand's candidates that add nothing to a set of them, those of the set included."""
+    gains = demand.gains(orthonormal(demand.stacked(chosen)))
+    return frozenset(candidate for candidate, gain in gains.items() if not gain)
+
+
+def demands(
+    robot: Robot,
+    contacts: Sequence[Contact],
+    states: Iterable[State],
+    candidates: Sequence[Candidate],
+    seed: int = 0,
+    joint_position: Array | None = None,
+) -> list[Demand]:
+    """What some contact states demand, each group of contacts once; nothing for a bolted base.
+
+    Args:
+        robot: the robot.
+        contacts: all contacts.
+        states: which of them touch the ground together.
+        candidates: sensors to choose from.
+        seed: of the random posture that stands for almost all.
+        joint_position: (n,) instead of that [rad or m].
+    """
+    if robot.fixed_base:
+        return []
+    if joint_position is None:
+        joint_position = random_postures(robot, 1, seed)[0]
+    q = torch.tensor([[0.0] * 6 + [1.0, *joint_position]], dtype=torch.float64)
+    J = [FrameJacobian(robot, c.frame)(q)[0].numpy()[list(c.components)] for c in contacts]
+    groups = dict.fromkeys(group for state in states for group in contact_groups(robot, contacts, state))
+    return [_demand(group, contacts, J, candidates) for group in groups]
+
+
+def random_postures(robot: Robot, count: int, seed: int = 0) -> Array:
+    """Joint positions (count, n) [rad or m], a uniform draw from -1.5 to 1.5."""
+    return np.random.default_rng(seed).uniform(-1.5, 1.5, (count, robot.n))
+
+
+def contact_joints(robot: Robot, contacts: Sequence[Contact]) -> list[frozenset[int]]:
+    """Independent joints between the base and each contact."""
+    columns = Columns(KinematicTree(robot))
+    return [frozenset(columns.joints_above(robot.link(contact.frame)[0])) for contact in contacts]
+
+
+def contact_groups(robot: Robot, contacts: Sequence[Contact], state: State) -> list[tuple[int, ...]]:
+    """Active contacts, grouped by shared joints on their paths from the base."""
+    active = [place for place, touching in enumerate(state) if touching]
+    above = contact_joints(robot, [contacts[place] for place in active])
+    return [tuple(active[k] for k in group) for group in connected(above)]
+
+
+def connected(sets: Sequence[AbstractSet[Hashable]]) -> list[tuple[int, ...]]:
+    """Places of sets that are linked by common members, ascending; an empty set is alone."""
+    groups: list[tuple[list[int], set[Hashable]]] = []
+    for place, members in enumerate(sets):
+        touched = [group for group in groups if group[1] & members]
+        groups = [group for group in groups if not group[1] & members]
+        places = sorted([place, *(k for group in touched for k in group[0])])
+        groups.append((places, set(members).union(*(group[1] for group in touched))))
+    return sorted(tuple(places) for places, _ in groups)
+
+
+def _demand(
+    group: tuple[int, ...], contacts: Sequence[Contact], J: Sequence[Array], candidates: Sequence[Candidate]
+) -> Demand:
+    rows = [(place, k) for place in group for k in contacts[place].components]
+    J_group = np.concatenate([J[place] for place in group])
+    J_base, J_joints = J_group[:, :6], J_group[:, 6:]
+    scale = np.linalg.norm(J_base)
+    U, values, _ = np.linalg.svd(J_base, full_matrices=False)
+    vectors = {}
+    for candidate in candidates:
+        if candidate.joint is not None:
+            x = J_joints[:, [candidate.joint]]
+            if np.linalg.norm(x) > TOLERANCE * scale:
+                vectors[candidate] = x / np.linalg.norm(x)
+        elif candidate.contact in group:
+            read = [rows.index((candidate.contact, k)) for k in candidate.components]
+            vectors[candidate] = np.eye(len(rows))[:, read]
+    frames = tuple(contacts[place].frame for place in group)
+    target = U[:, values > TOLERANCE * values[0]]
+    return Demand(group, frames, tuple(place for place, _ in rows), target, vectors)

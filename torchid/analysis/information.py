@@ -1,0 +1,52 @@
+"""How much is known of the parameters: bits, and combinations known better than to within their scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchid.parameters import Array
+from torchid.problem import LinearProblem, RowBuilder
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What data tell beyond "each free parameter is within one scale of its nominal value".
+
+    With H the information of the whitened rows in units of the scales, `bits` = log2 det(I + H) / 2, by how many
+    halvings the standard deviations shrink in all, and `determined` = tr((I + H)^-1 H), the number of independent
+    combinations that the data know better than the prior, counted by their share.
+    """
+
+    bits: float
+    determined: float
+
+    @classmethod
+    def of(cls, information: Array) -> Knowledge:
+        """From the eigenvalues of H, (M,), at least 0 but for rounding."""
+        values = np.maximum(information, 0.0)
+        return cls(float(np.log1p(values).sum() / np.log(4.0)), float((values / (1.0 + values)).sum()))
+
+    def __sub__(self, other: Knowledge) -> Knowledge:
+        return Knowledge(self.bits - other.bits, self.determined - other.determined)
+
+
+def prior_directions(problem: LinearProblem, builder: RowBuilder) -> Array:
+    """N, (columns, M), so that rows X in the builder's columns have the information `N^T X^T X N`.
+
+    `N N^T` is the covariance of the columns' parameters if the free parameters are independent with the standard
+    deviations `problem.scale`.
+    """
+    M = builder.columns.from_parameters()[:, problem.free] * problem.scale[problem.free]
+    return triangle(M.T).T
+
+
+def triangle(X: Array) -> Array:
+    """Triangular R, (min(M, N), N), with `R^T R = X^T X`."""
+    return np.asarray(np.linalg.qr(X, mode="r"))
+
+
+def singular_values(X: Array) -> Array:
+    """Of a matrix, descending."""
+    return np.asarray(np.linalg.svd(X, compute_uv=False))

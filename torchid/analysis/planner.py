@@ -1,0 +1,211 @@
+"""Which sensors a scenario needs: all that the other modules of the planner find, put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+
+import numpy as np
+
+from torchid.analysis.base_check import StateCheck, base_values, check_set
+from torchid.analysis.branches import Branch, Need, branches, needs
+from torchid.analysis.candidates import Candidate, sensor_set
+from torchid.analysis.demands import demands, random_postures
+from torchid.analysis.minimal_sets import Component, MinimalSet, all_minimal_sets, cheapest_set, components
+from torchid.analysis.ranking import SetRanking, best_first
+from torchid.analysis.stack import MotionStack, sparse_set
+from torchid.analysis.structure import structural_samples
+from torchid.errors import SensorError
+from torchid.parameters import Array
+from torchid.problem.chunks import spread_by_state
+from torchid.problem.plan import State
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+from torchid.sensing.projection import base_rank
+from torchid.sensing.sensors import SensorNoise, SensorSet
+
+CRITERIA = ("per_sample", "stack")
+Progress = Callable[[str, int, int], None]
+"""Called with what is going on, steps done and steps in all."""
+
+_EXACT = 1e-9
+_POSTURES = 500  # of a log, in a contact state
+_TRIED = 4  # random postures: the rank is that of almost every one
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of the planner.
+
+    Attributes:
+        robot, contacts, states: the scenario.
+        candidates: sensors to choose from; `keep`: those that are there anyway, `exclude`: that cannot be.
+        noise: of the sensors.
+        logs: motion to weigh the sensors by; empty: random motion in the scenario's states.
+        prior: (12 L,), how far parameters may be off the nominal ones, 0 where they are known.
+        criterion: one of `CRITERIA`.
+        seed: of random postures and motion.
+    """
+
+    robot: Robot
+    contacts: tuple[Contact, ...]
+    states: tuple[State, ...]
+    candidates: tuple[Candidate, ...]
+    prior: Array
+    keep: frozenset[Candidate] = frozenset()
+    exclude: frozenset[Candidate] = frozenset()
+    noise: SensorNoise = field(default_factory=SensorNoise)
+    logs: tuple[Samples, ...] = ()
+    criterion: str = "per_sample"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class PartPlan:
+    """A part of the robot that can be planned on its own.
+
+    `frames`: its contacts. `sets`: all its minimal sets, no sensor of which can be left out; None if there are too many
+    candidates to try all. `ranked`: the cheapest of them with their information [bits], most informative first.
+    """
+
+    frames: tuple[str, ...]
+    candidates: tuple[Candidate, ...]
+    sets: tuple[tuple[Candidate, ...], ...] | None
+    ranked: tuple[tuple[float, tuple[Candidate, ...]], ...]
+
+
+@dataclass(frozen=True)
+class Removal:
+    """What is left without one sensor: least rank(S_b V_x) over the states, and the rank of the stack of samples."""
+
+    candidate: Candidate
+    base_rank: int | None
+    stack_rank: int
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """Answer of the planner.
+
+    Attributes:
+        question: what was asked.
+        chosen: the recommended set. Its `cost` is the least possible if `proven`; `lower_bound`: no set costs less.
+        parts: what can be planned on its own. The minimal sets of the robot are the unions of one set of each part.
+        branches: chains of joints, and which of them contacts constrain; `needs`: of every group of contacts.
+        checks: what the recommended set sees, state by state.
+        stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
+        removals: what is left without each of its sensors.
+    """
+
+    question: Question
+    chosen: tuple[Candidate, ...]
+    cost: float
+    lower_bound: float
+    proven: bool
+    parts: tuple[PartPlan, ...]
+    branches: tuple[Branch, ...]
+    needs: tuple[Need, ...]
+    checks: tuple[StateCheck, ...]
+    stack_rank: int
+    stack_full: int
+    removals: tuple[Removal, ...]
+
+
+def plan_sensors(question: Question, progress: Progress | None = None) -> SensorPlan:
+    """The smallest sensor set for a scenario, the most informative of those.
+
+    Raises:
+        SensorError: no set of the candidates will do, or a criterion that does not fit the robot.
+    """
+    ask, tell = question, progress or (lambda *_: None)
+    if ask.criterion not in CRITERIA:
+        raise SensorError("sensors", "criterion", f"'{ask.criterion}'", ", ".join(CRITERIA))
+    if ask.criterion == "per_sample" and ask.robot.fixed_base:
+        raise SensorError("sensors", "criterion", "per_sample, with a bolted base, which cannot be lost", "stack")
+    stack = MotionStack(ask.robot, ask.contacts, ask.states, ask.candidates, ask.seed)
+    parts: tuple[PartPlan, ...] = ()
+    if ask.criterion == "stack":
+        chosen = sparse_set(stack, ask.keep, ask.exclude, _counted(tell, "leaving sensors out", len(ask.candidates)))
+        least = MinimalSet(chosen, sum(c.cost for c in chosen), 0.0, False)
+    else:
+        wanted = demands(ask.robot, ask.contacts, ask.states, ask.candidates, ask.seed)
+        least = cheapest_set(wanted, ask.candidates, ask.keep, ask.exclude)
+        parts, chosen = _best_parts(ask, components(wanted, ask.candidates), least, tell)
+    sensors = sensor_set(ask.robot, ask.contacts, chosen)
+    return SensorPlan(
+        question=ask,
+        chosen=chosen,
+        cost=least.cost,
+        lower_bound=least.lower_bound,
+        proven=least.proven,
+        parts=parts,
+        branches=branches(ask.robot, ask.contacts, ask.states),
+        needs=needs(ask.robot, ask.contacts, ask.states, ask.seed),
+        checks=tuple(check(ask, sensors)),
+        stack_rank=stack.rank(chosen),
+        stack_full=stack.full,
+        removals=tuple(_removals(ask, stack, chosen, tell)),
+    )
+
+
+def check(question: Question, sensors: SensorSet) -> list[StateCheck]:
+    """Whether a sensor set sees the base in every state of a scenario; over the postures of its logs as well."""
+    ask = question
+    pieces: dict[State, list[Array]] = {}
+    for samples, state, _ in spread_by_state(ask.logs, _POSTURES):
+        pieces.setdefault(state, []).append(samples.joint_position.numpy())
+    postures = {state: np.concatenate(found) for state, found in pieces.items()}
+    return check_set(ask.robot, ask.contacts, ask.states, sensors, ask.candidates, seed=ask.seed, postures=postures)
+
+
+def _best_parts(
+    ask: Question, parts: Sequence[Component], least: MinimalSet, tell: Progress
+) -> tuple[tuple[PartPlan, ...], tuple[Candidate, ...]]:
+    """Every part with its minimal sets, and the union of their most informative cheapest sets.
+
+    Parts are ranked in turn, with the best sets of those before and the first sets of those after.
+    """
+    chosen = frozenset(least.chosen)
+    logs = ask.logs or tuple(structural_samples(ask.robot, ask.contacts, ask.states, seed=ask.seed))
+    out = []
+    for part in parts:
+        frames = tuple(dict.fromkeys(frame for demand in part.demands for frame in demand.frames))
+        ours = frozenset(part.candidates)
+        sets = all_minimal_sets(part.demands, part.candidates, ask.keep & ours, ask.exclude & ours)
+        first = tuple(c for c in part.candidates if c in chosen)
+        bound = _cost(first) * (1.0 + _EXACT)
+        cheapest = [first] if sets is None else [s for s in sets if _cost(s) <= bound]
+        ranking = SetRanking(ask.robot, ask.contacts, logs, part.candidates, tuple(chosen - ours), ask.noise, ask.prior)
+        step = _counted(tell, f"ranking sets, {', '.join(frames)}", len(cheapest))
+        ranked = best_first(ranking, cheapest, step)
+        chosen = (chosen - ours) | frozenset(ranked[0][1])
+        out.append(PartPlan(frames, part.candidates, None if sets is None else tuple(sets), tuple(ranked)))
+    return tuple(out), tuple(c for c in ask.candidates if c in chosen)
+
+
+def _removals(ask: Question, stack: MotionStack, chosen: Sequence[Candidate], tell: Progress) -> Iterable[Removal]:
+    postures = random_postures(ask.robot, _TRIED, ask.seed)
+    step = _counted(tell, "leaving sensors out", len(chosen))
+    for candidate in chosen:
+        fewer = [c for c in chosen if c is not candidate]
+        builder = RowBuilder(ask.robot, ask.contacts, sensor_set(ask.robot, ask.contacts, fewer))
+        ranks = (
+            []
+            if ask.robot.fixed_base
+            else [int(base_rank(base_values(builder, state, postures)).max()) for state in ask.states]
+        )
+        step()
+        yield Removal(candidate, min(ranks, default=None), stack.rank(fewer))
+
+
+def _counted(tell: Progress, what: str, steps: int) -> Callable[[], None]:
+    """Tells one step more at every call."""
+    numbers = count(1)
+    return lambda: tell(what, next(numbers), steps)
+
+
+def _cost(chosen: Iterable[Candidate]) -> float:
+    return sum(c.cost for c in chosen)

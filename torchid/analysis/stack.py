@@ -1,0 +1,74 @@
+"""What all samples of a moving robot determine together, whatever each of them loses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+
+from torchid.analysis.base_parameters import structural_rank
+from torchid.analysis.candidates import Candidate, sensor_set
+from torchid.analysis.structure import structural_samples
+from torchid.errors import SensorError
+from torchid.problem.plan import State
+from torchid.problem.rows import RowBuilder
+from torchid.problem.streaming import compress, linear_problem
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+
+
+class MotionStack:
+    """Ranks of the stack of many samples, of inertial parameters, for any choice of sensors.
+
+    `rank(S_b V_x) = 6` in every sample suffices to reach every body. It is not necessary: what a sample loses of the
+    base depends on its posture, and another sample may show it.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        contacts: Sequence[Contact],
+        states: Sequence[State],
+        candidates: Sequence[Candidate],
+        seed: int = 0,
+    ) -> None:
+        """Draw samples of every contact state, to be used for all sets."""
+        self.robot, self.contacts, self.candidates = robot, tuple(contacts), tuple(candidates)
+        self._samples = structural_samples(robot, contacts, states, seed=seed)
+
+    def rank(self, chosen: Iterable[Candidate]) -> int:
+        """Independent combinations of inertial parameters that a set of sensors determines."""
+        builder = RowBuilder(self.robot, self.contacts, sensor_set(self.robot, self.contacts, chosen))
+        problem = linear_problem(compress(self._samples, builder), builder, self.robot, friction=False)
+        return structural_rank(problem).rank if len(problem.A) and problem.A.any() else 0
+
+    @cached_property
+    def full(self) -> int:
+        """The rank with all candidates."""
+        return self.rank(self.candidates)
+
+
+def sparse_set(
+    stack: MotionStack,
+    keep: Iterable[Candidate] = (),
+    exclude: Iterable[Candidate] = (),
+    done: Callable[[], None] | None = None,
+) -> tuple[Candidate, ...]:
+    """Sensors with which the stack still has the rank of all candidates, and none of which can be spared for it.
+
+    The dearest are dropped first; a cheaper set of another kind may exist.
+
+    Raises:
+        SensorError: the candidates that are left have a lower rank than all of them.
+    """
+    kept, excluded = frozenset(keep), frozenset(exclude)
+    chosen = [c for c in stack.candidates if c not in excluded]
+    if stack.rank(chosen) < stack.full:
+        found = f"without {', '.join(sorted(c.name for c in excluded))} fewer parameters are determined"
+        raise SensorError("sensors", "exclude", found, "other exclusions, or criterion: per_sample")
+    for candidate in sorted(set(chosen) - kept, key=lambda c: (-c.cost, stack.candidates.index(c))):
+        fewer = [c for c in chosen if c is not candidate]
+        if stack.rank(fewer) == stack.full:
+            chosen = fewer
+        if done is not None:
+            done()
+    return tuple(chosen)

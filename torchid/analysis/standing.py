@@ -1,0 +1,139 @@
+"""Random states of a robot whose active contacts neither move nor accelerate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from torchid.problem.plan import State
+from torchid.problem.samples import Samples
+from torchid.problem.threads import one_thread
+from torchid.regressor.dynamics import joint_directions
+from torchid.regressor.jacobian import generalized_forces, wrench_map, wrenches_at_base
+from torchid.regressor.kinematics import BodyStates, body_states, cross, joint_states
+from torchid.regressor.motion import motion_from_state, rotation_matrix
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+from torchid.sensing.nullspace import RANK_TOLERANCE
+
+_WEIGHTLESS = (0.0, 0.0, 0.0)
+_ANGLE, _STROKE = 1.5, 0.3  # [rad], [m] either way
+_AT_REST = 1e-10  # a projected velocity below this share of what was drawn is rounding, and has no sign
+
+
+def standing_samples(
+    robot: Robot, contacts: Sequence[Contact], state: State, count: int, rng: np.random.Generator
+) -> Samples:
+    """Random samples that honour a contact state; forces are zeros.
+
+    Positions are free: each sample stands on a ground of its own, every foot on any slope. What such samples determine
+    bounds from above what one footing does.
+
+    Args:
+        robot: the robot.
+        contacts: the contacts in use.
+        state: which of them touch the ground.
+        count: number N of samples.
+        rng: draws them.
+    """
+    q, v, a = standing_states(robot, contacts, state, count, rng)
+    rows, base = robot.base_rows, {}
+    if rows:
+        linear = a[:, :3] + torch.linalg.cross(v[:, 3:6], v[:, :3])
+        base = {
+            "base_quat_xyzw": q[:, 3:7],
+            "base_angular_velocity_base": v[:, 3:6],
+            "base_angular_acceleration_base": a[:, 3:6],
+            "base_linear_acceleration_world": (rotation_matrix(q[:, 3:7]) @ linear[..., None])[..., 0],
+        }
+    return Samples(
+        source="standing samples",
+        time=torch.arange(count, dtype=torch.float64),
+        joint_position=q[:, q.shape[1] - robot.n :],
+        joint_velocity=v[:, rows:],
+        joint_acceleration=a[:, rows:],
+        base=base,
+        torque=q.new_zeros(count, robot.n),
+        wrench=q.new_zeros(count, len(contacts), 6),
+        wrench_in_world=False,
+        active=torch.tensor(state, dtype=torch.bool).expand(count, len(contacts)),
+    )
+
+
+@one_thread()
+@torch.no_grad()
+def standing_states(
+    robot: Robot, contacts: Sequence[Contact], state: State, count: int, rng: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Coordinates q, v, a, as `Regressor` takes them, with `J_C v = 0` and `J_C a + dJ_C/dt v = 0`.
+
+    J_C has the rows of the components that active contacts can exert: a point contact holds its frame's origin, a flat
+    one the whole frame, a line all but the rotation about itself. Twice as many states are drawn, and those nearest to
+    a singular J_C left out: there, accelerations grow without bound.
+    """
+    tree = KinematicTree(robot)
+    q, v, a = _drawn(robot, tree, 2 * count, rng)
+    J, _ = _constraints(tree, contacts, state, robot, q, v)
+    if not J.shape[1]:
+        return q[:count], v[:count], a[:count]
+    values = torch.linalg.svdvals(J)
+    regular = values > RANK_TOLERANCE * values[:, :1]
+    smallest = torch.where(regular, values, torch.inf).amin(1) / values[:, 0]
+    best = torch.argsort(smallest, descending=True)[:count]
+    q, v, a, J = q[best], v[best], a[best], J[best]
+    inverse = torch.linalg.pinv(J, rtol=RANK_TOLERANCE)
+    v = _without(v, inverse, J)
+    v = torch.where(v.abs() < _AT_REST, 0.0, v)
+    _, drift = _constraints(tree, contacts, state, robot, q, v)
+    return q, v, _without(a, inverse, J) - (inverse @ drift[..., None])[..., 0]
+
+
+def _without(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
+    """The part of x, (B, nv), that J does not see; the second pass takes the rounding of the first."""
+    for _ in range(2):
+        x = x - (inverse @ (J @ x[..., None]))[..., 0]
+    return x
+
+
+def _drawn(robot: Robot, tree: KinematicTree, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    slides = (tree.joint_map[1:].T != 0).to(tree.prismatic) @ tree.prismatic[1:, 0] > 0
+    reach = np.where(slides.numpy(), _STROKE, _ANGLE)
+    q = reach * rng.uniform(-1.0, 1.0, (count, robot.n))
+    v, a = rng.normal(size=(count, robot.nv)), 3.0 * rng.normal(size=(count, robot.nv))
+    if not robot.fixed_base:
+        q = np.hstack([np.zeros((count, 3)), Rotation.random(count, random_state=rng).as_quat(), q])
+    return torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(a)
+
+
+def _constraints(
+    tree: KinematicTree, contacts: Sequence[Contact], state: State, robot: Robot, q: Tensor, v: Tensor
+) -> tuple[Tensor, Tensor]:
+    """J_C, (B, k, nv), and dJ_C/dt v, (B, k): what the contacts would accelerate by with a = 0, in their own axes."""
+    motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
+    states = body_states(tree, motion, joint_states(tree, motion))
+    directions = joint_directions(tree, states)
+    J, drift = [v.new_zeros(0, robot.nv, len(q))], [v.new_zeros(0, len(q))]
+    for contact, active in zip(contacts, state, strict=True):
+        if active:
+            body, T_link_frame = robot.link(contact.frame)
+            T_joint_frame = v.new_tensor(tree.T_joint_link[body] @ T_link_frame)
+            unit_wrenches = v.new_tensor(wrench_map(T_joint_frame.numpy()).T)[list(contact.components)]
+            at_base = wrenches_at_base(states, body, unit_wrenches)
+            J.append(generalized_forces(tree, directions, body, at_base, range(robot.n)))
+            drift.append(_acceleration(states, body, T_joint_frame)[list(contact.components)])
+    return torch.cat(J).permute(2, 0, 1), torch.cat(drift).T
+
+
+def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor) -> Tensor:
+    """Acceleration of a frame's origin, then angular acceleration, in the frame's axes, (6, B), without gravity."""
+    rotation = states.rotation[:, :, body]
+    arm = (rotation * T_joint_frame[:3, 3, None]).sum(1)
+    omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
+    linear = states.specific_force[:, body] + cross(alpha, arm) + cross(omega, cross(omega, arm))
+    in_joint_frame = (rotation[:, :, None] * torch.stack([linear, alpha], dim=1)[:, None]).sum(0)
+    return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))
