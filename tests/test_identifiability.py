@@ -21,7 +21,7 @@ from torchid.analysis.information import Knowledge, prior_directions
 from torchid.estimators import LeastSquares
 from torchid.estimators.result import VERDICTS
 from torchid.problem import LinearProblem, RowBuilder, Samples, bind, linear_problem
-from torchid.problem.streaming import Part, compress, compress_parts, merged, oversampling
+from torchid.problem.streaming import Part, compress, compress_parts, merged
 from torchid.report.tables import contribution_table, table_text, verdict_table
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors
@@ -72,20 +72,20 @@ def test_every_parameter_gets_the_verdict_that_its_share_and_the_rows_call_for()
     A = np.array([[1.0, 0, 0, 0, 0, 1.0], [0, 0.1, 0, 0, 0, 1.0], [0, 0, 1.0, 1.0, 0, 1.0]])
     problem = replace(problem_of(A, np.ones(3)), free=np.array([True, True, True, True, True, False]))
     estimate = LeastSquares(0.1).solve(problem)
-    expected = ["identified", "dominated by the prior", *["cannot be seen"] * 3, "fixed"]
+    expected = ["identified", "dominated by the prior", *["only in combination"] * 2, "cannot be seen", "fixed"]
     assert estimate.verdict.tolist() == expected
     assert np.isnan(estimate.data_share).tolist() == [False] * 5 + [True]
-    assert estimate.verdict_counts() == dict(zip(VERDICTS, (1, 1, 3, 1), strict=True))
+    assert estimate.verdict_counts() == dict(zip(VERDICTS, (1, 1, 2, 1, 1), strict=True))
     assert LeastSquares().solve(problem).verdict.tolist()[:2] == ["identified"] * 2
     np.testing.assert_allclose(estimate.data_share[4], 0.0, atol=1e-15)
 
 
 def test_marks_stand_for_verdicts_and_bodies_with_nothing_free_are_left_out() -> None:
     verdicts = np.full((3, parameters.PER_BODY), "fixed", dtype=object)
-    verdicts[1, :3] = ["identified", "dominated by the prior", "cannot be seen"]
+    verdicts[1, :4] = ["identified", "dominated by the prior", "only in combination", "cannot be seen"]
     text = table_text(verdict_table(["trunk", "arm", "dummy"], verdicts.flatten()))
     (row,) = [line for line in text.splitlines() if "arm" in line]
-    assert row.split() == ["arm", "*", "p", "."]
+    assert row.split() == ["arm", "*", "p", "+", "."]
     assert "dummy" not in text
     assert max(map(len, text.splitlines())) <= 100
 
@@ -192,7 +192,8 @@ def test_a_foot_in_the_air_adds_nothing_and_a_torque_beside_too_few_others_neith
 def test_some_samples_stand_for_all() -> None:
     w = quadruped(named_sensors("full", 12, 4, NOISE), samples=(400, 200))
     exact, found = (sensor_information(w.logs, w.builder, most) for most in (4000, 240))
-    N = prior_directions(identified(w)[1], w.builder)
+    problem = identified(w)[1]
+    N = prior_directions(w.builder, problem.scale * problem.free)
     bits = [Knowledge.of(np.linalg.eigvalsh(N.T @ one.total @ N)).bits for one in (exact, found)]
     assert bits[1] == pytest.approx(bits[0], rel=0.02)
     seen: list[int] = []
@@ -208,7 +209,7 @@ def identified(w: World, logs: Sequence[Samples] | None = None) -> tuple[list[Pa
     builder = w.builder
     parts = compress_parts(w.logs if logs is None else logs, builder)
     factor = merged((part.factor for part in parts), builder)
-    return parts, linear_problem(factor, builder, w.robot, True, oversampling(parts)), builder
+    return parts, linear_problem(factor, builder, w.robot), builder
 
 
 def adds(w: World) -> Contributions:
@@ -321,8 +322,9 @@ def test_rows_are_as_independent_as_those_of_the_logs_they_come_from(three_logs:
     logs = [replace(log, oversampling=kappa) for log, kappa in zip(w.logs, (1.0, 4.0, 2.0), strict=True)]
     parts = compress_parts(logs, w.builder)
     rows = [sum(p.factor.rows for p in parts if p.source == log.source) for log in logs]
-    assert oversampling(parts) == pytest.approx(sum(rows) / (rows[0] + rows[1] / 4.0 + rows[2] / 2.0))
-    assert oversampling([]) == 1.0
+    factor = merged((part.factor for part in parts), w.builder)
+    assert factor.oversampling == pytest.approx(sum(rows) / (rows[0] + rows[1] / 4.0 + rows[2] / 2.0))
+    assert merged([], w.builder).oversampling == 1.0
 
 
 def test_tables_say_how_many_are_not_shown(three_logs: World) -> None:

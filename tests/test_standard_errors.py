@@ -141,7 +141,7 @@ def filtered() -> tuple[list[Estimate], list[Estimate], Array]:
         samples = bind(preprocess(replace(log, joint_torque=log.joint_torque + noise), CUTOFF), robot, ())
         factor = compress([samples], builder, threads=1)
         for kappa, estimates in ((samples.oversampling, corrected), (1.0, counted)):
-            estimates.append(LeastSquares().solve(linear_problem(factor, builder, robot, oversampling=kappa)))
+            estimates.append(LeastSquares().solve(replace(linear_problem(factor, builder, robot), oversampling=kappa)))
     return corrected, counted, truth(oracle, robot)
 
 

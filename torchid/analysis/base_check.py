@@ -13,7 +13,7 @@ from torchid.analysis.candidates import Candidate, candidates, chosen_from
 from torchid.analysis.demands import TOLERANCE, Demand, demands, missing, orthonormal, random_postures
 from torchid.analysis.screws import simplest_basis, words
 from torchid.parameters import Array
-from torchid.problem.plan import State
+from torchid.problem.plan import State, state_name
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
@@ -183,10 +183,9 @@ def _check(
     if ranks.max() < 6:
         regular = zero if base_rank(straight)[0] == ranks.max() else drawn[[int(ranks.argmax())]]
         lost = _lost(builder, state, regular, cause)
-    frames = [contact.frame for contact, active in zip(builder.contacts, state, strict=True) if active]
     return StateCheck(
         state,
-        " + ".join(frames) or "none",
+        state_name(builder.contacts, state),
         Values.of(generic),
         Values.of(straight),
         None if recorded is None else Values.of(base_values(builder, state, recorded)),

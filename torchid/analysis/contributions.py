@@ -9,18 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.analysis.information import Knowledge, prior_directions, singular_values, triangle
+from torchid.analysis.information import DEPENDENT, Knowledge, prior_directions, singular_values, triangle
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import by_state, spread_by_state
-from torchid.problem.plan import State
+from torchid.problem.plan import State, state_name
 from torchid.problem.samples import measured_components
-from torchid.problem.streaming import Part, state_name
+from torchid.problem.streaming import Part
 from torchid.problem.threads import one_thread
 
 SAMPLES = 2000  # whose rows stand for those of all, where every sensor is left out in turn
 _CHUNK = 256  # samples whose rows are computed together
-_DEPENDENT = 1e-9  # what moves the whitened rows by less than this share of its size is rounding
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def contributions(
         rank_tolerance: as in `LeastSquares`.
         done: called with the number of samples worked through.
     """
-    directions = prior_directions(problem, builder)
+    directions = prior_directions(builder, problem.scale * problem.free)
     factors = [_information_factor(part, directions) for part in parts]
     states = _groups(parts, factors, [state_name(builder.contacts, part.state) for part in parts])
     states.sort(key=lambda group: -group.samples)
@@ -98,7 +97,7 @@ def contributions(
 def _information_factor(part: Part, directions: Array) -> Array:
     """X with `X^T X` the information of a part, correlated noise taken into account."""
     R = part.factor.triangle().numpy()[:-1, :-1]
-    return np.asarray(R @ directions / np.sqrt(part.oversampling))
+    return np.asarray(R @ directions / np.sqrt(part.factor.oversampling))
 
 
 @dataclass(frozen=True)
@@ -187,7 +186,7 @@ def sensor_information(
         total[0] += weight * (flat := K.flatten(0, 1)).T @ flat
         ways = W[:, [base + joint for joint in joints]]  # (B, joints, nv)
         size = torch.linalg.vector_norm(ways, dim=2, keepdim=True)
-        least = _DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None]
+        least = DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None]
         lost = (torch.where(size > least, ways / size, 0.0) @ K).transpose(0, 1)  # (joints, B, columns)
         total[1 : 1 + len(joints)].baddbmm_(lost.mT, lost, alpha=weight)
         if any(state[contact] for contact in contacts):
@@ -214,7 +213,7 @@ def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State
 def _span(C: Tensor, W: Tensor) -> Tensor:
     """Orthonormal rows, (B, c, nv), that span those of `C W`, zeros for dependent ones."""
     _, values, Vh = torch.linalg.svd(C @ W, full_matrices=False)
-    least = _DEPENDENT * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
+    least = DEPENDENT * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
     return Vh * (values > least[:, None])[..., None]
 
 

@@ -7,7 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchid.parameters import Array
-from torchid.problem import LinearProblem, RowBuilder
+from torchid.problem import RowBuilder
+
+DEPENDENT = 1e-9
+"""What moves the whitened rows by less than this share of its size is rounding."""
 
 
 @dataclass(frozen=True)
@@ -32,14 +35,13 @@ class Knowledge:
         return Knowledge(self.bits - other.bits, self.determined - other.determined)
 
 
-def prior_directions(problem: LinearProblem, builder: RowBuilder) -> Array:
+def prior_directions(builder: RowBuilder, prior: Array) -> Array:
     """N, (columns, M), so that rows X in the builder's columns have the information `N^T X^T X N`.
 
-    `N N^T` is the covariance of the columns' parameters if the free parameters are independent with the standard
-    deviations `problem.scale`.
+    `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
+    `prior`, (12 L,), 0 where they are known.
     """
-    M = builder.columns.from_parameters()[:, problem.free] * problem.scale[problem.free]
-    return triangle(M.T).T
+    return triangle((builder.columns.from_parameters() * prior).T).T
 
 
 def triangle(X: Array) -> Array:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchid.analysis.candidates import Candidate, sensor_set
+from torchid.analysis.information import DEPENDENT, prior_directions
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import spread_by_state
@@ -64,21 +65,20 @@ class SetRanking:
         self.candidates = tuple(candidates)
         sensors = sensor_set(robot, contacts, [*candidates, *others], noise)
         builder = RowBuilder(robot, contacts, sensors)
-        columns = builder.columns.from_parameters() * prior
-        values, vectors = np.linalg.eigh(columns @ columns.T)
-        self._scale = torch.from_numpy(vectors * np.sqrt(np.maximum(values, 0.0)))
+        directions = torch.from_numpy(prior_directions(builder, prior))
         self._states: list[_StateRows] = []
-        self._information = torch.eye(builder.columns.count, dtype=torch.float64)
+        self._information = torch.eye(directions.shape[1], dtype=torch.float64)
         for samples, state, stands_for in spread_by_state(logs, _SAMPLES):
             weight = stands_for / samples.oversampling
             rows, W = builder.rows_by_sample(samples, state)
-            R = rows[..., :-1] @ self._scale
+            R = rows[..., :-1] @ directions
             self._information += weight * (flat := R.flatten(0, 1)).T @ flat
             owners, ways = self._ways(builder, samples, state)
             if owners:
                 Q = ways @ W
                 size = torch.linalg.vector_norm(Q, dim=2, keepdim=True)
-                Q = torch.where(size > 0.0, Q / size, Q)
+                least = DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=2, keepdim=True)
+                Q = torch.where(size > least, Q / size, 0.0)
                 self._states.append(_StateRows(weight, owners, Q, Q @ R))
 
     def _ways(self, builder: RowBuilder, samples: Samples, state: tuple[bool, ...]) -> tuple[list[int], Tensor]:

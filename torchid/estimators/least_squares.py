@@ -12,6 +12,7 @@ from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
 
+_SEEN = 1e-12  # a finger's share in a sum with the trunk's mass is 1e-7, that of no row but rounding
 _HIDDEN = 1e-6  # far above rounding (1e-10 on a humanoid) and below any share found in a robot (1e-4)
 
 
@@ -61,8 +62,8 @@ class LeastSquares:
         phi[free] += scale * step
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
-        identifiable = np.zeros(len(phi), dtype=bool)
-        identifiable[free] = hidden < _HIDDEN
+        seen, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
+        seen[free], identifiable[free] = hidden**2 < 1.0 - _SEEN, hidden < _HIDDEN
         standard_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
         standard_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
         standard_error[~identifiable] = np.nan
@@ -70,6 +71,7 @@ class LeastSquares:
         return Estimate(
             phi=phi,
             standard_error=standard_error,
+            seen=seen,
             identifiable=identifiable,
             data_share=data_share,
             singular_values=values,

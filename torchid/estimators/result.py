@@ -8,8 +8,9 @@ import numpy as np
 
 from torchid.parameters import Array
 
-IDENTIFIED, PRIOR, UNSEEN, FIXED = "identified", "dominated by the prior", "cannot be seen", "fixed"
-VERDICTS = (IDENTIFIED, PRIOR, UNSEEN, FIXED)
+IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
+UNSEEN, FIXED = "cannot be seen", "fixed"
+VERDICTS = (IDENTIFIED, PRIOR, COMBINED, UNSEEN, FIXED)
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,7 @@ class Estimate:
     Attributes:
         phi: (P,) estimated parameters; those that were not free are nominal.
         standard_error: (P,), NaN where the data do not determine the parameter.
+        seen: (P,) bool, whether the data depend on the parameter at all.
         identifiable: (P,) bool, whether the data alone determine the parameter.
         data_share: (P,), diagonal of the resolution matrix of the scaled problem with its Euclidean ridge: 1 where the
             data alone make the estimate, 0 where the nominal value does, NaN where the parameter was not free. It needs
@@ -33,6 +35,7 @@ class Estimate:
 
     phi: Array
     standard_error: Array
+    seen: np.ndarray
     identifiable: np.ndarray
     data_share: Array
     singular_values: Array
@@ -53,11 +56,14 @@ class Estimate:
         """One of `VERDICTS` for every parameter, (P,).
 
         "identified": the data determine it and have the larger share; "dominated by the prior": they determine it, but
-        the nominal value has the larger share; "cannot be seen": the data alone do not determine it; "fixed": not free.
+        the nominal value has the larger share; "only in combination": they determine it together with others, not
+        alone, however large their share; "cannot be seen": they do not depend on it; "fixed": not free.
+
+        Source: the three kinds of Atkeson, An, Hollerbach, IJRR 1986, and a pull to nominal values.
         """
         larger_share = self.data_share >= 0.5
-        decided = [np.isnan(self.data_share), ~self.identifiable, ~larger_share]
-        return np.select(decided, [FIXED, UNSEEN, PRIOR], IDENTIFIED)
+        decided = [np.isnan(self.data_share), ~self.seen, ~self.identifiable, ~larger_share]
+        return np.select(decided, [FIXED, UNSEEN, COMBINED, PRIOR], IDENTIFIED)
 
     def verdict_counts(self) -> dict[str, int]:
         """Number of parameters by verdict."""

@@ -37,15 +37,15 @@ def by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slic
 
 def spread_by_state(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
     """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
-    found: dict[State, list[Samples]] = {}
+    found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
     for samples in logs:
         for state, index in by_state(samples):
-            found.setdefault(state, []).append(samples[index])
+            found.setdefault(state, []).append((samples, torch.arange(len(samples))[index]))
     for state, pieces in found.items():
-        total = sum(map(len, pieces))
-        for piece in pieces:
-            share = min(len(piece), max(1, round(count * len(piece) / total)))
-            yield piece[torch.linspace(0, len(piece) - 1, share).long()], state, len(piece) / share
+        total = sum(len(index) for _, index in pieces)
+        for samples, index in pieces:
+            share = min(len(index), max(1, round(count * len(index) / total)))
+            yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
 
 
 def over_chunks(

@@ -23,6 +23,12 @@ from torchid.sensing.sensors import SensorSet
 State = tuple[bool, ...]
 """Which contacts touch the ground."""
 
+
+def state_name(contacts: Sequence[Contact], state: State) -> str:
+    """Frames in contact, joined by "+"."""
+    return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or "none"
+
+
 _DEPENDENT = 1e-9  # singular values of constant unit wrenches below this share of the largest count as zero
 
 

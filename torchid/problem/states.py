@@ -10,7 +10,7 @@ import torch
 
 from torchid.errors import BaseLostError, BaseLostWarning
 from torchid.problem.chunks import by_state
-from torchid.problem.plan import State
+from torchid.problem.plan import State, state_name
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
@@ -56,13 +56,12 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
                         values.setdefault(state, []).append(base_singular_values(V).cpu())
     reports = []
     for state in sorted(counts, key=lambda s: -counts[s]):
-        frames = [contact.frame for contact, active in zip(builder.contacts, state, strict=True) if active]
         rank = smallest = None
         if builder.tree.base_rows:
             found = torch.cat(values[state])
             rank = int(base_rank(found).max())
             smallest = float(found[:, -1].median())
-        reports.append(StateReport(" + ".join(frames) or "none", counts[state], rows[state], rank, smallest))
+        reports.append(StateReport(state_name(builder.contacts, state), counts[state], rows[state], rank, smallest))
     return reports
 
 

@@ -19,7 +19,6 @@ from torchid.problem.threads import one_thread
 from torchid.problem.triangular import TriangularFactor
 from torchid.problem.workspace import Workspace
 from torchid.robot import Robot
-from torchid.sensing.contacts import Contact
 
 
 @dataclass
@@ -30,7 +29,6 @@ class Part:
     state: State
     factor: TriangularFactor
     samples: int
-    oversampling: float
 
 
 def compress(
@@ -82,10 +80,10 @@ def _fold(builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: 
     for samples, state in chunks:
         key = samples.source if by_log else "", state
         if key not in parts:
-            parts[key] = Part(*key, TriangularFactor(builder.columns.count), 0, samples.oversampling)
+            parts[key] = Part(*key, TriangularFactor(builder.columns.count), 0)
         parts[key].samples += len(samples)
         for support, rows in builder.rows(samples, state, workspace):
-            parts[key].factor.add(support, rows)
+            parts[key].factor.add(support, rows, samples.oversampling)
     return list(parts.values())
 
 
@@ -101,17 +99,6 @@ def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
     return list(total.values())
 
 
-def oversampling(parts: Sequence[Part]) -> float:
-    """Rows per independent row of some logs together."""
-    rows = sum(part.factor.rows for part in parts)
-    return max(1.0, rows / sum(part.factor.rows / part.oversampling for part in parts)) if rows else 1.0
-
-
-def state_name(contacts: Sequence[Contact], state: State) -> str:
-    """Frames in contact, joined by "+"."""
-    return " + ".join(c.frame for c, active in zip(contacts, state, strict=True) if active) or "none"
-
-
 @one_thread()
 def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
     """The factor of all that some factors have seen."""
@@ -122,12 +109,10 @@ def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> Triangul
 
 
 @one_thread()
-def linear_problem(
-    factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True, oversampling: float = 1.0
-) -> LinearProblem:
+def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
     """The problem in all 12 L parameters from the factor of the regrouped columns.
 
-    Inertia of massless bodies stays out, and friction if `friction` is False. `oversampling` is that of the rows.
+    Inertia of massless bodies stays out, and friction if `friction` is False.
     """
     R = factor.triangle().numpy()
     free = np.ones(robot.nominal.shape, dtype=bool)
@@ -143,5 +128,5 @@ def linear_problem(
         nominal=robot.nominal.flatten(),
         scale=parameter_scale(robot.nominal).flatten(),
         free=free.flatten(),
-        oversampling=oversampling,
+        oversampling=factor.oversampling,
     )

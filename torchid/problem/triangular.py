@@ -19,12 +19,25 @@ class TriangularFactor:
         """Start empty, for `columns` columns and one right-hand side."""
         self.columns = columns
         self.rows = 0
+        self.independent_rows = 0.0
         self._blocks: dict[tuple[int, ...], Tensor] = {}
         self._scratch: Tensor | None = None
 
-    def add(self, support: tuple[int, ...], rows: Tensor) -> None:
-        """Add rows (M, len(support) + 1) that are zero but in the columns `support`; right-hand side last."""
+    @property
+    def oversampling(self) -> float:
+        """Rows per independent row, 1 without any."""
+        return max(1.0, self.rows / self.independent_rows) if self.rows else 1.0
+
+    def add(self, support: tuple[int, ...], rows: Tensor, oversampling: float = 1.0) -> None:
+        """Add rows.
+
+        Args:
+            support: the columns in which they are not zero.
+            rows: (M, len(support) + 1), right-hand side last.
+            oversampling: of them that noise makes one independent row, at least 1.
+        """
         self.rows += rows.shape[0]
+        self.independent_rows += rows.shape[0] / oversampling
         self._absorb(support, rows)
 
     def merge(self, other: TriangularFactor) -> None:
@@ -36,6 +49,7 @@ class TriangularFactor:
         if other.columns != self.columns:
             raise ValueError(f"merge: found a factor of {other.columns} columns; accepted: {self.columns} columns")
         self.rows += other.rows
+        self.independent_rows += other.independent_rows
         for support, block in other._blocks.items():
             self._absorb(support, block)
 

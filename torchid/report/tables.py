@@ -14,11 +14,11 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.analysis.contributions import Contribution, Contributions, PartContribution
-from torchid.estimators.result import FIXED, IDENTIFIED, PRIOR, UNSEEN
+from torchid.estimators.result import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.report.metrics import GROUPS, Metrics
 
-_MARKS = {IDENTIFIED: "*", PRIOR: "p", UNSEEN: ".", FIXED: ""}
+_MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
 
 
 def print_tables(*tables: Table) -> None:

@@ -12,7 +12,7 @@ from torchid.errors import UnknownNameError
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, linear_problem
-from torchid.problem.streaming import Part, merged, oversampling
+from torchid.problem.streaming import Part, merged
 from torchid.robot import Robot
 from torchid.run.conditions import conditions_from
 
@@ -26,7 +26,7 @@ def problem_of(
         UnknownNameError: a frozen body that the robot does not have.
     """
     factor = merged((part.factor for part in parts), builder)
-    problem = linear_problem(factor, builder, robot, settings.friction, oversampling(parts))
+    problem = linear_problem(factor, builder, robot, settings.friction)
     return with_frozen(problem, settings, robot, source)
 
 

@@ -9,7 +9,7 @@ from torchid.estimators import Estimate
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, linear_problem
 from torchid.problem.chunks import by_state
-from torchid.problem.plan import State
+from torchid.problem.plan import State, state_name
 from torchid.problem.streaming import compress_by_state, merged
 from torchid.problem.triangular import TriangularFactor
 from torchid.run.estimation import batch_estimator, stated_conditions, with_frozen
@@ -46,10 +46,9 @@ class CompressedLogs:
         out = []
         for state in {state for group in groups for state in self.factors[group]}:
             factors = (self.factors[group][state] for group in groups if state in self.factors[group])
-            frames = [c.frame for c, active in zip(self.builder.contacts, state, strict=True) if active]
             samples = sum(self.counts[group].get(state, 0) for group in groups)
             rank = self._solve(merged(factors, self.builder), nominal, friction).rank
-            out.append(StateRank(" + ".join(frames) or "none", samples, rank))
+            out.append(StateRank(state_name(self.builder.contacts, state), samples, rank))
         out.sort(key=lambda found: -found.samples)
         return [*out, StateRank("together", sum(found.samples for found in out), together.rank)]
 
