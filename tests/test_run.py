@@ -59,7 +59,7 @@ def test_parameters_json_names_every_body_and_parameter(run: Path) -> None:
         np.testing.assert_allclose([body["nominal"][name] for name in PARAMETERS], nominal)
         for name in PARAMETERS:
             assert body["identifiable"][name] == (body["standard_error"][name] is not None)
-            assert (body["verdict"][name] in ("cannot be seen", "fixed")) != body["identifiable"][name]
+            assert (body["verdict"][name] in ("identified", "dominated by the prior")) == body["identifiable"][name]
             assert (body["verdict"][name] == "fixed") == (body["data_share"][name] is None)
     verdicts = [verdict for body in bodies for verdict in body["verdict"].values()]
     assert document["verdicts"] == {verdict: verdicts.count(verdict) for verdict in VERDICTS}
