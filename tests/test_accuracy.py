@@ -74,6 +74,7 @@ def test_the_noise_of_the_sensors_that_predictions_are_compared_with_is_as_expec
 ) -> None:
     generator = torch.Generator().manual_seed(3)
     evaluation, squares, draws = Evaluation(robot, CONTACTS), dict.fromkeys(GROUPS, 0.0), 30
+    without_floors = replace(NOISE, base_force=0.0, base_moment=0.0)
     for _ in range(draws):
         noisy = []
         for log in logs:
@@ -85,10 +86,14 @@ def test_the_noise_of_the_sensors_that_predictions_are_compared_with_is_as_expec
         for group, value in evaluation.metrics(noisy, np.zeros((1, robot.nominal.size)))[0].rms.items():
             assert value is not None
             squares[group] += value**2 / draws
-    expected = expected_errors(evaluation.builder, logs, np.zeros((1, robot.nominal.size)), NOISE)
+    expected = expected_errors(evaluation.builder, logs, np.zeros((1, robot.nominal.size)), without_floors)
     for group in GROUPS:
         assert expected.sensors[group] == pytest.approx(np.sqrt(squares[group]), rel=0.03), group
         assert expected.total[group] == expected.sensors[group]
+    with_floors = expected_errors(evaluation.builder, logs, np.zeros((1, robot.nominal.size)), NOISE).sensors
+    for group, floor in (("base_force", NOISE.contact_force), ("base_moment", NOISE.contact_moment)):
+        assert with_floors[group] == pytest.approx(np.hypot(expected.sensors[group] or 0.0, floor))
+    assert with_floors["joint_torque"] == expected.sensors["joint_torque"]
 
 
 def test_without_rows_the_urdfs_error_is_all_there_is(robot: Robot, logs: list[Samples]) -> None:

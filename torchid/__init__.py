@@ -7,6 +7,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from torchid.analysis.base_parameters import BaseParameters, base_parameters
+    from torchid.analysis.structure import structural_problem
     from torchid.errors import TorchidError, TorchidWarning
     from torchid.estimators import (
         Conditions,
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from torchid.sensing import Contact, Projection, SensorNoise, SensorSet, chosen_sensors, named_sensors
 
 _HOMES = {
+    "torchid.analysis.base_parameters": ("BaseParameters", "base_parameters"),
+    "torchid.analysis.structure": ("structural_problem",),
     "torchid.errors": ("TorchidError", "TorchidWarning"),
     "torchid.estimators": (
         "Conditions",
@@ -55,6 +59,7 @@ _HOMES = {
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "BaseParameters",
     "Conditions",
     "Consistent",
     "Contact",
@@ -77,6 +82,7 @@ __all__ = [
     "TorchidWarning",
     "Trainer",
     "TriangularFactor",
+    "base_parameters",
     "bind",
     "chosen_sensors",
     "compress",
@@ -87,6 +93,7 @@ __all__ = [
     "preprocess",
     "project",
     "read_log",
+    "structural_problem",
     "violations",
     "write_log",
 ]

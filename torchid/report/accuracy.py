@@ -41,16 +41,24 @@ class SetAccuracy:
 
 def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
     """Expected and measured rms error by group of rows."""
-    table = Table(title="Accuracy of sensor sets: rms error expected / measured on the test logs", title_justify="left")
+    title = "Accuracy of sensor sets, rms error: expected of the model, with noise added, measured"
+    table = Table(title=title, title_justify="left")
     table.add_column("sensors", overflow="fold")
     table.add_column("channels", justify="right")
     table.add_column("rank", justify="right")
+    table.add_column("", no_wrap=True)
     for label in GROUPS.values():
         table.add_column(Text(label.replace(" [", "\n[")), justify="right")
     for name, found in sets.items():
-        measured = {} if found.measured is None else found.measured.rms
-        cells = [f"{_figure(found.expected.total[group])} / {_figure(measured.get(group))}" for group in GROUPS]
-        table.add_row(Text(name), str(found.channels), str(found.rank), *cells)
+        first: list[Text | str] = [Text(name), str(found.channels), str(found.rank)]
+        for label, errors in (
+            ("expected", found.expected.model),
+            ("with noise", found.expected.total),
+            ("measured", {} if found.measured is None else found.measured.rms),
+        ):
+            table.add_row(*first, label, *(_figure(errors.get(group)) for group in GROUPS))
+            first = ["", "", ""]
+        table.add_section()
     return table
 
 

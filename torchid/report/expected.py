@@ -24,7 +24,11 @@ _SAMPLES = 400  # a contact state
 
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Rms by group of rows: of the model's own error, and of the sensors it is compared with."""
+    """Rms by group of rows: of the model's own error, and of what it is compared with.
+
+    The latter is the noise of torque and contact sensors, and on the base rows that of the differentiated motion, which
+    the floors `SensorNoise.base` stand for.
+    """
 
     model: dict[str, float | None]
     sensors: dict[str, float | None]
@@ -47,7 +51,7 @@ def expected_errors(
         builder: of an `Evaluation`.
         logs: whose motion the forces are predicted on.
         directions: (M, 12 L), independent errors of the parameters, as `error_directions` gives them.
-        noise: of the sensors that recorded these logs.
+        noise: of the sensors that recorded these logs, with its floors of the base rows.
     """
     triangle = np.linalg.qr(directions @ builder.columns.from_parameters().T, mode="r")
     columns = torch.from_numpy(triangle).to(builder.device)
@@ -57,22 +61,20 @@ def expected_errors(
         terms = builder.terms(samples)
         predicted = torch.stack([predicted_forces(builder, terms, phi).T for phi in columns])
         model.add(samples, state, weight, predicted, predicted)
-        torque = _torque_noise(builder, samples, noise)
-        sensors.add(samples, state, weight, torch.cat([torque, _wrench_noise(builder, samples, state, noise)]), torque)
+        rows = _row_noise(builder, samples, noise)
+        sensors.add(samples, state, weight, torch.cat([rows, _wrench_noise(builder, samples, state, noise)]), rows)
     return ExpectedErrors(model.rms(), sensors.rms())
 
 
-def _torque_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:
-    """Generalized forces that one standard deviation of each torque sensor makes, (n, B, nv)."""
+def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:
+    """One standard deviation of each base row's floor and each torque sensor, as generalized forces (nv, B, nv)."""
     n, base = len(builder.columns.joint_rows), builder.tree.base_rows
-    out = samples.time.new_zeros(n, len(samples), base + n)
-    for joint in range(n):
-        out[joint, :, base + joint] = noise.joint_torque
-    return out
+    std = np.append(noise.base[:base], np.full(n, noise.joint_torque))
+    return torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
 
 
 def _wrench_noise(builder: RowBuilder, samples: Samples, state: State, noise: SensorNoise) -> Tensor:
-    """The same of each contact sensor, (6 C, B, nv)."""
+    """Generalized forces that one standard deviation of each contact sensor makes, (6 C, B, nv)."""
     std = samples.time.new_zeros(len(builder.contacts), 6)
     for contact, active in enumerate(state):
         if active:

@@ -12,6 +12,7 @@ from torchid.analysis.candidates import Candidate
 from torchid.analysis.planner import PartPlan, SensorPlan
 
 _MOST, _CURES, _BASE = 5, 8, 6
+_NEARLY = 1e-3  # of S_b V_x: the noise of the base's rows is a thousand times that of the sensors
 
 
 def set_text(chosen: Sequence[Candidate]) -> str:
@@ -73,6 +74,12 @@ def check_lines(checks: Sequence[StateCheck]) -> list[str]:
             lines.append(f"{short} in {where}; lost is the {_words(lost)}")
             cures = set_text(lost.cures[:_CURES]) if lost.cures else "no single candidate"
             lines.append(f"  any of these would help: {cures}")
+    near = [check for check in checks if check.lost is None and check.recorded and check.recorded.least < _NEARLY]
+    if near:
+        least = min(check.recorded.least for check in near if check.recorded)
+        lines.append(
+            f"warning: at some postures of the logs the base is all but lost (smallest singular value {least:.2g})"
+        )
     falling = [check for check in checks if check.lost is None and check.zero.rank < check.generic.rank]
     if falling:
         alike = dict.fromkeys(names for check in falling for names in check.coincident)
