@@ -39,7 +39,7 @@ from torchid.run.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
 
 DEMO = Path(torchid.__file__).parent / "demo"
 EPOCHS, EVERY = 16, 5
-FIGURES = ("forces_of", "error_figure", "parameter_figure", "contribution_figure")
+FIGURES = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
 EVALUATED = sorted({*range(0, EPOCHS + 1, EVERY), EPOCHS})
 BY_EPOCH = list(range(1, EPOCHS + 1))
 
@@ -165,7 +165,7 @@ def assert_as_uninterrupted(output: Path, run: Path) -> None:
 
 def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
     names = {"events" if path.name.startswith("events") else path.name for path in run.iterdir()}
-    figures = {"forces.png", "errors.png", "parameters.png", "contributions.png"}
+    figures = {"forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png"}
     assert names == {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "events", "hparams", *figures}
     assert list(run.parent.iterdir()) == [run]
     assert load_config(run / "config.yaml").estimator.training.epochs == EPOCHS
@@ -206,7 +206,6 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     evaluated += [f"eigenvalue/{name}" for name in robot.body_names]
     once = ["fit/residual_std", "fit/rank", "fit/condition_number", "identifiability/bits"]
     once += ["identifiability/combinations", *(f"verdicts/{verdict}" for verdict in VERDICTS)]
-    once += [f"data_share/{name}" for name in robot.body_names]
     assert set(events.Tags()["scalars"]) == {*by_epoch, *evaluated, *once, "identifiability/singular_value"}
     for tags, expected in ((by_epoch, BY_EPOCH), (evaluated, EVALUATED), (once, [EPOCHS])):
         for tag in tags:
@@ -217,7 +216,7 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     total = [event.value for event in events.Scalars("loss/total")]
     parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in ("data", "prior")), strict=True)
     assert total == pytest.approx([sum(pair) for pair in parts], rel=1e-6)
-    assert set(events.Tags()["images"]) == {"forces", "errors", "parameters", "contributions"}
+    assert set(events.Tags()["images"]) == {"forces", "errors", "parameters", "identifiability", "contributions"}
     (text,) = events.Tensors("config/text_summary")
     assert b"checkpoint_seconds: 0" in text.tensor_proto.string_val[0]
 

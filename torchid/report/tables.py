@@ -18,7 +18,7 @@ from torchid.estimators.result import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.report.metrics import GROUPS, Metrics
 
-_MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
+MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
 
 
 def print_tables(*tables: Table) -> None:
@@ -85,16 +85,20 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
     return table
 
 
+def legend_of_marks() -> str:
+    """What the marks of verdicts stand for."""
+    return ", ".join(f"{mark} {verdict}" for verdict, mark in MARKS.items() if mark)
+
+
 def verdict_table(body_names: Sequence[str], verdicts: np.ndarray) -> Table:
     """A mark for the verdict, (12 L,), on every parameter of the bodies with any that is free."""
-    legend = ", ".join(f"{mark} {verdict}" for verdict, mark in _MARKS.items() if mark)
-    table = Table(title=f"Parameters: {legend}", title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title=f"Parameters: {legend_of_marks()}", title_justify="left", box=box.SIMPLE_HEAD)
     table.add_column("body", overflow="fold")
     for name in PARAMETERS:
         table.add_column(name, justify="center")
     for name, found in zip(body_names, verdicts.reshape(-1, PER_BODY), strict=True):
         if (found != FIXED).any():
-            table.add_row(Text(name), *(_MARKS[verdict] for verdict in found))
+            table.add_row(Text(name), *(MARKS[verdict] for verdict in found))
     return table
 
 

@@ -11,7 +11,6 @@ from torch.utils.tensorboard import SummaryWriter
 
 from torchid.analysis.information import Knowledge
 from torchid.estimators import BoundEstimate, Epoch, Estimate
-from torchid.parameters import INERTIAL
 from torchid.report.metrics import GROUPS, SETS, Metrics
 
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
@@ -105,22 +104,18 @@ class RunEvents:
         for name, value in scalars.items():
             self._writer.add_scalar(f"fit/{name}", value, step)
 
-    def identifiability(self, step: int, estimate: Estimate, known: Knowledge, bodies: Sequence[str]) -> None:
+    def identifiability(self, step: int, estimate: Estimate, known: Knowledge) -> None:
         """What the data tell of the parameters; of the singular values' chart, steps are their places.
 
         Args:
             step: of all other charts.
             estimate: the fit.
             known: by all data.
-            bodies: their names.
         """
         scalars = {f"verdicts/{verdict}": float(count) for verdict, count in estimate.verdict_counts().items()}
         scalars |= {"identifiability/bits": known.bits, "identifiability/combinations": known.determined}
-        shares = estimate.data_share.reshape(len(bodies), -1)[:, INERTIAL]
-        scalars |= {f"data_share/{body}": float(share.mean()) for body, share in zip(bodies, shares, strict=True)}
         for tag, value in scalars.items():
-            if value == value:  # bodies that are not free have no share
-                self._writer.add_scalar(tag, value, step)
+            self._writer.add_scalar(tag, value, step)
         for place, value in enumerate(estimate.singular_values):
             self._writer.add_scalar("identifiability/singular_value", value, place)
 

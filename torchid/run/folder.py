@@ -29,7 +29,7 @@ class FolderKind:
         return sorted(name for name in names if not any(fnmatch(name, pattern) for pattern in own))
 
 
-_FIGURES = ("forces.png", "errors.png", "parameters.png", "contributions.png")
+_FIGURES = ("forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png")
 _RESULTS = ("parameters.json", "metrics.json", "identified.urdf", *_FIGURES)
 EVENTS = "events.out.tfevents*"
 RUN = FolderKind("run", "config.yaml", (*_RESULTS, "hparams", "evaluation", EVENTS))

@@ -17,6 +17,7 @@ from torchid.problem import Samples
 from torchid.problem.predict import force_series
 from torchid.problem.states import StateReport
 from torchid.report.figures import ForceSeries, contribution_figure, error_figure, force_figure, parameter_figure
+from torchid.report.identifiability_figure import identifiability_figure
 from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.report.parameters_json import parameters_document
 from torchid.report.tensorboard import RunEvents
@@ -82,6 +83,7 @@ def write_run(run: Identification, evaluation: Evaluation, shown: Samples, train
         "parameters": parameter_figure(
             robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
         ),
+        "identifiability": identifiability_figure(robot.body_names, run.estimate),
         "contributions": contribution_figure(_bits(run.adds)),
     }
     with new_folder(config.output, config.overwrite) as folder:
@@ -176,7 +178,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figur
                 events.eigenvalues(step, body_eigenvalues(robot, phi))
             events.solution(estimate, run.samples / run.seconds["compress"])
         events.fit(last, estimate)
-        events.identifiability(last, estimate, run.adds.known, robot.body_names)
+        events.identifiability(last, estimate, run.adds.known)
         final = {
             f"{name}_{group}": value
             for name in reversed(SETS)  # unseen logs first: TensorBoard shows the first few
