@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from pathlib import Path
@@ -13,7 +14,14 @@ import yaml
 from refusals import files_in, refusal
 
 import torchid
+from torchid.analysis.base_check import StateCheck, Values
 from torchid.cli import main
+from torchid.report.accuracy import SetAccuracy, accuracy_figure
+from torchid.report.expected import ExpectedErrors
+from torchid.report.metrics import GROUPS
+from torchid.report.plan_tables import check_lines
+from torchid.report.tree_figure import tree_figure
+from torchid.run.experiment import Scene
 
 DEMO = Path(torchid.__file__).parent / "demo"
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -150,8 +158,10 @@ def test_the_stack_of_all_samples_needs_far_fewer_sensors(experiment: Path) -> N
 
 REFUSED = {
     "a scenario with an unknown frame": ({"scenarios": {"stand": [["paw"]]}}, "analysis.scenarios.stand", "'paw'"),
+    "no scenario": ({"scenarios": {}}, "analysis.scenarios", "an empty mapping"),
     "a scenario without states": ({"scenarios": {"stand": []}}, "analysis.scenarios.stand", "an empty list"),
-    "a scenario that is no file name": ({"scenarios": {"a/b": [[]]}}, "analysis.scenarios", "a name of letters"),
+    "a scenario that is no file name": ({"scenarios": {"a/b": [[]]}}, "analysis.scenarios.a/b:", "a name of letters"),
+    "scenarios without names": ({"scenarios": [[[]]]}, "analysis.scenarios", "accepted: a mapping"),
     "a kept sensor that is no candidate": ({"keep": ["knee"]}, "analysis.keep", "'knee'"),
     "an excluded sensor that is no candidate": ({"exclude": ["front_left_foot.fx"]}, "analysis.exclude", "foot.fx'"),
     "a sensor kept and excluded": (
@@ -169,6 +179,13 @@ REFUSED = {
     ),
     "sets to compare without logs": ({"compare": {"full": "full"}}, "analysis.compare", "logs.train"),
     "a set to compare that is empty": ({"compare": {"none": {}}}, "analysis.compare.none", "no sensor"),
+    "a set to compare that reads nothing": (
+        {"compare": {"none": {"contact_wrenches": {FEET[0]: []}}}}, "analysis.compare.none", "no sensor",
+    ),
+    "a set to compare without a name": ({"compare": {"": "full"}}, "analysis.compare", "accepted: a name"),
+    "a set to compare with a limb-mounted sensor": (
+        {"compare": {"limb": {"ft_sensors": ["hip"]}}}, "analysis.compare.limb.ft_sensors", "not supported yet",
+    ),
 }  # fmt: skip
 
 
@@ -182,6 +199,84 @@ def test_a_slip_is_answered_in_one_line_and_nothing_is_written(
     assert str(file) in message
     assert field in message
     assert hint in message
+
+
+COMPARED = {
+    "an unknown joint": ({"legs": {"joint_torques": ["knee"]}}, "analysis.compare.legs.joint_torques", "'knee'"),
+    "an unknown contact": ({"legs": {"contact_wrenches": {"paw": ["fx"]}}}, "analysis.compare.legs.contact", "'paw'"),
+    "a moment of a point": (
+        {"feet": {"contact_wrenches": {FEET[0]: ["mx"]}}}, f"analysis.compare.feet.contact_wrenches.{FEET[0]}", "'mx'",
+    ),
+    "the name of the proposed set": ({"proposed": "full"}, "analysis.compare.proposed", "another name"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", COMPARED)
+def test_a_slip_in_a_set_to_compare_is_placed_before_any_work(
+    case: str, experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compare, field, hint = COMPARED[case]
+    logs = {"train": ["sway_train.npz"]}
+    file = asked(experiment, logs=logs, sensors="joints", analysis={"compare": compare})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Scene, "read_logs", None)
+        message = refusal(["analyze", str(file)], experiment, capsys)
+    assert f"{file}: {field}" in message
+    assert hint in message
+
+
+def test_a_frozen_body_that_does_not_exist_is_looked_for_in_the_file(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs = {"train": ["sway_train.npz"]}
+    file = asked(experiment, logs=logs, estimator={"frozen": ["tail"]}, analysis={"scenarios": {"air": [[]]}})
+    assert f"{file}: estimator.frozen" in refusal(["analyze", str(file)], experiment, capsys)
+
+
+def test_an_output_without_a_name_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "no name for a folder" in refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
+
+
+def test_a_robot_that_cannot_move_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    inertial = "<mass value='1'/><inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
+    stone = experiment / "stone.urdf"
+    stone.write_text(f"<robot name='stone'><link name='stone'><inertial>{inertial}</inertial></link></robot>")
+    file = asked(experiment, robot={"urdf": str(stone), "fixed_base": True}, contacts=[])
+    assert "accepted: a robot that can move" in refusal(["analyze", str(file)], experiment, capsys)
+
+
+def test_sensors_that_tell_nothing_leave_nothing_to_determine(experiment: Path) -> None:
+    robot, output = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}, experiment / "blind"
+    file = asked(experiment, robot=robot, sensors="contacts", analysis={"scenarios": {"air": [[]]}}, output=str(output))
+    assert main(["analyze", str(file)]) == 0
+    plan = json.loads((experiment / "blind.analysis" / "analysis.json").read_text())["scenarios"]["air"]
+    assert (plan["base_parameters"]["rank"], plan["base_parameters"]["gap"]) == (0, None)
+
+
+def test_no_two_labels_of_the_tree_lie_on_each_other(experiment: Path) -> None:
+    robot = torchid.load_robot(experiment / "quadruped.urdf")
+    contacts = [torchid.Contact(link, "point") for link in ("trunk", "front_left_shank_link", "front_left_thigh_link")]
+    (axes,) = tree_figure("", robot, [*contacts, torchid.Contact(FEET[0], "point")], [], {}, []).axes
+    places = [label.xy for label in axes.texts]
+    assert len(set(places)) == len(places) == len(robot.bodies) + 4
+
+
+def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
+    def checked(low: float) -> StateCheck:
+        return StateCheck((True,), "sole", Values(6, 0.1, low, low), Values(6, 0.1, 0.1, 0.1), None, None, ())
+
+    (line,) = check_lines([checked(1e-3), checked(1e-8)])
+    assert "in 1 of 2 contact states" in line
+
+
+def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
+    rms = {group: 0.05 for group in GROUPS}
+    expected = ExpectedErrors(rms, rms)
+    figure = accuracy_figure({name: SetAccuracy(1, 1, expected, None) for name in ("full", "joints")})
+    figure.savefig(io.BytesIO())
+    labels = [text.get_text() for axes in figure.axes for text in axes.yaxis.get_ticklabels(which="both")]
+    assert any(labels)
+    assert not any("$" in label for label in labels)
 
 
 def test_a_bolted_robot_cannot_lose_its_base_and_is_told_so(

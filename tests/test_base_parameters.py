@@ -16,7 +16,8 @@ from synthetic import ANYMAL, DRONE, G1, ROBOTS, SOLO12, TALOS, TIAGO, UR5, Arra
 from urdfs import BASE, inertial, joint, link, write
 
 from torchid import parameters
-from torchid.analysis.base_parameters import BaseParameters, base_parameters, rank_and_gap, structural_rank
+from torchid.analysis.base_parameters import BaseParameters, base_parameters
+from torchid.analysis.rank import rank_and_gap, structural_rank
 from torchid.analysis.structure import structural_problem
 from torchid.analysis.words import relations, unseen
 from torchid.errors import NumericalWarning

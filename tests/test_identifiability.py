@@ -11,13 +11,9 @@ import torch
 from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
 
 from torchid import parameters
-from torchid.analysis.contributions import (
-    Contributions,
-    SensorContribution,
-    contributions,
-    sensor_information,
-)
+from torchid.analysis.contributions import Contributions, SensorContribution, contributions
 from torchid.analysis.information import Knowledge, prior_directions
+from torchid.analysis.sensor_information import sensor_information
 from torchid.estimators import LeastSquares
 from torchid.estimators.result import VERDICTS
 from torchid.problem import LinearProblem, RowBuilder, Samples, bind, linear_problem
@@ -111,7 +107,7 @@ FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")
 STATES = [[True] * 4, [False, True, True, True], [True, False, False, True], [False] * 4]
 
 
-def quadruped(sensors: SensorSet, samples: Sequence[int] = (40,), states: Sequence[list[bool]] = STATES) -> World:
+def quadruped(sensors: SensorSet, samples: Sequence[int] = (24,), states: Sequence[list[bool]] = STATES) -> World:
     robot, rng = load(SOLO12), np.random.default_rng(3)
     oracle, feet = Oracle.of(robot), [(foot.frame, 3) for foot in FEET]
     logs = [make_log(oracle, feet, states, n, rng, f"{number}.npz") for number, n in enumerate(samples)]
@@ -132,7 +128,7 @@ def arm(point: bool) -> World:
 
 def gram(w: World) -> Array:
     """Information in the builder's columns, from all rows."""
-    R = compress(w.logs, w.builder).triangle().numpy()[:-1, :-1]
+    R = compress(w.logs, w.builder, threads=1).triangle().numpy()[:-1, :-1]
     return R.T @ R
 
 

@@ -11,6 +11,7 @@ from torchid.analysis.ranking import SetRanking, best_first
 from torchid.analysis.structure import structural_samples
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
+from torchid.problem.threads import one_thread
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise
 
@@ -29,7 +30,7 @@ CASES = {
 def test_leaving_sensors_out_of_the_rows_is_building_the_rows_without_them(case: str, per: str) -> None:
     urdf, fixed, contacts, states = CASES[case]
     robot = load(urdf, fixed_base=fixed)
-    logs = structural_samples(robot, contacts, states, 40)
+    logs = structural_samples(robot, contacts, states, 25)
     offered, rng = candidates(robot, contacts, per=per), np.random.default_rng(1)
     prior = prior_of(robot, contacts, logs, offered)
     others = tuple(c for c in offered if rng.uniform() < 0.2)
@@ -61,6 +62,7 @@ def prior_of(robot: Robot, contacts: tuple[Contact, ...], logs: list[Samples], o
     return problem.scale * problem.free
 
 
+@one_thread()
 def bits(
     robot: Robot, contacts: tuple[Contact, ...], logs: list[Samples], chosen: tuple[Candidate, ...], prior: Array
 ) -> float:

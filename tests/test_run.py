@@ -77,6 +77,19 @@ def test_parameters_json_names_every_body_and_parameter(run: Path) -> None:
     assert bodies[1]["identifiable"]["fv"]
 
 
+def test_parameters_json_judges_every_contact_state_alone(run: Path) -> None:
+    document, metrics = (json.loads((run / f"{name}.json").read_text()) for name in ("parameters", "metrics"))
+    states = document["contact_states"]
+    assert {state["name"] for state in states} == {state["name"] for state in metrics["contact_states"]}
+    for state in states:
+        assert [body["name"] for body in state["bodies"]] == [body["name"] for body in document["bodies"]]
+        assert 0 < state["rank"] <= metrics["rank"]
+        assert len([x for x in state["singular_values"] if x > 1e-10 * state["singular_values"][0]]) == state["rank"]
+        for alone, together in zip(state["bodies"], document["bodies"], strict=True):
+            for name in PARAMETERS:
+                assert together["identifiable"][name] or not alone["identifiable"][name], "more data determine more"
+
+
 def test_metrics_json_has_the_documented_fields(run: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")

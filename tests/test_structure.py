@@ -14,7 +14,8 @@ from synthetic import G1, PANDA, SOLO12, TIAGO, UR5, Array, Oracle, load
 
 import torchid
 from torchid import parameters
-from torchid.analysis.base_parameters import BaseParameters, base_parameters, structural_rank
+from torchid.analysis.base_parameters import BaseParameters, base_parameters
+from torchid.analysis.rank import structural_rank
 from torchid.analysis.standing import standing_samples, standing_states
 from torchid.analysis.structure import structural_problem, structural_samples
 from torchid.analysis.words import unseen

@@ -138,6 +138,7 @@ def _identify(options: argparse.Namespace) -> None:
             error_tables,
             print_tables,
             state_table,
+            verdict_counts_table,
             verdict_table,
             violation_table,
         )
@@ -147,15 +148,17 @@ def _identify(options: argparse.Namespace) -> None:
     run = identify(load_config(options.file, options.overrides), options.file, options.resume)
     estimate, robot = run.estimate, run.experiment.robot
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
-    print_tables(contribution_table(run.adds), verdict_table(robot.body_names, estimate.verdict))
+    print_tables(
+        contribution_table(run.adds),
+        verdict_table(robot.body_names, estimate.verdict),
+        verdict_counts_table(run.by_state, estimate),
+    )
     if run.violations:
         print_tables(violation_table(run.violations_by_name()))
         if type(estimate) is Estimate:
             print("estimator.name=consistent finds the best parameters that break none of them")
     mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
-    counts = ", ".join(f"{count} {verdict}" for verdict, count in estimate.verdict_counts().items())
-    print(f"verdicts      {counts}")
     print(f"condition     {estimate.condition_number:.3g}")
     print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
@@ -217,7 +220,8 @@ def _print_scenario(scenario: Scenario) -> None:
             print_tables(check_table(title, checks))
         for line in check_lines(checks) if title != "Chosen sensors" or plan.parts else []:
             print(fill(line, 100, subsequent_indent="  "))
-    print_tables(removal_table(plan))
+    if plan.removals:
+        print_tables(removal_table(plan))
     print(
         f"structure     {base.rank} combinations of {int(base.free.sum())} parameters; base_parameters.txt names them"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
@@ -27,7 +28,7 @@ def error_directions(
         rank_tolerance: of the fit.
     """
     scale = problem.scale[problem.free]
-    _, values, Vh = np.linalg.svd(problem.A[:, problem.free] * scale)
+    _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, lapack_driver="gesvd")  # see `base_parameters`
     values = np.pad(values, (0, len(scale) - len(values)))
     values[values <= rank_tolerance * values.max(initial=0.0)] = 0.0
     pull = ridge * problem.rows

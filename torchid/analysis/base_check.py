@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from torchid.analysis.candidates import Candidate, candidates, chosen_from
-from torchid.analysis.demands import TOLERANCE, Demand, demands, missing, orthonormal, random_postures
+from torchid.analysis.demands import TOLERANCE, Demand, demands, orthonormal
+from torchid.analysis.postures import at_rest, random_postures
 from torchid.analysis.screws import simplest_basis, words
 from torchid.parameters import Array
 from torchid.problem.plan import State, state_name
 from torchid.problem.rows import RowBuilder
-from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
@@ -111,17 +111,16 @@ def check_set(
     if robot.fixed_base:
         return []
     builder, postures = RowBuilder(robot, contacts, sensors), postures or {}
-    drawn = random_postures(robot, samples, seed)
+    drawn = random_postures(robot, samples, np.random.default_rng(seed))
     channels = candidates(robot, contacts, per="axis")
     everything = tuple(dict.fromkeys((*channels, *choice)))
-    mounted = chosen_from(robot, contacts, sensors, channels).chosen
+    mounted = chosen_from(contacts, sensors, channels)
     checks = []
     for state in states:
         generic = demands(robot, contacts, [state], everything, seed)
         straight = demands(robot, contacts, [state], everything, joint_position=np.zeros(robot.n))
-        pairs = zip(generic, straight, strict=True)
-        alike = tuple(found for pair in pairs if (found := coincident(*pair, mounted)))
-        checks.append(_check(builder, state, drawn, postures.get(state), _Cause(generic, mounted, choice), alike))
+        cause = _Cause(generic, straight, mounted, choice)
+        checks.append(_check(builder, state, drawn, postures.get(state), cause))
     return checks
 
 
@@ -129,7 +128,7 @@ def base_values(builder: RowBuilder, state: State, postures: Array) -> torch.Ten
     """Singular values of S_b V_x, (N, 6), at joint positions (N, n) in a contact state."""
     found = torch.zeros(len(postures), 6, dtype=torch.float64)
     for start in range(0, len(postures), _CHUNK):
-        samples = _at(postures[start : start + _CHUNK], state)
+        samples = at_rest(postures[start : start + _CHUNK], state)
         for index, V in builder.bases(samples, state):
             found[start : start + _CHUNK][index] = base_singular_values(V)
     return found
@@ -144,11 +143,11 @@ def coincident(generic: Demand, singular: Demand, chosen: Iterable[Candidate]) -
         chosen: sensors of one reading each.
     """
     needed = [c for c in chosen if c in generic.vectors]
-    if missing(generic, needed) or not missing(singular, needed):
+    if generic.missing(needed) or not singular.missing(needed):
         return ()
     for candidate in tuple(needed):  # those that no sensor can be spared of are independent
         fewer = [c for c in needed if c != candidate]
-        needed = needed if missing(generic, fewer) else fewer
+        needed = needed if generic.missing(fewer) else fewer
     for count in range(1, len(needed) + 1):
         for some in combinations(needed, count):
             if orthonormal(singular.stacked(some)).any(axis=0).sum() < count:
@@ -158,25 +157,27 @@ def coincident(generic: Demand, singular: Demand, chosen: Iterable[Candidate]) -
 
 @dataclass(frozen=True)
 class _Cause:
-    """Where to look for what a state lacks: its demands, the sensors there are, the candidates there could be."""
+    """Where to look for what a state lacks.
 
-    demands: Sequence[Demand]
+    Its demands at a random posture and at position zero, the sensors there are, the candidates there could be.
+    """
+
+    generic: Sequence[Demand]
+    straight: Sequence[Demand]
     mounted: tuple[Candidate, ...]
     choice: Sequence[Candidate]
 
     def missing(self, *more: Candidate) -> list[int]:
         """Dimensions missing, demand by demand."""
-        return [missing(demand, (*self.mounted, *more)) for demand in self.demands]
+        return [demand.missing((*self.mounted, *more)) for demand in self.generic]
+
+    def alike(self) -> tuple[tuple[str, ...], ...]:
+        """Sensors that act alike at position zero only."""
+        pairs = zip(self.generic, self.straight, strict=True)
+        return tuple(found for pair in pairs if (found := coincident(*pair, self.mounted)))
 
 
-def _check(
-    builder: RowBuilder,
-    state: State,
-    drawn: Array,
-    recorded: Array | None,
-    cause: _Cause,
-    alike: tuple[tuple[str, ...], ...],
-) -> StateCheck:
+def _check(builder: RowBuilder, state: State, drawn: Array, recorded: Array | None, cause: _Cause) -> StateCheck:
     zero = np.zeros((1, drawn.shape[1]))
     generic, straight = base_values(builder, state, drawn), base_values(builder, state, zero)
     ranks, lost = base_rank(generic), None
@@ -190,16 +191,16 @@ def _check(
         Values.of(straight),
         None if recorded is None else Values.of(base_values(builder, state, recorded)),
         lost,
-        alike,
+        cause.alike(),
     )
 
 
 def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> LostBase:
-    [(_, V)] = builder.bases(_at(posture, state), state)
+    [(_, V)] = builder.bases(at_rest(posture, state), state)
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
     directions = U[:, (values > TOLERANCE).sum() :]
     short = cause.missing()
-    groups = zip(cause.demands, short, strict=True)
+    groups = zip(cause.generic, short, strict=True)
     return LostBase(
         posture[0],
         directions,
@@ -207,14 +208,3 @@ def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> L
         tuple((demand.frames, dimensions) for demand, dimensions in groups if dimensions),
         tuple(c for c in cause.choice if sum(cause.missing(c)) < sum(short)),
     )
-
-
-def _at(postures: Array, state: State) -> Samples:
-    """Samples at rest, upright, with no forces recorded."""
-    q = torch.from_numpy(np.ascontiguousarray(postures, dtype=float))
-    count = len(q)
-    upright = q.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(count, 4)
-    active = torch.tensor(state, dtype=torch.bool).expand(count, len(state))
-    still = torch.zeros_like(q)
-    base = {"base_quat_xyzw": upright}
-    return Samples("postures", q.new_zeros(count), q, still, still, base, None, None, False, active)

@@ -6,63 +6,19 @@ base inertial parameters of robots", J. Robotic Systems 1991.
 
 from __future__ import annotations
 
-import warnings
-from typing import NamedTuple
-
 import numpy as np
 import scipy.linalg
 import torch
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.errors import NumericalWarning
+from torchid.analysis.rank import RankGap, rank_and_gap, unit_columns
 from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
 
-_CLEAR_GAP = 1e3  # a rank is told by a step of many decades (14 on exact motions), not by a slope
 _ROUNDING = 1e-9  # of a coefficient, columns having norm 1; joint angles written as 1.5707963 leave 1e-11
 _LEAST_PREFERENCE = 1e-2  # between 1e-1 and 1e-4 sums are shortest, and conditioning is the same
-
-
-class RankGap(NamedTuple):
-    """Number of singular values that count, and how clear that is: the smallest of them over the next one."""
-
-    rank: int
-    gap: float
-
-
-def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
-    """Rank of a matrix with columns of one size.
-
-    What lies below rounding is not known: the gap takes it for `eps` times the largest value, and is 4.5e15 at most.
-
-    Args:
-        values: singular values, descending.
-        tolerance: a value below this share of the largest counts as zero.
-
-    Warns:
-        NumericalWarning: a gap below 1e3, so that another tolerance finds another rank.
-    """
-    rank = int((values > tolerance * values[:1]).sum())
-    if rank == 0:
-        return RankGap(0, np.inf)
-    dropped = max(float(values[rank]) if rank < len(values) else 0.0, np.finfo(float).eps * float(values[0]))
-    gap = float(values[rank - 1]) / dropped
-    if gap < _CLEAR_GAP:
-        message = f"rank {rank}: the next singular value is only {gap:.3g} times smaller than the last that counts"
-        warnings.warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning, 2)
-    return RankGap(rank, gap)
-
-
-@one_thread()
-def structural_rank(problem: LinearProblem, tolerance: float = 1e-10) -> RankGap:
-    """Rank of a problem's free columns.
-
-    Args, Warns: as `base_parameters`.
-    """
-    columns, _ = _unit_columns(problem, tolerance)
-    return rank_and_gap(scipy.linalg.svd(columns, compute_uv=False, lapack_driver="gesvd"), tolerance)
 
 
 def drop_preference(count: int) -> Array:
@@ -162,7 +118,7 @@ def base_parameters(
         NumericalWarning: the rank is a matter of the tolerance.
     """
     free, count = np.flatnonzero(problem.free), len(problem.scale)
-    columns, units = _unit_columns(problem, tolerance)
+    columns, units = unit_columns(problem, tolerance)
     _, values, Vh = scipy.linalg.svd(columns, lapack_driver="gesvd")  # gesdd can fail on dozens of null directions
     rank_gap = rank_and_gap(values, tolerance)
     null_space = Vh[rank_gap.rank :].T
@@ -177,16 +133,6 @@ def base_parameters(
     combination[np.arange(len(kept)), free[kept]] = 1.0
     combination[:, free[dropped]] = units[kept, None] * regrouped / units[dropped]
     return BaseParameters(free[kept], combination, problem.free, problem.scale, values, rank_gap)
-
-
-def _unit_columns(problem: LinearProblem, tolerance: float) -> tuple[Array, Array]:
-    """Free columns scaled to norm 1, those not seen to 0, (R, P_free), and their parameters' units, (P_free,)."""
-    scale = problem.scale[problem.free]
-    columns = problem.A[:, problem.free] * scale
-    norms = np.linalg.norm(columns, axis=0)
-    seen = norms > tolerance * norms.max(initial=0.0)
-    norms[~seen] = 1.0
-    return np.where(seen, columns, 0.0) / norms, scale / norms
 
 
 def _hidden(kept: np.ndarray, combination: Array, free: np.ndarray, scale: Array) -> Array:

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from torchid.analysis.candidates import candidates
-from torchid.analysis.demands import contact_joints, demands
-from torchid.analysis.minimal_sets import cheapest_set
+from torchid.analysis.cheapest_set import cheapest_set
+from torchid.analysis.demands import demands
 from torchid.problem.plan import State
+from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 
@@ -51,8 +52,10 @@ class Need:
 
 def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State]) -> tuple[Branch, ...]:
     """All branches with joints of their own, depth first; a finger that only mimics has none."""
-    used = [contact for contact, *active in zip(contacts, *states, strict=True) if any(active)]
-    children: dict[int, list[int]] = {index: [] for index in range(len(robot.bodies))}
+    used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
+    tree = KinematicTree(robot)
+    above = {frame: tree.path(robot.link(frame)[0]) for frame in used}
+    children: list[list[int]] = [[] for _ in robot.bodies]
     for index, body in enumerate(robot.bodies[1:], start=1):
         children[body.parent].append(index)
     found = []
@@ -64,12 +67,8 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State])
             chain += children[chain[-1]]
         names = [joint.name for k in chain if (joint := robot.bodies[k].joint) is not None]
         joints = tuple(name for name in names if name in robot.joint_names)
-        beyond = {first}
-        for index in range(first + 1, len(robot.bodies)):  # bodies are depth first
-            if robot.bodies[index].parent in beyond:
-                beyond.add(index)
         if joints:
-            found.append(Branch(joints, tuple(c.frame for c in used if robot.link(c.frame)[0] in beyond)))
+            found.append(Branch(joints, tuple(frame for frame in used if first in above[frame])))
     return tuple(found)
 
 
@@ -78,18 +77,10 @@ def needs(robot: Robot, contacts: Sequence[Contact], states: Iterable[State], se
     states = tuple(states)
     limbs = branches(robot, contacts, states)
     channels = candidates(robot, contacts, per="axis")
-    above = contact_joints(robot, contacts)
     found = []
     for demand in demands(robot, contacts, states, channels, seed):
         least = cheapest_set([demand], channels)
-        path = {robot.joint_names[j] for place in demand.contacts for j in above[place]}
-        found.append(
-            Need(
-                demand.frames,
-                tuple(name for name in robot.joint_names if name in path),
-                tuple(limb.name for limb in limbs if path.intersection(limb.joints)),
-                round(least.lower_bound),
-                least.proven,
-            )
-        )
+        joints = tuple(robot.joint_names[j] for j in demand.joints)
+        through = tuple(limb.name for limb in limbs if not set(limb.joints).isdisjoint(joints))
+        found.append(Need(demand.frames, joints, through, round(least.lower_bound), least.proven))
     return tuple(found)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from torchid.errors import SensorError, UnknownNameError
 from torchid.problem.samples import measured_components
 from torchid.robot import Robot
-from torchid.sensing.contacts import COMPONENTS, Contact
+from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import SensorNoise, SensorSet
 
 KINDS = ("joint_torque", "contact")
-PER = ("device", "axis")
+PER = ("device", "axis", "none")
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,9 @@ class Candidate:
         return len(self.components) or 1
 
 
-@dataclass(frozen=True)
-class CandidatesIn:
-    """The candidates that a sensor set contains; `uncovered`: names of what it measures beyond them."""
-
-    chosen: tuple[Candidate, ...]
-    uncovered: tuple[str, ...]
+def total_cost(chosen: Iterable[Candidate]) -> float:
+    """Of some candidates together."""
+    return sum(candidate.cost for candidate in chosen)
 
 
 def candidates(
@@ -54,7 +51,6 @@ def candidates(
     joint_torques: Sequence[str] | None = None,
     per: str = "device",
     costs: Mapping[str, float] | None = None,
-    source: object = "sensors",
 ) -> tuple[Candidate, ...]:
     """All candidate sensors: joint torques in the robot's order, then the contacts'.
 
@@ -62,53 +58,43 @@ def candidates(
         robot: the robot.
         contacts: where the environment can push; a sensor reads components that its contact can exert.
         joint_torques: joints that can carry a torque sensor; None for all.
-        per: "device", one force/torque sensor per contact, or "axis", one candidate per component.
+        per: "device", one force/torque sensor per contact, "axis", one candidate per component, or "none" at contacts.
         costs: by name of a candidate, or by kind and then per channel; 1 per channel by default.
-        source: named in errors.
 
     Raises:
         UnknownNameError: a joint, or a name in `costs`, that does not exist.
         SensorError: `per` is another word, or a cost is not a positive number.
     """
     if per not in PER:
-        raise SensorError(source, "candidates.per", f"'{per}'", ", ".join(PER))
+        raise SensorError("sensors", "candidates.per", f"'{per}'", ", ".join(PER))
     chosen = robot.joint_names if joint_torques is None else joint_torques
     for name in chosen:
         if name not in robot.joint_names:
-            raise UnknownNameError(source, "candidates.joint_torques", name, robot.joint_names)
+            raise UnknownNameError("sensors", "candidates.joint_torques", name, robot.joint_names)
     found = [
         Candidate(name, "joint_torque", 1.0, joint=j) for j, name in enumerate(robot.joint_names) if name in chosen
     ]
     for place, contact in enumerate(contacts):
         if per == "device":
             found.append(Candidate(contact.frame, "contact", 1.0, contact=place, components=tuple(contact.components)))
-        else:
+        elif per == "axis":
             names = zip(contact.component_names, contact.components, strict=True)
             found += [
                 Candidate(f"{contact.frame}.{name}", "contact", 1.0, contact=place, components=(k,))
                 for name, k in names
             ]
-    return _priced(found, costs or {}, source)
+    return _priced(found, costs or {})
 
 
-def _priced(found: Sequence[Candidate], costs: Mapping[str, float], source: object) -> tuple[Candidate, ...]:
+def _priced(found: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[Candidate, ...]:
     known = [*KINDS, *(candidate.name for candidate in found)]
     for name, cost in costs.items():
         if name not in known:
-            raise UnknownNameError(source, "costs", name, known)
+            raise UnknownNameError("sensors", "costs", name, known)
         if not (math.isfinite(cost) and cost > 0.0):
-            raise SensorError(source, f"costs.{name}", str(cost), "a positive number")
-    return tuple(
-        Candidate(
-            c.name,
-            c.kind,
-            float(costs.get(c.name, c.channels * costs.get(c.kind, 1.0))),
-            c.joint,
-            c.contact,
-            c.components,
-        )
-        for c in found
-    )
+            raise SensorError("sensors", f"costs.{name}", str(cost), "a positive number")
+    prices = [costs.get(c.name, c.channels * costs.get(c.kind, 1.0)) for c in found]
+    return tuple(replace(c, cost=float(price)) for c, price in zip(found, prices, strict=True))
 
 
 def sensor_set(
@@ -125,17 +111,13 @@ def sensor_set(
 
 
 def chosen_from(
-    robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, candidates: Sequence[Candidate]
-) -> CandidatesIn:
-    """Which candidates a sensor set contains: those all of whose readings are measured."""
+    contacts: Sequence[Contact], sensors: SensorSet, candidates: Sequence[Candidate]
+) -> tuple[Candidate, ...]:
+    """The candidates that a sensor set contains: those all of whose readings are measured."""
     wrench = measured_components(contacts, sensors)
-    chosen = tuple(
+    return tuple(
         c
         for c in candidates
         if (c.joint is None or sensors.torque[c.joint])
         and (c.contact is None or wrench[c.contact, list(c.components)].all())
     )
-    covered = sensor_set(robot, contacts, chosen)
-    torques = [robot.joint_names[j] for j in np.flatnonzero(sensors.torque & ~covered.torque)]
-    axes = [f"{contacts[c].frame}.{COMPONENTS[k]}" for c, k in np.argwhere(wrench & ~covered.wrench)]
-    return CandidatesIn(chosen, (*torques, *axes))

@@ -19,13 +19,12 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from torchid.analysis.candidates import Candidate
+from torchid.analysis.candidates import Candidate, sensor_set
+from torchid.analysis.postures import at_rest, random_postures
 from torchid.parameters import Array
-from torchid.problem.plan import Columns, State
-from torchid.regressor.jacobian import FrameJacobian
-from torchid.regressor.tree import KinematicTree
+from torchid.problem.plan import State
+from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 
@@ -42,6 +41,7 @@ class Demand:
 
     Attributes:
         contacts: places of the group's contacts, ascending; `frames`: their names.
+        joints: places of the independent joints between the base and the contacts, ascending.
         rows: (k,) the contact that each row of J belongs to.
         target: (k, d) orthonormal basis of range(J_b).
         vectors: (k, w) unit vectors of every candidate that acts on the group; others, and those that act on it with
@@ -50,6 +50,7 @@ class Demand:
 
     contacts: tuple[int, ...]
     frames: tuple[str, ...]
+    joints: tuple[int, ...]
     rows: tuple[int, ...]
     target: Array
     vectors: Mapping[Candidate, Array]
@@ -58,7 +59,11 @@ class Demand:
         """All vectors of some candidates, (k, w)."""
         return np.hstack([np.zeros((len(self.rows), 0)), *(self.vectors[c] for c in chosen if c in self.vectors)])
 
-    def missing(self, basis: Array) -> Array:
+    def missing(self, chosen: Iterable[Candidate]) -> int:
+        """Dimensions of the target that some candidates leave unreached; 0 if they meet the demand."""
+        return int(self.unreached(orthonormal(self.stacked(chosen))))
+
+    def unreached(self, basis: Array) -> Array:
         """Dimensions of the target outside the span of orthonormal (or zero) columns (..., k, r), int (...)."""
         return np.asarray((np.linalg.svd(outside(self.target, basis), compute_uv=False) > TOLERANCE).sum(-1))
 
@@ -79,15 +84,10 @@ def outside(vectors: Array, basis: Array) -> Array:
     return vectors - basis @ (np.swapaxes(basis, -1, -2) @ vectors)
 
 
-def missing(demand: Demand, chosen: Iterable[Candidate]) -> int:
-    """Dimensions of the target that a set of candidates leaves unreached; 0 if it meets the demand."""
-    return int(demand.missing(orthonormal(demand.stacked(chosen))))
-
-
-def closure(demand: Demand, chosen: Iterable[Candidate]) -> frozenset[Candidate]:
-    """The demand's candidates that add nothing to a set of them, those of the set included."""
-    gains = demand.gains(orthonormal(demand.stacked(chosen)))
-    return frozenset(candidate for candidate, gain in gains.items() if not gain)
+def spanning(vectors: Array) -> Array:
+    """Orthonormal basis (k, r) of the span of parts of unit vectors (k, w); small ones are none."""
+    U, values, _ = np.linalg.svd(vectors, full_matrices=False)
+    return U[:, values > TOLERANCE]
 
 
 def demands(
@@ -111,29 +111,19 @@ def demands(
     if robot.fixed_base:
         return []
     if joint_position is None:
-        joint_position = random_postures(robot, 1, seed)[0]
-    q = torch.tensor([[0.0] * 6 + [1.0, *joint_position]], dtype=torch.float64)
-    J = [FrameJacobian(robot, c.frame)(q)[0].numpy()[list(c.components)] for c in contacts]
-    groups = dict.fromkeys(group for state in states for group in contact_groups(robot, contacts, state))
-    return [_demand(group, contacts, J, candidates) for group in groups]
+        joint_position = random_postures(robot, 1, np.random.default_rng(seed))[0]
+    builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, ()))
+    J = builder.contact_jacobian(at_rest(joint_position[None], (False,) * len(contacts)))[0].numpy()
+    above = [frozenset(builder.columns.joints_above(body)) for body, _ in builder.frames]
+    groups = dict.fromkeys(group for state in states for group in _groups(above, state))
+    joints = {group: sorted(frozenset().union(*(above[place] for place in group))) for group in groups}
+    return [_demand(group, tuple(joints[group]), contacts, J, candidates) for group in groups]
 
 
-def random_postures(robot: Robot, count: int, seed: int = 0) -> Array:
-    """Joint positions (count, n) [rad or m], a uniform draw from -1.5 to 1.5."""
-    return np.random.default_rng(seed).uniform(-1.5, 1.5, (count, robot.n))
-
-
-def contact_joints(robot: Robot, contacts: Sequence[Contact]) -> list[frozenset[int]]:
-    """Independent joints between the base and each contact."""
-    columns = Columns(KinematicTree(robot))
-    return [frozenset(columns.joints_above(robot.link(contact.frame)[0])) for contact in contacts]
-
-
-def contact_groups(robot: Robot, contacts: Sequence[Contact], state: State) -> list[tuple[int, ...]]:
-    """Active contacts, grouped by shared joints on their paths from the base."""
+def _groups(above: Sequence[AbstractSet[int]], state: State) -> list[tuple[int, ...]]:
+    """Active contacts, grouped by shared joints among those `above` each."""
     active = [place for place, touching in enumerate(state) if touching]
-    above = contact_joints(robot, [contacts[place] for place in active])
-    return [tuple(active[k] for k in group) for group in connected(above)]
+    return [tuple(active[k] for k in group) for group in connected([above[place] for place in active])]
 
 
 def connected(sets: Sequence[AbstractSet[Hashable]]) -> list[tuple[int, ...]]:
@@ -148,22 +138,24 @@ def connected(sets: Sequence[AbstractSet[Hashable]]) -> list[tuple[int, ...]]:
 
 
 def _demand(
-    group: tuple[int, ...], contacts: Sequence[Contact], J: Sequence[Array], candidates: Sequence[Candidate]
+    group: tuple[int, ...],
+    joints: tuple[int, ...],
+    contacts: Sequence[Contact],
+    J: Array,
+    candidates: Sequence[Candidate],
 ) -> Demand:
+    """What a group demands, from the Jacobians of all contacts, (C, 6, nv)."""
     rows = [(place, k) for place in group for k in contacts[place].components]
-    J_group = np.concatenate([J[place] for place in group])
-    J_base, J_joints = J_group[:, :6], J_group[:, 6:]
-    scale = np.linalg.norm(J_base)
-    U, values, _ = np.linalg.svd(J_base, full_matrices=False)
+    J_group = np.stack([J[row] for row in rows])
+    J_group /= np.linalg.norm(J_group[:, :6])
     vectors = {}
     for candidate in candidates:
         if candidate.joint is not None:
-            x = J_joints[:, [candidate.joint]]
-            if np.linalg.norm(x) > TOLERANCE * scale:
+            x = J_group[:, [6 + candidate.joint]]
+            if np.linalg.norm(x) > TOLERANCE:
                 vectors[candidate] = x / np.linalg.norm(x)
         elif candidate.contact in group:
             read = [rows.index((candidate.contact, k)) for k in candidate.components]
             vectors[candidate] = np.eye(len(rows))[:, read]
     frames = tuple(contacts[place].frame for place in group)
-    target = U[:, values > TOLERANCE * values[0]]
-    return Demand(group, frames, tuple(place for place, _ in rows), target, vectors)
+    return Demand(group, frames, joints, tuple(place for place, _ in rows), spanning(J_group[:, :6]), vectors)

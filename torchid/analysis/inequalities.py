@@ -31,7 +31,7 @@ def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: Abstra
     """
     ours = [c for c in candidates if c in demand.vectors]
     start = orthonormal(demand.stacked(c for c in ours if c in chosen))
-    short = int(demand.missing(start))
+    short = int(demand.unreached(start))
     for contact in demand.contacts:
         rows = np.array(demand.rows) == contact
         there = {c for c in ours if demand.vectors[c][rows].any()}
@@ -39,7 +39,7 @@ def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: Abstra
             basis = start
             for candidate in sorted(order, key=lambda c: c in there):
                 wider = orthonormal(np.hstack([basis, demand.vectors[candidate]]))
-                if demand.missing(wider) == short:
+                if demand.unreached(wider) == short:
                     basis = wider
             gains = demand.gains(basis)
             weights = [0 if c in chosen else min(gains.get(c, 0), short) for c in candidates]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
@@ -49,6 +51,23 @@ def triangle(X: Array) -> Array:
     return np.asarray(np.linalg.qr(X, mode="r"))
 
 
-def singular_values(X: Array) -> Array:
-    """Of a matrix, descending."""
-    return np.asarray(np.linalg.svd(X, compute_uv=False))
+def information_in(rows: Tensor, weight: float) -> Tensor:
+    """`weight X^T X`, (c, c), of the rows X of all samples together, (B, r, c)."""
+    X = rows.flatten(0, 1)
+    return weight * (X.T @ X)
+
+
+def unit_readings(ways: Tensor, W: Tensor) -> Tensor:
+    """Rows `ways W`, (B, c, nv), of norm 1, or zero where they are rounding.
+
+    A sensor that enters the generalized force of a sample by `way^T` times its reading tells what the whitened rows
+    `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
+
+    Args:
+        ways: (B, c, nv) or (c, nv).
+        W: (B, nv, nv), from `RowBuilder.rows_by_sample`.
+    """
+    readings = ways @ W
+    size = torch.linalg.vector_norm(readings, dim=-1, keepdim=True)
+    least = DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
+    return torch.where(size > least, readings / size, 0.0)

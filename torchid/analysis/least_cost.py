@@ -16,8 +16,8 @@ from itertools import chain, combinations, islice
 
 import numpy as np
 
-from torchid.analysis.candidates import Candidate
-from torchid.analysis.demands import TOLERANCE, Demand, orthonormal, outside
+from torchid.analysis.candidates import Candidate, total_cost
+from torchid.analysis.demands import TOLERANCE, Demand, orthonormal, outside, spanning
 from torchid.parameters import Array
 
 _DEVICES, _COMBINATIONS, _BATCH = 5, 100_000, 4096
@@ -45,17 +45,11 @@ def least_cost(demand: Demand, candidates: Sequence[Candidate]) -> LeastCost:
     for taken in chain.from_iterable(combinations(devices, count) for count in range(len(devices) + 1)):
         basis = orthonormal(demand.stacked(taken))
         target, vectors = outside(demand.target, basis), outside(demand.stacked(single), basis)
-        bound, places = _least_of_vectors(_spanning(target), vectors, cost)
-        bound += sum(c.cost for c in taken)
+        bound, places = _least_of_vectors(spanning(target), vectors, cost)
+        bound += total_cost(taken)
         if bound < best.bound:
             best = LeastCost(bound, (*taken, *(single[k] for k in places)))
     return best
-
-
-def _spanning(vectors: Array) -> Array:
-    """Orthonormal basis (k, r) of the span; vectors are parts of unit vectors, so small ones are none."""
-    U, values, _ = np.linalg.svd(vectors, full_matrices=False)
-    return U[:, values > TOLERANCE]
 
 
 def _least_of_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float, Sequence[int]]:
@@ -68,7 +62,7 @@ def _least_of_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float
     rest = outside(vectors, target)
     length = np.linalg.norm(rest, axis=0)
     inside = length <= TOLERANCE
-    rest = (_spanning(rest).T @ rest) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
+    rest = (spanning(rest).T @ rest) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
     best, chosen, budget = math.inf, np.zeros(0, dtype=int), _COMBINATIONS
     for g in range(len(rest) + 1):
         floor = float(cost[: d + g].sum()) if d + g <= len(cost) else math.inf

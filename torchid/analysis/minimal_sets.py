@@ -1,43 +1,20 @@
-"""The cheapest sensor set, with a proof that no cheaper one exists, and all sets without a sensor to spare.
-
-The cheapest set that obeys some of the inequalities every sufficient set obeys costs no more than the cheapest
-sufficient set. If it is not sufficient, the inequalities it violates are added, and so on.
-"""
+"""All sensor sets without a sensor to spare, part by part of the robot."""
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, milp
 
 from torchid.analysis.candidates import Candidate
-from torchid.analysis.demands import Demand, connected, missing, orthonormal
-from torchid.analysis.inequalities import inequalities
-from torchid.analysis.least_cost import least_cost
+from torchid.analysis.demands import Demand, connected, orthonormal
 from torchid.errors import SensorError
 from torchid.parameters import Array
 from torchid.problem.threads import one_thread
 
-Progress = Callable[[int, float, float], None]
-"""Called with the inequalities so far, the lower bound and the cost of the best set known, of the part at work."""
-
 _MEMORY = 2**22  # numbers in one batch of the enumeration
-_EXACT = 1e-7  # relative; what a solver of integer programs rounds
-
-
-@dataclass(frozen=True)
-class MinimalSet:
-    """A sufficient set, by the order of the candidates; `proven` if its cost is `lower_bound`, the least possible."""
-
-    chosen: tuple[Candidate, ...]
-    cost: float
-    lower_bound: float
-    proven: bool
 
 
 @dataclass(frozen=True)
@@ -61,40 +38,6 @@ def components(demands: Sequence[Demand], candidates: Sequence[Candidate]) -> li
 
 
 @one_thread()
-def cheapest_set(
-    demands: Sequence[Demand],
-    candidates: Sequence[Candidate],
-    keep: Iterable[Candidate] = (),
-    exclude: Iterable[Candidate] = (),
-    progress: Progress | None = None,
-    seconds: float = 60.0,
-) -> MinimalSet:
-    """The cheapest set of candidates that meets every demand.
-
-    Args:
-        demands: from `torchid.analysis.demands.demands`.
-        candidates: to choose from.
-        keep: in the set, needed or not.
-        exclude: not in the set.
-        progress: told after every round of inequalities.
-        seconds: after these, the best set found is returned with the bound reached, unproven.
-
-    Raises:
-        SensorError: no set of these candidates suffices, or one is both kept and excluded.
-    """
-    kept, usable = _usable(demands, candidates, keep, exclude)
-    deadline = time.monotonic() + seconds
-    solved = [_cheapest_part(part, kept, progress, deadline) for part in components(demands, usable)]
-    chosen = kept.union(*(result.chosen for result in solved))
-    beside = sum(c.cost for c in kept.difference(*(result.chosen for result in solved)))
-    return MinimalSet(
-        tuple(c for c in candidates if c in chosen),
-        sum(c.cost for c in chosen),
-        beside + sum(result.lower_bound for result in solved),
-        all(result.proven for result in solved),
-    )
-
-
 def all_minimal_sets(
     demands: Sequence[Demand],
     candidates: Sequence[Candidate],
@@ -117,9 +60,9 @@ def all_minimal_sets(
         The sets by size; None if more than `limit` candidates are open.
 
     Raises:
-        SensorError: as `cheapest_set`.
+        SensorError: as `usable_candidates`.
     """
-    kept, usable = _usable(demands, candidates, keep, exclude)
+    kept, usable = usable_candidates(demands, candidates, keep, exclude)
     free = [c for c in usable if c not in kept]
     if len(free) > limit:
         return None
@@ -137,10 +80,14 @@ def all_minimal_sets(
     return [tuple(c for c in candidates if c in chosen) for chosen in found]
 
 
-def _usable(
+def usable_candidates(
     demands: Sequence[Demand], candidates: Sequence[Candidate], keep: Iterable[Candidate], exclude: Iterable[Candidate]
 ) -> tuple[frozenset[Candidate], tuple[Candidate, ...]]:
-    """The kept candidates and all that are not excluded, once these are known to suffice."""
+    """The kept candidates and all that are not excluded, once these are known to suffice.
+
+    Raises:
+        SensorError: they do not suffice, or one is both kept and excluded.
+    """
     kept, excluded = frozenset(keep), frozenset(exclude)
     for both in kept & excluded:
         raise SensorError("sensors", "keep", f"'{both.name}', which is also excluded", "one or the other")
@@ -148,70 +95,14 @@ def _usable(
     lacking = [
         f"{short} of {demand.target.shape[1]} dimensions of {' + '.join(demand.frames)}"
         for demand in demands
-        if (short := missing(demand, usable))
+        if (short := demand.missing(usable))
     ]
     if lacking:
-        found, accepted = (
-            f"all of them leave {'; '.join(lacking)} unseen",
-            "joints on the way there, contact components",
+        found = f"all of them leave {'; '.join(lacking)} unseen"
+        raise SensorError(
+            "sensors", "candidates", found, "more candidates: joints on the way there, contact components"
         )
-        raise SensorError("sensors", "candidates", found, f"more candidates: {accepted}")
     return kept, usable
-
-
-def _cheapest_part(
-    part: Component, kept: AbstractSet[Candidate], progress: Progress | None, deadline: float
-) -> MinimalSet:
-    cost = np.array([c.cost for c in part.candidates])
-    must = np.array([float(c in kept) for c in part.candidates])
-    alone = [least_cost(demand, part.candidates) for demand in part.demands]
-    cuts = [row for demand in part.demands for row in inequalities(demand, part.candidates, frozenset())]
-    cuts += [
-        np.append(cost * [c in d.vectors for c in part.candidates], least.bound)
-        for d, least in zip(part.demands, alone, strict=True)
-    ]
-    guesses = [frozenset(chosen for least in alone for chosen in least.chosen), *(frozenset(a.chosen) for a in alone)]
-    best, bound = min((_pruned(part, guess, kept) for guess in guesses), key=_cost), max(a.bound for a in alone)
-    while True:
-        A = np.unique(np.array(cuts).reshape(-1, len(cost) + 1), axis=0)
-        left = max(deadline - time.monotonic(), 0.0)
-        solved = milp(
-            cost,
-            constraints=LinearConstraint(A[:, :-1], A[:, -1], np.inf),
-            integrality=np.ones(len(cost)),
-            bounds=Bounds(must, 1.0),
-            options={"mip_rel_gap": 0.0, "time_limit": left},
-        )
-        bound = max(bound, solved.mip_dual_bound or 0.0)
-        if solved.status != 0:  # out of time
-            break
-        relaxed = frozenset(c for c, x in zip(part.candidates, solved.x, strict=True) if x > 0.5)
-        violated = [
-            row for d in part.demands if missing(d, relaxed) for row in inequalities(d, part.candidates, relaxed)
-        ]
-        best = min(best, _pruned(part, relaxed, kept), key=_cost)
-        if progress is not None:
-            progress(len(A), bound, _cost(best))
-        if not violated or _cost(best) <= bound * (1.0 + _EXACT):
-            break
-        cuts += violated
-    proven = math.isclose(_cost(best), bound, rel_tol=_EXACT)
-    chosen = tuple(c for c in part.candidates if c in best)
-    return MinimalSet(chosen, _cost(best), _cost(best) if proven else bound, proven)
-
-
-def _cost(chosen: Iterable[Candidate]) -> float:
-    return sum(c.cost for c in chosen)
-
-
-def _pruned(part: Component, wanted: AbstractSet[Candidate], kept: AbstractSet[Candidate]) -> frozenset[Candidate]:
-    """A sufficient set: all candidates, less whatever can be spared, the unwanted and the dear first."""
-    chosen = frozenset(part.candidates)
-    for candidate in sorted(chosen - kept, key=lambda c: (c in wanted, -c.cost, c.name)):
-        fewer = chosen - {candidate}
-        if not any(missing(d, fewer) for d in part.demands if candidate in d.vectors):
-            chosen = fewer
-    return chosen
 
 
 def _sufficient(
@@ -227,5 +118,5 @@ def _sufficient(
             masked = vectors * member[some][:, None, owner]
             fixed = np.broadcast_to(always, (len(some), *always.shape))
             basis = orthonormal(np.concatenate([fixed, masked], axis=2))
-            result[some] = demand.missing(basis) == 0
+            result[some] = demand.unreached(basis) == 0
     return result

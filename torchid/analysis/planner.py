@@ -10,9 +10,11 @@ import numpy as np
 
 from torchid.analysis.base_check import StateCheck, base_values, check_set
 from torchid.analysis.branches import Branch, Need, branches, needs
-from torchid.analysis.candidates import Candidate, sensor_set
-from torchid.analysis.demands import demands, random_postures
-from torchid.analysis.minimal_sets import Component, MinimalSet, all_minimal_sets, cheapest_set, components
+from torchid.analysis.candidates import Candidate, sensor_set, total_cost
+from torchid.analysis.cheapest_set import CheapestSet, cheapest_set
+from torchid.analysis.demands import demands
+from torchid.analysis.minimal_sets import Component, all_minimal_sets, components
+from torchid.analysis.postures import random_postures
 from torchid.analysis.ranking import SetRanking, best_first
 from torchid.analysis.stack import MotionStack, sparse_set
 from torchid.analysis.structure import structural_samples
@@ -129,7 +131,7 @@ def plan_sensors(question: Question, progress: Progress | None = None) -> Sensor
     parts: tuple[PartPlan, ...] = ()
     if ask.criterion == "stack":
         chosen = sparse_set(stack, ask.keep, ask.exclude, _counted(tell, "leaving sensors out", len(ask.candidates)))
-        least = MinimalSet(chosen, sum(c.cost for c in chosen), 0.0, False)
+        least = CheapestSet(chosen, total_cost(chosen), 0.0, False)
     else:
         wanted = demands(ask.robot, ask.contacts, ask.states, ask.candidates, ask.seed)
         least = cheapest_set(wanted, ask.candidates, ask.keep, ask.exclude)
@@ -162,7 +164,7 @@ def check(question: Question, sensors: SensorSet) -> list[StateCheck]:
 
 
 def _best_parts(
-    ask: Question, parts: Sequence[Component], least: MinimalSet, tell: Progress
+    ask: Question, parts: Sequence[Component], least: CheapestSet, tell: Progress
 ) -> tuple[tuple[PartPlan, ...], tuple[Candidate, ...]]:
     """Every part with its minimal sets, and the union of their most informative cheapest sets.
 
@@ -176,8 +178,8 @@ def _best_parts(
         ours = frozenset(part.candidates)
         sets = all_minimal_sets(part.demands, part.candidates, ask.keep & ours, ask.exclude & ours)
         first = tuple(c for c in part.candidates if c in chosen)
-        bound = _cost(first) * (1.0 + _EXACT)
-        cheapest = [first] if sets is None else [s for s in sets if _cost(s) <= bound]
+        bound = total_cost(first) * (1.0 + _EXACT)
+        cheapest = [first] if sets is None else [s for s in sets if total_cost(s) <= bound]
         ranking = SetRanking(ask.robot, ask.contacts, logs, part.candidates, tuple(chosen - ours), ask.noise, ask.prior)
         step = _counted(tell, f"ranking sets, {', '.join(frames)}", len(cheapest))
         ranked = best_first(ranking, cheapest, step)
@@ -187,25 +189,23 @@ def _best_parts(
 
 
 def _removals(ask: Question, stack: MotionStack, chosen: Sequence[Candidate], tell: Progress) -> Iterable[Removal]:
-    postures = random_postures(ask.robot, _TRIED, ask.seed)
     step = _counted(tell, "leaving sensors out", len(chosen))
     for candidate in chosen:
         fewer = [c for c in chosen if c is not candidate]
-        builder = RowBuilder(ask.robot, ask.contacts, sensor_set(ask.robot, ask.contacts, fewer))
-        ranks = (
-            []
-            if ask.robot.fixed_base
-            else [int(base_rank(base_values(builder, state, postures)).max()) for state in ask.states]
-        )
+        yield Removal(candidate, _base_rank(ask, fewer), stack.rank(fewer))
         step()
-        yield Removal(candidate, min(ranks, default=None), stack.rank(fewer))
+
+
+def _base_rank(ask: Question, chosen: Sequence[Candidate]) -> int | None:
+    """Least rank(S_b V_x) over the states, each at almost every posture; None for a bolted base."""
+    if ask.robot.fixed_base:
+        return None
+    postures = random_postures(ask.robot, _TRIED, np.random.default_rng(ask.seed))
+    builder = RowBuilder(ask.robot, ask.contacts, sensor_set(ask.robot, ask.contacts, chosen))
+    return min(int(base_rank(base_values(builder, state, postures)).max()) for state in ask.states)
 
 
 def _counted(tell: Progress, what: str, steps: int) -> Callable[[], None]:
     """Tells one step more at every call."""
     numbers = count(1)
     return lambda: tell(what, next(numbers), steps)
-
-
-def _cost(chosen: Iterable[Candidate]) -> float:
-    return sum(c.cost for c in chosen)

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from torchid.analysis.candidates import Candidate, sensor_set
-from torchid.analysis.information import DEPENDENT, prior_directions
+from torchid.analysis.information import information_in, prior_directions, unit_readings
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import spread_by_state
+from torchid.problem.plan import State
 from torchid.problem.threads import one_thread
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise
@@ -72,16 +73,13 @@ class SetRanking:
             weight = stands_for / samples.oversampling
             rows, W = builder.rows_by_sample(samples, state)
             R = rows[..., :-1] @ directions
-            self._information += weight * (flat := R.flatten(0, 1)).T @ flat
+            self._information += information_in(R, weight)
             owners, ways = self._ways(builder, samples, state)
             if owners:
-                Q = ways @ W
-                size = torch.linalg.vector_norm(Q, dim=2, keepdim=True)
-                least = DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=2, keepdim=True)
-                Q = torch.where(size > least, Q / size, 0.0)
+                Q = unit_readings(ways, W)
                 self._states.append(_StateRows(weight, owners, Q, Q @ R))
 
-    def _ways(self, builder: RowBuilder, samples: Samples, state: tuple[bool, ...]) -> tuple[list[int], Tensor]:
+    def _ways(self, builder: RowBuilder, samples: Samples, state: State) -> tuple[list[int], Tensor]:
         """How each channel of the candidates enters the generalized force, (B, c, nv), and whose channel it is."""
         J = builder.contact_jacobian(samples)
         base, owners, ways = builder.tree.base_rows, [], []
@@ -109,7 +107,7 @@ class SetRanking:
                 gram = Q @ Q.mT
                 gram.diagonal(dim1=1, dim2=2).add_(_ROUNDING)  # channels that read alike, or nothing
                 lost = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows.QR[:, gone], upper=False)
-                information = information - rows.weight * (flat := lost.flatten(0, 1)).T @ flat
+                information = information - information_in(lost, rows.weight)
         return float(0.5 * torch.linalg.slogdet(information).logabsdet / np.log(2.0))
 
 

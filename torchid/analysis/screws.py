@@ -28,7 +28,7 @@ def simplest_basis(space: Array) -> list[Array]:
             others = np.arange(len(rows)) != done
             rows[others] -= np.outer(rows[others, block.start + column], rows[done])
             done += 1
-    return [row for row in rows[:done]]
+    return list(rows[:done])
 
 
 def words(wrench: Array) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 
-from torchid.analysis.base_parameters import structural_rank
 from torchid.analysis.candidates import Candidate, sensor_set
+from torchid.analysis.rank import structural_rank
 from torchid.analysis.structure import structural_samples
 from torchid.errors import SensorError
 from torchid.problem.plan import State
@@ -39,7 +39,7 @@ class MotionStack:
         """Independent combinations of inertial parameters that a set of sensors determines."""
         builder = RowBuilder(self.robot, self.contacts, sensor_set(self.robot, self.contacts, chosen))
         problem = linear_problem(compress(self._samples, builder), builder, self.robot, friction=False)
-        return structural_rank(problem).rank if len(problem.A) and problem.A.any() else 0
+        return structural_rank(problem).rank
 
     @cached_property
     def full(self) -> int:

@@ -9,11 +9,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from torchid.analysis.postures import random_postures
 from torchid.problem.plan import State
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
-from torchid.regressor.dynamics import joint_directions
-from torchid.regressor.jacobian import generalized_forces, wrench_map, wrenches_at_base
+from torchid.regressor.jacobian import FrameJacobian
 from torchid.regressor.kinematics import BodyStates, body_states, cross, joint_states
 from torchid.regressor.motion import motion_from_state, rotation_matrix
 from torchid.regressor.tree import KinematicTree
@@ -22,7 +22,6 @@ from torchid.sensing.contacts import Contact
 from torchid.sensing.nullspace import RANK_TOLERANCE
 
 _WEIGHTLESS = (0.0, 0.0, 0.0)
-_ANGLE, _STROKE = 1.5, 0.3  # [rad], [m] either way
 _AT_REST = 1e-10  # a projected velocity below this share of what was drawn is rounding, and has no sign
 
 
@@ -76,10 +75,11 @@ def standing_states(
     one the whole frame, a line all but the rotation about itself. Twice as many states are drawn, and those nearest to
     a singular J_C left out: there, accelerations grow without bound.
     """
-    tree = KinematicTree(robot)
-    q, v, a = _drawn(robot, tree, 2 * count, rng)
-    J, _ = _constraints(tree, contacts, state, robot, q, v)
-    if not J.shape[1]:
+    q, v, a = _drawn(robot, 2 * count, rng)
+    held = [contact for contact, active in zip(contacts, state, strict=True) if active]
+    rows = [FrameJacobian(robot, contact.frame)(q)[:, list(contact.components)] for contact in held]
+    J = torch.cat([q.new_zeros(len(q), 0, robot.nv), *rows], dim=1)
+    if not held:
         return q[:count], v[:count], a[:count]
     values = torch.linalg.svdvals(J)
     regular = values > RANK_TOLERANCE * values[:, :1]
@@ -89,7 +89,7 @@ def standing_states(
     inverse = torch.linalg.pinv(J, rtol=RANK_TOLERANCE)
     v = _without(v, inverse, J)
     v = torch.where(v.abs() < _AT_REST, 0.0, v)
-    _, drift = _constraints(tree, contacts, state, robot, q, v)
+    drift = _drift(robot, held, q, v)
     return q, v, _without(a, inverse, J) - (inverse @ drift[..., None])[..., 0]
 
 
@@ -100,33 +100,25 @@ def _without(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
     return x
 
 
-def _drawn(robot: Robot, tree: KinematicTree, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    slides = (tree.joint_map[1:].T != 0).to(tree.prismatic) @ tree.prismatic[1:, 0] > 0
-    reach = np.where(slides.numpy(), _STROKE, _ANGLE)
-    q = reach * rng.uniform(-1.0, 1.0, (count, robot.n))
+def _drawn(robot: Robot, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    q = random_postures(robot, count, rng)
     v, a = rng.normal(size=(count, robot.nv)), 3.0 * rng.normal(size=(count, robot.nv))
     if not robot.fixed_base:
         q = np.hstack([np.zeros((count, 3)), Rotation.random(count, random_state=rng).as_quat(), q])
     return torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(a)
 
 
-def _constraints(
-    tree: KinematicTree, contacts: Sequence[Contact], state: State, robot: Robot, q: Tensor, v: Tensor
-) -> tuple[Tensor, Tensor]:
-    """J_C, (B, k, nv), and dJ_C/dt v, (B, k): what the contacts would accelerate by with a = 0, in their own axes."""
+def _drift(robot: Robot, held: Sequence[Contact], q: Tensor, v: Tensor) -> Tensor:
+    """dJ_C/dt v, (B, k): what the held components would accelerate by with a = 0, in the contacts' own axes."""
+    tree = KinematicTree(robot)
     motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
     states = body_states(tree, motion, joint_states(tree, motion))
-    directions = joint_directions(tree, states)
-    J, drift = [v.new_zeros(0, robot.nv, len(q))], [v.new_zeros(0, len(q))]
-    for contact, active in zip(contacts, state, strict=True):
-        if active:
-            body, T_link_frame = robot.link(contact.frame)
-            T_joint_frame = v.new_tensor(tree.T_joint_link[body] @ T_link_frame)
-            unit_wrenches = v.new_tensor(wrench_map(T_joint_frame.numpy()).T)[list(contact.components)]
-            at_base = wrenches_at_base(states, body, unit_wrenches)
-            J.append(generalized_forces(tree, directions, body, at_base, range(robot.n)))
-            drift.append(_acceleration(states, body, T_joint_frame)[list(contact.components)])
-    return torch.cat(J).permute(2, 0, 1), torch.cat(drift).T
+    rows = []
+    for contact in held:
+        body, T_link_frame = robot.link(contact.frame)
+        T_joint_frame = v.new_tensor(tree.T_joint_link[body] @ T_link_frame)
+        rows.append(_acceleration(states, body, T_joint_frame)[list(contact.components)])
+    return torch.cat(rows).T
 
 
 def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor) -> Tensor:

@@ -42,8 +42,6 @@ def structural_problem(
     sensors: SensorSet,
     states: Sequence[State],
     friction: bool = True,
-    count: int | None = None,
-    seed: int = 0,
 ) -> LinearProblem:
     """What a sensor set sees of the parameters if the robot may move as it likes in some contact states.
 
@@ -55,9 +53,6 @@ def structural_problem(
         sensors: which forces are measured.
         states: contact states the robot may be in.
         friction: whether friction is free.
-        count: samples per state, see `structural_samples`.
-        seed: of the random numbers.
     """
     builder = RowBuilder(robot, contacts, sensors)
-    factor = compress(structural_samples(robot, contacts, states, count, seed), builder)
-    return linear_problem(factor, builder, robot, friction)
+    return linear_problem(compress(structural_samples(robot, contacts, states), builder), builder, robot, friction)

@@ -11,6 +11,9 @@ from pydantic.dataclasses import dataclass
 from torchid.config.sensors import Choice
 from torchid.config.types import STRICT, FileName, Positive, Seed
 
+Name = Annotated[str, Field(min_length=1)]
+Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
+
 
 @dataclass(config=STRICT, frozen=True)
 class CandidatesConfig:
@@ -32,12 +35,12 @@ class AnalysisConfig:
     logs; `prior_error`: how far off the URDF may be, against the size of each body.
     """
 
-    scenarios: dict[FileName, Annotated[list[list[str]], Field(min_length=1)]] | None = None
+    scenarios: Annotated[Scenarios, Field(min_length=1)] | None = None
     candidates: CandidatesConfig = dataclasses.field(default_factory=CandidatesConfig)
     keep: list[str] = dataclasses.field(default_factory=list)
     exclude: list[str] = dataclasses.field(default_factory=list)
     costs: dict[str, Positive] = dataclasses.field(default_factory=dict)
     criterion: Literal["per_sample", "stack"] | None = None
-    compare: dict[str, Choice] = dataclasses.field(default_factory=dict)
+    compare: dict[Name, Choice] = dataclasses.field(default_factory=dict)
     prior_error: Positive = 0.2
     seed: Seed = 0

@@ -105,7 +105,7 @@ _EXPERIMENT = FileKind(
     list_example="contacts=[{frame: l_sole, type: flat}]",
     paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*", "output"),
     prepare=_with_sensors_spelled_out,
-    refusals={"sensors.ft_sensors": _REFUSED},
+    refusals={"sensors.ft_sensors": _REFUSED, "analysis.compare.*.ft_sensors": _REFUSED},
 )
 _ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": "robot, contacts, output"}))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -37,7 +38,8 @@ class FileKind(Generic[T]):
         paths: places that hold a path, such as `robot.urdf`; `logs.train.*` is every item of the list `logs.train`.
         prepare: takes the settings and those that will override them, and returns the settings to merge; it is called
             for the file and the overrides, then for the overrides and nothing.
-        refusals: what a message says was found and is accepted, by place, where the type alone says too little.
+        refusals: what a message says was found and is accepted, by place (`*` for a name that the file gives), where
+            the type alone says too little.
     """
 
     settings: type[T]
@@ -128,7 +130,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
     """The first complaint, an unknown key before others: it is the likeliest cause of the rest."""
     complaints = sorted(error.errors(), key=lambda e: e["type"] != "unexpected_keyword_argument")
     first = complaints[0]
-    place = [str(part) for part in first["loc"]]
+    place = [str(part) for part in first["loc"] if part != "[key]"]
     field = ".".join(place)
     if first["type"] == "unexpected_keyword_argument":
         keys = _keys_at(kind.settings, place[:-1])
@@ -136,17 +138,25 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
     missing = [".".join(map(str, e["loc"])) for e in complaints if e["type"] == "missing"]
     if missing:
         return ConfigError(path, ", ".join(missing), "missing", "a value")
-    if field in kind.refusals:
-        return ConfigError(path, field, *kind.refusals[field])
+    for pattern, refusal in kind.refusals.items():
+        if fnmatch(field, pattern):
+            return ConfigError(path, field, *refusal)
     if first["type"] == "too_short" and not first["input"]:
-        return ConfigError(path, field, "an empty list", "at least one item")
+        empty = "an empty mapping" if isinstance(first["input"], Mapping) else "an empty list"
+        return ConfigError(path, field, empty, "at least one item")
     found = first["input"]
     shown = "a mapping" if isinstance(found, Mapping) else "a list" if isinstance(found, list) else repr(found)
     if first["type"] == "dataclass_type":
         accepted = f"a mapping with {', '.join(_keys_at(kind.settings, place))}"
     else:
         count = first.get("ctx", {}).get("min_length", 1)
-        plain = {"path_type": "a path", "list_type": "a list", "too_short": f"at least {count} items"}
+        plain = {
+            "path_type": "a path",
+            "list_type": "a list",
+            "dict_type": "a mapping",
+            "too_short": f"at least {count} items",
+            "string_too_short": "a name",
+        }
         described = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
         accepted = plain.get(first["type"], described)
     return ConfigError(path, field, f"found {shown}", accepted)

@@ -39,7 +39,7 @@ class ChoiceConfig:
     @property
     def empty(self) -> bool:
         """Whether nothing is chosen."""
-        return self.set is None and not (self.joint_torques or self.contact_wrenches)
+        return self.set is None and not (self.joint_torques or any(self.contact_wrenches.values()))
 
 
 @dataclass(config=STRICT, frozen=True)

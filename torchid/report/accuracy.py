@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from rich.table import Table
 from rich.text import Text
 
@@ -82,6 +83,8 @@ def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
             known = [np.nan if height is None else height for height in heights]
             axis.plot(place, known, marker, color=color, markersize=7, label=name)
         axis.set_yscale("log")
+        axis.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
+        axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         axis.margins(x=0.3 / max(len(sets) - 1, 1), y=0.15)
         axis.set_xticks(place, list(sets), rotation=40, ha="right")
         axis.set_title(group_name(group), loc="left", fontsize=9)

@@ -82,7 +82,7 @@ def base_document(base: BaseParameters, body_names: Sequence[str]) -> dict[str, 
     return {
         "rank": base.rank,
         "parameters": int(base.free.sum()),
-        "gap": base.gap,
+        "gap": base.gap if base.rank else None,
         "relations": relations(base, body_names),
         "unseen": unseen(base, body_names),
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,31 +15,53 @@ from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
 from torchid.robot import Robot
 
 
-def parameters_document(robot: Robot, estimate: Estimate) -> dict[str, Any]:
-    """What `parameters.json` holds; a standard error or a share that the data do not give is null."""
+def parameters_document(robot: Robot, estimate: Estimate, by_state: Mapping[str, Estimate]) -> dict[str, Any]:
+    """What `parameters.json` holds; a standard error or a share that the data do not give is null.
 
-    def named(values: Array) -> dict[str, Any]:
-        return {name: _plain(x) for name, x in zip(PARAMETERS, values, strict=True)}
-
-    columns = {
-        "identified": estimate.phi,
-        "standard_error": estimate.standard_error,
-        "identifiable": estimate.identifiable,
-        "data_share": estimate.data_share,
-        "verdict": estimate.verdict,
-    }
-    per_body = {name: x.reshape(-1, PER_BODY) for name, x in columns.items()}
+    Args:
+        robot: the robot.
+        estimate: of all data.
+        by_state: of the data of each contact state alone.
+    """
+    nominal = [{"nominal": _named(phi)} for phi in robot.nominal]
+    found = _bodies(robot, {"identified": estimate.phi} | _judged(estimate))
     return {
         "units": dict(zip(PARAMETERS, UNITS, strict=True)),
         "frame": "each body's link frame, inertia about its origin",
         "massless": list(robot.massless),
         "verdicts": estimate.verdict_counts(),
-        "bodies": [
-            {"name": name, "nominal": named(robot.nominal[body])}
-            | {column: named(values[body]) for column, values in per_body.items()}
-            for body, name in enumerate(robot.body_names)
+        "bodies": [{"name": body["name"]} | before | body for body, before in zip(found, nominal, strict=True)],
+        "contact_states": [
+            {
+                "name": name,
+                "rank": alone.rank,
+                "condition_number": _plain(alone.condition_number),
+                "singular_values": alone.singular_values.tolist(),
+                "verdicts": alone.verdict_counts(),
+                "bodies": _bodies(robot, _judged(alone)),
+            }
+            for name, alone in by_state.items()
         ],
     }
+
+
+def _judged(estimate: Estimate) -> dict[str, np.ndarray]:
+    """How far each parameter can be trusted, (12 L,) each."""
+    names = ("standard_error", "identifiable", "data_share", "verdict")
+    return {name: getattr(estimate, name) for name in names}
+
+
+def _bodies(robot: Robot, columns: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Columns (12 L,) by body and parameter."""
+    per_body = {name: x.reshape(-1, PER_BODY) for name, x in columns.items()}
+    return [
+        {"name": name} | {column: _named(values[body]) for column, values in per_body.items()}
+        for body, name in enumerate(robot.body_names)
+    ]
+
+
+def _named(values: np.ndarray) -> dict[str, Any]:
+    return {name: _plain(x) for name, x in zip(PARAMETERS, values, strict=True)}
 
 
 def read_parameters(path: Path, robot: Robot) -> Array:

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from torchid.analysis.base_check import LostBase, StateCheck
 from torchid.analysis.candidates import Candidate
+from torchid.analysis.demands import TOLERANCE
 from torchid.analysis.planner import PartPlan, SensorPlan
 
 _MOST, _CURES, _BASE = 5, 8, 6
@@ -80,6 +81,10 @@ def check_lines(checks: Sequence[StateCheck]) -> list[str]:
         lines.append(
             f"warning: at some postures of the logs the base is all but lost (smallest singular value {least:.2g})"
         )
+    rare = sum(check.lost is None and check.generic.low < TOLERANCE for check in checks)
+    if rare:
+        where = f"{rare} of {len(checks)} contact states"
+        lines.append(f"warning: in {where} the base is as good as lost at one random posture in twenty or more")
     falling = [check for check in checks if check.lost is None and check.zero.rank < check.generic.rank]
     if falling:
         alike = dict.fromkeys(names for check in falling for names in check.coincident)

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.analysis.contributions import Contribution, Contributions, PartContribution
+from torchid.estimators import Estimate
 from torchid.estimators.result import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.report.metrics import GROUPS, Metrics
@@ -99,6 +100,21 @@ def verdict_table(body_names: Sequence[str], verdicts: np.ndarray) -> Table:
     for name, found in zip(body_names, verdicts.reshape(-1, PER_BODY), strict=True):
         if (found != FIXED).any():
             table.add_row(Text(name), *(MARKS[verdict] for verdict in found))
+    return table
+
+
+def verdict_counts_table(by_state: Mapping[str, Estimate], together: Estimate) -> Table:
+    """Rank, condition number and numbers of parameters by verdict, of each contact state alone and of all data."""
+    table = Table(title="Parameters by verdict, of each contact state alone and together", title_justify="left")
+    table.add_column("in contact", overflow="fold")
+    for heading in ("rank", "condition", *filter(None, MARKS.values())):
+        table.add_column(heading, justify="right")
+    for name, estimate in [*by_state.items(), ("together", together)]:
+        if name == "together":
+            table.add_section()
+        condition = f"{estimate.condition_number:.2g}" if estimate.rank else "-"
+        counts = (str(count) for verdict, count in estimate.verdict_counts().items() if MARKS[verdict])
+        table.add_row(Text(name), str(estimate.rank), condition, *counts)
     return table
 
 

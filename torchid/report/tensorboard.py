@@ -104,18 +104,20 @@ class RunEvents:
         for name, value in scalars.items():
             self._writer.add_scalar(f"fit/{name}", value, step)
 
-    def identifiability(self, step: int, estimate: Estimate, known: Knowledge) -> None:
+    def identifiability(self, step: int, estimate: Estimate, known: Knowledge, table: str) -> None:
         """What the data tell of the parameters; of the singular values' chart, steps are their places.
 
         Args:
             step: of all other charts.
             estimate: the fit.
             known: by all data.
+            table: of the verdicts by contact state.
         """
         scalars = {f"verdicts/{verdict}": float(count) for verdict, count in estimate.verdict_counts().items()}
         scalars |= {"identifiability/bits": known.bits, "identifiability/combinations": known.determined}
         for tag, value in scalars.items():
             self._writer.add_scalar(tag, value, step)
+        self._writer.add_text("verdicts", _preformatted(table), step)
         for place, value in enumerate(estimate.singular_values):
             self._writer.add_scalar("identifiability/singular_value", value, place)
 
@@ -136,11 +138,16 @@ class RunEvents:
             figures: by tag.
             step: of the figures.
         """
-        self._writer.add_text("config", "    " + settings.replace("\n", "\n    "))
+        self._writer.add_text("config", _preformatted(settings))
         for tag, figure in figures.items():
             self._writer.add_figure(tag, figure, step, close=False)
         named = {f"final/{name}": value for name, value in final.items()}
         self._writer.add_hparams(dict(hyperparameters), named, run_name="hparams")
+
+
+def _preformatted(text: str) -> str:
+    """As a block that Markdown leaves alone."""
+    return "    " + text.replace("\n", "\n    ")
 
 
 def write_comparison(

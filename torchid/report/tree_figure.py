@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from torchid.robot.tree import BodyJoint
 from torchid.sensing import Contact
 
 _TORQUE, _WRENCH, _PLAIN, _LOADED = "tab:blue", "tab:green", "0.75", "0.3"
-_COLUMN, _ROW = 2.1, 0.3  # inches
+_COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4  # inches
 
 Place = tuple[float, int]
 """Column and row."""
@@ -41,12 +42,12 @@ def tree_figure(
         wrenches: measured components by contact frame.
         constrained: joints between the base and a contact.
     """
-    places = _places(robot)
+    places = _places(robot, contacts)
     hanging = _contact_rows(robot, contacts, places)
     right = max(x for x, _ in places)
     deepest = max(y for _, y in [*places, *hanging.values()])
     width = _COLUMN * (right + 1.0)
-    figure = Figure(figsize=(max(width, 5.0) + 0.2, _ROW * (deepest + 1) + 1.3), layout="constrained")
+    figure = Figure(figsize=(max(width, _LEGEND) + 0.2, _ROW * (deepest + 1) + 1.3), layout="constrained")
     axes = figure.subplots()
     for body, link in enumerate(robot.bodies):
         if link.joint is not None:
@@ -63,13 +64,14 @@ def tree_figure(
     return figure
 
 
-def _places(robot: Robot) -> list[Place]:
-    """Column and row of every body: leaves side by side, bodies above the middle of their children."""
+def _places(robot: Robot, contacts: Sequence[Contact]) -> list[Place]:
+    """Column and row of every body: leaves side by side, bodies above their contacts and their children's middle."""
+    hanging = Counter(robot.link(contact.frame)[0] for contact in contacts)
     children: dict[int, list[int]] = {body: [] for body in range(len(robot.bodies))}
     row = [0] * len(robot.bodies)
     for body, link in enumerate(robot.bodies[1:], start=1):
         children[link.parent].append(body)
-        row[body] = row[link.parent] + 1
+        row[body] = row[link.parent] + 1 + hanging[link.parent]
     column, free = [0.0] * len(robot.bodies), 0
     for body in reversed(range(len(robot.bodies))):  # children come after their parents
         if children[body]:
@@ -82,10 +84,12 @@ def _places(robot: Robot) -> list[Place]:
 def _contact_rows(robot: Robot, contacts: Sequence[Contact], places: Sequence[Place]) -> dict[str, Place]:
     """Places of contacts, one below the other beneath their body."""
     hanging: dict[str, Place] = {}
+    count: Counter[int] = Counter()
     for contact in contacts:
-        column, row = places[robot.link(contact.frame)[0]]
-        above = sum(x == column and y > row for x, y in hanging.values())
-        hanging[contact.frame] = (column, row + 1 + above)
+        body, _ = robot.link(contact.frame)
+        count[body] += 1
+        column, row = places[body]
+        hanging[contact.frame] = (column, row + count[body])
     return hanging
 
 

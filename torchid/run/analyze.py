@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from torchid.analysis.candidates import Candidate, candidates, sensor_set
 from torchid.analysis.planner import Question, SensorPlan, check, plan_sensors
 from torchid.analysis.structure import structural_problem
 from torchid.config import AnalyzeConfig, dump_config
-from torchid.errors import SensorError, UnknownNameError
+from torchid.errors import ConfigError, SensorError, UnknownNameError
 from torchid.problem import Samples
 from torchid.problem.chunks import by_state
 from torchid.problem.plan import State
@@ -61,7 +61,7 @@ class Analysis:
 
 def analysis_folder(output: Path) -> Path:
     """Where an analysis goes: beside the run of the same experiment file."""
-    return output.with_name(f"{output.name}.analysis")
+    return output.parent / f"{output.name}.analysis"
 
 
 def analyze(config: AnalyzeConfig, source: object = "experiment") -> Analysis:
@@ -75,18 +75,19 @@ def analyze(config: AnalyzeConfig, source: object = "experiment") -> Analysis:
         InputError: whatever does not fit; nothing has been written then.
     """
     output = analysis_folder(config.output)
+    if not config.output.name:
+        raise ConfigError(source, "output", f"'{config.output}', no name for a folder", "a path to a new folder")
     check_free(output, config.overwrite, ANALYSIS)
     scene = set_up_scene(config, source)
     proposal = None if config.sensors.empty else scene.sensors_of(config.sensors, source)
-    offered = _offered(scene, source)
+    offered, named = _offered(scene, source), _named_sets(scene, proposal, source)
     with progress_bars() as bars:
         train, test = _read(scene, proposal, bars)
         scenarios = tuple(
             _scenario(scene, name, states, offered, proposal, train, bars, source)
             for name, states in _scenarios(scene, train, source).items()
         )
-        compared = _compared(scene, proposal, scenarios, source)
-        found = accuracies(scene, compared, train, test, bars) if train else {}
+        found = accuracies(scene, _compared(scene, named, scenarios), train, test, bars, source) if train else {}
         analysis = Analysis(scene, scenarios, found, output)
         bars.add_task("writing", total=None)
         _write(analysis)
@@ -247,12 +248,29 @@ def same_sensors(a: SensorSet, b: SensorSet, contacts: Sequence[Contact]) -> boo
     return np.array_equal(a.torque, b.torque) and np.array_equal(wrench_a, wrench_b)
 
 
-def _compared(
-    scene: Scene, proposal: SensorSet | None, scenarios: Sequence[Scenario], source: object
-) -> dict[str, SensorSet]:
-    """Sensor sets to compare by accuracy: the proposed one, those named in the file, and the planned ones."""
+def _named_sets(scene: Scene, proposal: SensorSet | None, source: object) -> dict[str, SensorSet]:
+    """The proposed set and those that the file compares.
+
+    Raises:
+        InputError: names that do not fit the robot, or one that is taken.
+    """
     sets = {} if proposal is None else {"proposed": proposal}
-    sets |= {name: scene.sensors_of(choice, source) for name, choice in scene.config.analysis.compare.items()}
+    for name, choice in scene.config.analysis.compare.items():
+        field = f"analysis.compare.{name}"
+        if name in sets:
+            raise ConfigError(source, field, "the name of what stands under sensors", "another name")
+        try:
+            sets[name] = scene.sensors_of(choice, source)
+        except UnknownNameError as error:
+            raise UnknownNameError(source, error.field.replace("sensors", field, 1), error.name, error.valid) from error
+        except SensorError as error:
+            raise SensorError(source, error.field.replace("sensors", field, 1), error.found, error.accepted) from error
+    return sets
+
+
+def _compared(scene: Scene, named: Mapping[str, SensorSet], scenarios: Sequence[Scenario]) -> dict[str, SensorSet]:
+    """Sensor sets to compare by accuracy: those with a name, and the planned ones."""
+    sets = dict(named)
     for scenario in scenarios:
         planned = sensor_set(scene.robot, scene.contacts, scenario.plan.chosen, scene.noise)
         if not any(same_sensors(planned, other, scene.contacts) for other in sets.values()):

@@ -89,6 +89,8 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "exp
             source, "device", f"'{config.device}' is not available here", "cpu, cuda, cuda:0, ..."
         ) from error
     robot = load_robot(config.robot.urdf, config.robot.base_link, config.robot.fixed_base)
+    if not robot.nv:
+        raise ConfigError(source, "robot", "a bolted base without a joint, which never moves", "a robot that can move")
     contacts = check_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
     return Scene(config, robot, contacts)
 

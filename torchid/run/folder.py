@@ -17,7 +17,10 @@ from torchid.errors import ConfigError
 
 @dataclass(frozen=True)
 class FolderKind:
-    """What a folder that may be overwritten holds: a file that tells its kind, and patterns of the other names."""
+    """What a folder that may be overwritten holds: a file that tells its kind, and patterns of the other names.
+
+    `name`: with its article, as in "a run".
+    """
 
     name: str
     mark: str
@@ -32,13 +35,13 @@ class FolderKind:
 _FIGURES = ("forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png")
 _RESULTS = ("parameters.json", "metrics.json", "identified.urdf", *_FIGURES)
 EVENTS = "events.out.tfevents*"
-RUN = FolderKind("run", "config.yaml", (*_RESULTS, "hparams", "evaluation", EVENTS))
-TRAINING = FolderKind("training", "config.yaml", ("checkpoint.pt", ".checkpoint.pt", EVENTS))
-SIMULATION = FolderKind("simulation", "simulation.yaml", ("logs", "exact", "nominal.urdf", "stability.json"))
+RUN = FolderKind("a run", "config.yaml", (*_RESULTS, "hparams", "evaluation", EVENTS))
+TRAINING = FolderKind("a training", "config.yaml", ("checkpoint.pt", ".checkpoint.pt", EVENTS))
+SIMULATION = FolderKind("a simulation", "simulation.yaml", ("logs", "exact", "nominal.urdf", "stability.json"))
 ANALYSIS = FolderKind(
-    "analysis", "analysis.json", ("config.yaml", "base_parameters.txt", "sensors-*.png", "accuracy.png")
+    "an analysis", "analysis.json", ("config.yaml", "base_parameters.txt", "sensors-*.png", "accuracy.png")
 )
-STUDY = FolderKind("study", "results.json", ("tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard"))
+STUDY = FolderKind("a study", "results.json", ("tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard"))
 
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer
 
@@ -63,9 +66,9 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN) -> None:
         raise ConfigError(output, "output", "not empty", "a new folder, or overwrite=true")
     foreign = kind.foreign(names)
     if names and (foreign or kind.mark not in names):
-        what = f"no part of a {kind.name}" if foreign else f"not a {kind.name} folder"
+        what = f"no part of {kind.name}" if foreign else f"not {kind.name} folder"
         found = f"holds {', '.join(foreign[:3])}, {what}" if foreign else f"not empty and {what}"
-        raise ConfigError(output, "output", found, f"a new folder, or a {kind.name} to overwrite")
+        raise ConfigError(output, "output", found, f"a new folder, or {kind.name} to overwrite")
 
 
 def write_json(path: Path, document: object) -> None:

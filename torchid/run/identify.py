@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,9 +16,10 @@ from rich.progress import Progress
 from torchid.analysis.contributions import Contributions, contributions
 from torchid.config import ExperimentConfig
 from torchid.errors import NumericalWarning, SensorError
-from torchid.estimators import Estimate, violations
+from torchid.estimators import Estimate, LeastSquares, violations
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
+from torchid.problem.plan import State, state_name
 from torchid.problem.states import check_base, state_reports
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
@@ -80,13 +82,14 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
                 estimate = estimator.solve(problem)
             _check_sense(estimate, source)
         with clock("identifiability"):
+            alone = _by_state(experiment, builder, parts, source)
             adds = _contributions(experiment, builder, parts, logs["train"], problem, bars)
             del parts
         with clock("evaluate"):
             metrics = _metrics(evaluation, logs, estimate.phi, bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
         samples = sum(map(len, logs["train"]))
-        run = Identification(experiment, estimate, states, adds, metrics, broken, clock.seconds, samples)
+        run = Identification(experiment, estimate, states, alone, adds, metrics, broken, clock.seconds, samples)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], training)
     return run
@@ -105,6 +108,21 @@ def _read(experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
 def _compressed(builder: RowBuilder, train: Sequence[Samples], bars: Progress) -> list[Part]:
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
     return compress_parts(train, builder, progress=lambda n: bars.advance(streaming, n))
+
+
+def _by_state(
+    experiment: Experiment, builder: RowBuilder, parts: Sequence[Part], source: object
+) -> dict[str, Estimate]:
+    """What each contact state determines on its own, by least squares, most frequent first."""
+    settings, samples = experiment.config.estimator, Counter[State]()
+    for part in parts:
+        samples[part.state] += part.samples
+    estimator, out = LeastSquares(settings.ridge, settings.rank_tolerance), {}
+    for state, _ in samples.most_common():
+        of_state = [part for part in parts if part.state == state]
+        problem = problem_of(of_state, builder, experiment.robot, settings, source)
+        out[state_name(builder.contacts, state)] = estimator.solve(problem)
+    return out
 
 
 def _contributions(

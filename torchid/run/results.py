@@ -20,6 +20,7 @@ from torchid.report.figures import ForceSeries, contribution_figure, error_figur
 from torchid.report.identifiability_figure import identifiability_figure
 from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.report.parameters_json import parameters_document
+from torchid.report.tables import table_text, verdict_counts_table
 from torchid.report.tensorboard import RunEvents
 from torchid.report.urdf_export import identified_urdf
 from torchid.robot import Robot
@@ -40,6 +41,7 @@ class Identification:
     experiment: Experiment
     estimate: Estimate
     states: list[StateReport]
+    by_state: dict[str, Estimate]
     adds: Contributions
     metrics: dict[str, tuple[Metrics, Metrics]]
     violations: list[Violation]
@@ -88,7 +90,7 @@ def write_run(run: Identification, evaluation: Evaluation, shown: Samples, train
     }
     with new_folder(config.output, config.overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
-        write_json(folder / "parameters.json", parameters_document(robot, run.estimate))
+        write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state))
         write_json(folder / "metrics.json", metrics_document(run))
         (folder / "identified.urdf").write_bytes(identified_urdf(robot, run.phi))
         for name, figure in figures.items():
@@ -178,7 +180,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figur
                 events.eigenvalues(step, body_eigenvalues(robot, phi))
             events.solution(estimate, run.samples / run.seconds["compress"])
         events.fit(last, estimate)
-        events.identifiability(last, estimate, run.adds.known)
+        events.identifiability(last, estimate, run.adds.known, table_text(verdict_counts_table(run.by_state, estimate)))
         final = {
             f"{name}_{group}": value
             for name in reversed(SETS)  # unseen logs first: TensorBoard shows the first few

@@ -1,0 +1,90 @@
+"""What of the information in some logs hangs on each sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid.analysis.information import DEPENDENT, information_in, unit_readings
+from torchid.parameters import Array
+from torchid.problem import RowBuilder, Samples
+from torchid.problem.chunks import by_state, spread_by_state
+from torchid.problem.plan import State
+from torchid.problem.samples import measured_components
+from torchid.problem.threads import one_thread
+
+_SAMPLES = 2000  # whose rows stand for those of all
+_CHUNK = 256  # samples whose rows are computed together
+
+
+@dataclass(frozen=True)
+class SensorInformation:
+    """Information (columns, columns) of all sensors together, and what of it is lost without each.
+
+    `torques`: by place among the robot's joints; `wrenches`: by contact, with all its measured components.
+    """
+
+    total: Array
+    torques: Mapping[int, Array]
+    wrenches: Mapping[int, Array]
+
+
+@one_thread()
+@torch.no_grad()
+def sensor_information(
+    logs: Sequence[Samples], builder: RowBuilder, most: int = _SAMPLES, done: Callable[[int], None] | None = None
+) -> SensorInformation:
+    """Information of some logs in the builder's columns, and what of it hangs on each sensor.
+
+    A sensor tells of a sample what its `unit_readings` take from the whitened rows.
+
+    Args:
+        logs: bound logs.
+        builder: of their rows.
+        most: samples, about, that stand for all.
+        done: called with the number of samples worked through.
+    """
+    joints = np.flatnonzero(builder.sensors.torque).tolist()
+    components = measured_components(builder.contacts, builder.sensors)
+    contacts = np.flatnonzero(components.any(axis=1)).tolist()
+    count, base = builder.columns.count, builder.tree.base_rows
+    nv = base + len(builder.columns.joint_rows)
+    torques = torch.eye(nv, dtype=torch.float64, device=builder.device)[[base + joint for joint in joints]]
+    total = torch.zeros(1 + len(joints) + len(contacts), count, count, dtype=torch.float64, device=builder.device)
+    for samples, state, stands_for in _spread(logs, most):
+        weight = stands_for / samples.oversampling
+        rows, W = builder.rows_by_sample(samples.to(builder.device), state)
+        K = rows[..., :-1]
+        total[0] += information_in(K, weight)
+        lost = (unit_readings(torques, W) @ K).transpose(0, 1)  # (joints, B, columns)
+        total[1 : 1 + len(joints)].baddbmm_(lost.mT, lost, alpha=weight)
+        if any(state[contact] for contact in contacts):
+            J = builder.contact_jacobian(samples.to(builder.device))
+            for place, contact in enumerate(contacts, start=1 + len(joints)):
+                if state[contact]:
+                    C = J[:, contact, np.flatnonzero(components[contact]).tolist()]
+                    total[place] += information_in(_span(C, W) @ K, weight)
+        if done is not None:
+            done(len(samples))
+    found = total.cpu().numpy()
+    wrenches = dict(zip(contacts, found[1 + len(joints) :], strict=True))
+    return SensorInformation(found[0], dict(zip(joints, found[1:], strict=False)), wrenches)
+
+
+def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State, float]]:
+    """Chunks of about `most` samples, evenly spread over contact states and logs, and how many each stands for."""
+    states = {state for samples in logs for state, _ in by_state(samples)}
+    for samples, state, stands_for in spread_by_state(logs, max(most // max(len(states), 1), 1)):
+        for start in range(0, len(samples), _CHUNK):
+            yield samples[start : start + _CHUNK], state, stands_for
+
+
+def _span(C: Tensor, W: Tensor) -> Tensor:
+    """Orthonormal rows, (B, c, nv), that span those of `C W`, zeros for dependent ones."""
+    _, values, Vh = torch.linalg.svd(C @ W, full_matrices=False)
+    least = DEPENDENT * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
+    return Vh * (values > least[:, None])[..., None]
