@@ -56,7 +56,7 @@ def rms(robot: Robot, logs: list[Samples], phi: np.ndarray) -> dict[str, float]:
 def test_repeated_fits_from_wrong_urdfs_and_noisy_sensors_are_as_far_off_as_expected(
     robot: Robot, logs: list[Samples], sensors: str, ridge: float
 ) -> None:
-    problem, prior_error, draws = problem_of(robot, logs, sensors), 0.2, 200
+    problem, prior_error, draws = problem_of(robot, logs, sensors), 0.2, 120
     rng = np.random.default_rng(5)
     off = np.empty((draws, len(problem.nominal)))
     for draw in range(draws):

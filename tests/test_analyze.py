@@ -285,3 +285,27 @@ def test_a_bolted_robot_cannot_lose_its_base_and_is_told_so(
     robot = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}
     file = asked(experiment, robot=robot, analysis={"criterion": "per_sample"})
     assert "accepted: stack" in refusal(["analyze", str(file)], experiment, capsys)
+
+
+def test_a_name_that_a_joint_and_a_contact_share_is_not_guessed_at(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    urdf = experiment / "clash.urdf"
+    urdf.write_text((experiment / "quadruped.urdf").read_text().replace("front_left_foot", "front_left_knee"))
+    contacts = [{"frame": "front_left_knee", "type": "point"}]
+    file = asked(experiment, robot={"urdf": str(urdf)}, contacts=contacts, analysis={"keep": ["front_left_knee"]})
+    assert "analysis.keep" in refusal(["analyze", str(file)], experiment, capsys)
+    urdf.unlink()
+
+
+def test_what_is_planned_for_flight_is_not_compared_on_logs_of_a_robot_that_stands(experiment: Path) -> None:
+    file = asked(
+        experiment,
+        logs={"train": ["sway_train.npz"], "test": ["sway_test.npz"]},
+        analysis={"scenarios": {"air": [[]]}, "compare": {"full": "full"}},
+        output=str(experiment / "air"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    answers = json.loads((experiment / "air.analysis" / "analysis.json").read_text())
+    assert list(answers["accuracy"]) == ["full"]
+    assert answers["scenarios"]["air"]["sensors"] == []

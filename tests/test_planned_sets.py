@@ -46,7 +46,7 @@ def sets(name: str, per: str) -> list[tuple[Candidate, ...]]:
     """The recommended set, and unions of minimal sets of the parts: the least informative, and some at random."""
     found, rng = plan(name, per), np.random.default_rng(4)
     unions = [found.chosen, tuple(c for part in found.parts for c in part.ranked[-1][1])]
-    for _ in range(2):
+    for _ in range(1):
         unions.append(tuple(c for part in found.parts if part.sets for c in part.sets[rng.integers(len(part.sets))]))
     return unions
 

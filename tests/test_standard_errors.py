@@ -111,7 +111,7 @@ def test_intervals_from_noisy_joint_torques_of_a_robot_on_its_feet_hold_the_trut
 # ------------------------------------------------------------------------------------------------------ filtered noise
 
 
-CUTOFF, RATE, SECONDS, TORQUE_NOISE = 20.0, 200.0, 5.0, 2.0
+CUTOFF, RATE, SECONDS, TORQUE_NOISE = 20.0, 200.0, 3.0, 2.0
 
 
 def smooth_log(robot: Robot, oracle: Oracle, rng: np.random.Generator) -> Log:

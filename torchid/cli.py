@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from torchid.errors import BaseLostError, InputError, TorchidWarning
 
 if TYPE_CHECKING:
-    from torchid.run.analyze import Scenario
+    from torchid.run.analysis_results import Scenario
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
@@ -173,7 +173,7 @@ def _identify(options: argparse.Namespace) -> None:
     if robot.massless:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
     timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
-    print(f"time          {run.samples} samples: {timed}")
+    print(fill(f"time          {run.samples} samples: {timed}", 100, subsequent_indent=" " * 14))
     print(f"written to    {run.experiment.config.output}")
 
 

@@ -13,6 +13,7 @@ from torchid.analysis.branches import Branch, Need, branches, needs
 from torchid.analysis.candidates import Candidate, sensor_set, total_cost
 from torchid.analysis.cheapest_set import CheapestSet, cheapest_set
 from torchid.analysis.demands import demands
+from torchid.analysis.exchange import exchanged
 from torchid.analysis.minimal_sets import Component, all_minimal_sets, components
 from torchid.analysis.postures import random_postures
 from torchid.analysis.ranking import SetRanking, best_first
@@ -70,7 +71,8 @@ class PartPlan:
     """A part of the robot that can be planned on its own.
 
     `frames`: its contacts. `sets`: all its minimal sets, no sensor of which can be left out; None if there are too many
-    candidates to try all. `ranked`: the cheapest of them with their information [bits], most informative first.
+    candidates to try all. `ranked`: the cheapest of them with their information [bits], most informative first; if they
+    were not all tried, those on the way from one to a better one.
     """
 
     frames: tuple[str, ...]
@@ -131,7 +133,8 @@ def plan_sensors(question: Question, progress: Progress | None = None) -> Sensor
     parts: tuple[PartPlan, ...] = ()
     if ask.criterion == "stack":
         chosen = sparse_set(stack, ask.keep, ask.exclude, _counted(tell, "leaving sensors out", len(ask.candidates)))
-        least = CheapestSet(chosen, total_cost(chosen), 0.0, False)
+        cost, floor = total_cost(chosen), total_cost(ask.keep)
+        least = CheapestSet(chosen, cost, floor, cost <= floor)
     else:
         wanted = demands(ask.robot, ask.contacts, ask.states, ask.candidates, ask.seed)
         least = cheapest_set(wanted, ask.candidates, ask.keep, ask.exclude)
@@ -176,13 +179,18 @@ def _best_parts(
     for part in parts:
         frames = tuple(dict.fromkeys(frame for demand in part.demands for frame in demand.frames))
         ours = frozenset(part.candidates)
-        sets = all_minimal_sets(part.demands, part.candidates, ask.keep & ours, ask.exclude & ours)
+        keep, exclude = ask.keep & ours, ask.exclude & ours
+        sets = all_minimal_sets(part.demands, part.candidates, keep, exclude)
         first = tuple(c for c in part.candidates if c in chosen)
-        bound = total_cost(first) * (1.0 + _EXACT)
-        cheapest = [first] if sets is None else [s for s in sets if total_cost(s) <= bound]
         ranking = SetRanking(ask.robot, ask.contacts, logs, part.candidates, tuple(chosen - ours), ask.noise, ask.prior)
-        step = _counted(tell, f"ranking sets, {', '.join(frames)}", len(cheapest))
-        ranked = best_first(ranking, cheapest, step)
+        what = f"ranking sets, {', '.join(frames)}"
+        if sets is None:
+            tell(what, 0, 1)
+            ranked = exchanged(ranking, part, first, keep, exclude)
+        else:
+            bound = total_cost(first) * (1.0 + _EXACT)
+            cheapest = [s for s in sets if total_cost(s) <= bound]
+            ranked = best_first(ranking, cheapest, _counted(tell, what, len(cheapest)))
         chosen = (chosen - ours) | frozenset(ranked[0][1])
         out.append(PartPlan(frames, part.candidates, None if sets is None else tuple(sets), tuple(ranked)))
     return tuple(out), tuple(c for c in ask.candidates if c in chosen)

@@ -42,5 +42,5 @@ class AnalysisConfig:
     costs: dict[str, Positive] = dataclasses.field(default_factory=dict)
     criterion: Literal["per_sample", "stack"] | None = None
     compare: dict[Name, Choice] = dataclasses.field(default_factory=dict)
-    prior_error: Positive = 0.2
+    prior_error: Annotated[Positive, Field(le=100.0)] = 0.2
     seed: Seed = 0

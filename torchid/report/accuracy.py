@@ -75,13 +75,13 @@ def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
     place = np.arange(len(sets))
     for axis, (group, label) in zip(axes, GROUPS.items(), strict=True):
         measured = [None if found.measured is None else found.measured.rms[group] for found in sets.values()]
-        for name, (marker, color), heights in (
-            ("expected model error", _MODEL, [found.expected.model[group] for found in sets.values()]),
-            ("expected, with sensor noise", _EXPECTED, [found.expected.total[group] for found in sets.values()]),
-            ("measured on the test logs", _MEASURED, measured),
+        for shift, name, (marker, color), heights in (
+            (-0.15, "expected model error", _MODEL, [found.expected.model[group] for found in sets.values()]),
+            (0.0, "expected, with noise added", _EXPECTED, [found.expected.total[group] for found in sets.values()]),
+            (0.15, "measured on the test logs", _MEASURED, measured),
         ):
             known = [np.nan if height is None else height for height in heights]
-            axis.plot(place, known, marker, color=color, markersize=7, label=name)
+            axis.plot(place + shift, known, marker, color=color, markersize=7, label=name)
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
         axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchid.analysis.information import triangle
 from torchid.parameters import Array
 from torchid.problem import Samples
 from torchid.problem.chunks import spread_by_state
@@ -17,6 +18,7 @@ from torchid.problem.predict import predicted_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.threads import one_thread
 from torchid.report.metrics import GROUPS
+from torchid.report.sums import ForceSums, figure, projected
 from torchid.sensing import SensorNoise
 
 _SAMPLES = 400  # a contact state
@@ -53,17 +55,28 @@ def expected_errors(
         directions: (M, 12 L), independent errors of the parameters, as `error_directions` gives them.
         noise: of the sensors that recorded these logs, with its floors of the base rows.
     """
-    triangle = np.linalg.qr(directions @ builder.columns.from_parameters().T, mode="r")
-    columns = torch.from_numpy(triangle).to(builder.device)
-    model, sensors = _Squares(builder), _Squares(builder)
+    columns = torch.from_numpy(triangle(directions @ builder.columns.from_parameters().T)).to(builder.device)
+    base, nv = builder.tree.base_rows, builder.tree.base_rows + len(builder.columns.joint_rows)
+    model, sensors = ForceSums(nv), ForceSums(nv)
     for samples, state, weight in spread_by_state(logs, _SAMPLES):
         samples = samples.to(builder.device)
         terms = builder.terms(samples)
         predicted = torch.stack([predicted_forces(builder, terms, phi).T for phi in columns])
-        model.add(samples, state, weight, predicted, predicted)
         rows = _row_noise(builder, samples, noise)
-        sensors.add(samples, state, weight, torch.cat([rows, _wrench_noise(builder, samples, state, noise)]), rows)
-    return ExpectedErrors(model.rms(), sensors.rms())
+        through_contacts = _wrench_noise(builder, samples, state, noise)
+        for sums, errors, without_contacts in (
+            (model, predicted, predicted),
+            (sensors, torch.cat([rows, through_contacts]), rows),
+        ):
+            sums.rows.add(_together(errors), weight)
+            for inside in projected(builder, samples, state, without_contacts):
+                sums.projected.add(_together(inside).flatten()[:, None], weight)
+    return ExpectedErrors(*({group: figure(x) for group, x in sums.rms(base).items()} for sums in (model, sensors)))
+
+
+def _together(errors: Tensor) -> Tensor:
+    """Standard deviation of the sum of independent errors, (M, B, r) to (B, r)."""
+    return errors.square().sum(0).sqrt()
 
 
 def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:
@@ -81,35 +94,3 @@ def _wrench_noise(builder: RowBuilder, samples: Samples, state: State, noise: Se
             possible = list(builder.contacts[contact].components)
             std[contact, possible] = std.new_tensor(noise.wrench[possible])
     return (builder.contact_jacobian(samples) * std[..., None]).flatten(1, 2).transpose(0, 1)
-
-
-class _Squares:
-    """Weighted sums of squares of independent errors, row by row and inside the contacts' null space."""
-
-    def __init__(self, builder: RowBuilder) -> None:
-        self.builder, self.base = builder, builder.tree.base_rows
-        self.rows = np.zeros(self.base + len(builder.columns.joint_rows))
-        self.inside, self.count, self.inside_count = 0.0, 0.0, 0.0
-
-    def add(self, samples: Samples, state: State, weight: float, errors: Tensor, without_contacts: Tensor) -> None:
-        """Add errors (M, B, nv); those that are projected are without the noise of contact sensors."""
-        self.rows += weight * errors.square().sum((0, 1)).cpu().numpy()
-        self.count += weight * len(samples)
-        plan = self.builder.plan(state)
-        mixed = [*range(self.base), *(self.base + joint for joint in plan.mixed_joints)]
-        lone = [self.base + joint for joint in plan.lone_joints]
-        for index, V in self.builder.bases(samples, state):
-            inside = V.mT @ without_contacts[:, index][..., mixed, None]
-            self.inside += weight * float(inside.square().sum() + without_contacts[:, index][..., lone].square().sum())
-            self.inside_count += weight * len(V) * (V.shape[2] + len(lone))
-
-    def rms(self) -> dict[str, float | None]:
-        """By group of rows."""
-        mean = self.rows / max(self.count, 1.0)
-        force, moment = (float(np.sqrt(mean[rows].mean())) for rows in (slice(0, 3), slice(3, 6)))
-        return {
-            "joint_torque": float(np.sqrt(mean[self.base :]).mean()) if len(mean) > self.base else None,
-            "base_force": force if self.base else None,
-            "base_moment": moment if self.base else None,
-            "nullspace": float(np.sqrt(self.inside / self.inside_count)) if self.inside_count else None,
-        }

@@ -14,6 +14,7 @@ from torchid.problem.plan import State
 from torchid.problem.predict import forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.report.sums import ForceSums, figure, projected
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import named_sensors
@@ -68,57 +69,6 @@ class Metrics:
         return out
 
 
-class _Squares:
-    """Sums and sums of squares by row, over the samples where the row is known."""
-
-    def __init__(self, rows: int) -> None:
-        self.plain, self.sum, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
-
-    def add(self, x: torch.Tensor) -> None:
-        values = x.cpu().numpy()
-        known = np.isfinite(values)
-        values = np.where(known, values, 0.0)
-        self.plain += values.sum(0)
-        self.sum += np.square(values).sum(0)
-        self.count += known.sum(0)
-
-    def rms(self, rows: slice = slice(None)) -> Array:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.sqrt(self.sum[rows] / self.count[rows])
-
-    def pooled(self, rows: slice) -> float:
-        count = self.count[rows].sum()
-        return float(np.sqrt(self.sum[rows].sum() / count)) if count else np.nan
-
-    def deviation(self, rows: slice) -> float:
-        """Rms about the mean of each row, over all of them."""
-        known = self.count[rows] > 0
-        count, plain = self.count[rows][known], self.plain[rows][known]
-        if not len(count):
-            return np.nan
-        return float(np.sqrt(max((self.sum[rows][known] - plain**2 / count).sum(), 0.0) / count.sum()))
-
-    def merge(self, other: _Squares) -> None:
-        self.plain += other.plain
-        self.sum += other.sum
-        self.count += other.count
-
-
-class _Sums:
-    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space."""
-
-    def __init__(self, nv: int) -> None:
-        self.rows, self.projected = _Squares(nv), _Squares(1)
-
-    @classmethod
-    def total(cls, parts: Sequence[_Sums]) -> _Sums:
-        out = cls(len(parts[0].rows.sum))
-        for part in parts:
-            out.rows.merge(part.rows)
-            out.projected.merge(part.projected)
-        return out
-
-
 class Evaluation:
     """Evaluates several parameter vectors at once, in one pass over the logs."""
 
@@ -134,56 +84,34 @@ class Evaluation:
         builder = self.builder
         columns = torch.from_numpy(phi @ builder.columns.from_parameters().T).to(builder.device)
 
-        def fold(chunks: Iterator[tuple[Samples, State]]) -> list[_Sums]:
-            sums = [_Sums(self.robot.nv) for _ in range(len(phi) + 1)]
+        def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
+            sums = [ForceSums(self.robot.nv) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
                 found = forces(builder, samples, state, columns)
                 for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
                     total.rows.add(predicted - found.measured)
-                projected = [total.projected for total in sums]
-                self._project(samples, state, [found.torque, *(found.predicted - found.torque)], projected)
+                vectors = torch.cat([found.torque[None], found.predicted - found.torque])
+                for group in projected(builder, samples, state, vectors):
+                    for total, inside in zip(sums, group, strict=True):
+                        total.projected.add(inside.flatten()[:, None])
             return sums
 
         parts = over_chunks(logs, builder, fold, progress=progress)
-        measured, *errors = [_Sums.total(same) for same in zip(*parts, strict=True)]
+        measured, *errors = [ForceSums.total(same) for same in zip(*parts, strict=True)]
         return [self._summary(error, measured) for error in errors]
 
-    def _project(
-        self, samples: Samples, state: State, vectors: Sequence[torch.Tensor], sums: Sequence[_Squares]
-    ) -> None:
-        """Add V_x^T of each (B, nv), V_x the contacts' null space; joints away from contacts pass unchanged."""
-        plan, base = self.builder.plan(state), self.robot.base_rows
-        mixed = [*range(base), *(base + joint for joint in plan.mixed_joints)]
-        lone = [base + joint for joint in plan.lone_joints]
-        for index, V in self.builder.bases(samples, state):
-            for vector, squares in zip(vectors, sums, strict=True):
-                inside = (V.mT @ vector[index][:, mixed, None])[..., 0]
-                squares.add(torch.cat([inside, vector[index][:, lone]], dim=1).flatten()[:, None])
-
-    def _summary(self, errors: _Sums, measured: _Sums) -> Metrics:
+    def _summary(self, errors: ForceSums, measured: ForceSums) -> Metrics:
         base = self.robot.base_rows
-        rms: dict[str, float] = {}
-        size: dict[str, float] = {}
-        for sums, out in ((errors, rms), (measured, size)):
-            squares, inside = sums.rows, sums.projected
-            joints = squares.rms(slice(base, None))
-            out["joint_torque"] = float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan
-            out["base_force"] = squares.pooled(slice(0, 3)) if base else np.nan
-            out["base_moment"] = squares.pooled(slice(3, 6)) if base else np.nan
-            out["nullspace"] = inside.pooled(slice(None))
+        rms, size = errors.rms(base), measured.rms(base)
         by_joint, joint_size = errors.rows.rms(slice(base, None)), measured.rows.rms(slice(base, None))
         names = self.robot.joint_names
         return Metrics(
-            {group: _figure(rms[group]) for group in GROUPS},
+            {group: figure(rms[group]) for group in GROUPS},
             {group: _ratio(rms[group], size[group]) for group in GROUPS},
-            {name: _figure(x) for name, x in zip(names, by_joint, strict=True)},
+            {name: figure(x) for name, x in zip(names, by_joint, strict=True)},
             {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
             _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
         )
-
-
-def _figure(x: float) -> float | None:
-    return float(x) if np.isfinite(x) else None
 
 
 def _ratio(x: float, y: float) -> float | None:

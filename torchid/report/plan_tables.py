@@ -107,7 +107,8 @@ def _count(sensors: int) -> str:
 def removal_table(plan: SensorPlan) -> Table:
     """What is left without one sensor, by the criterion of each sample and by the stack of all."""
     title = (
-        f"Without one sensor (inertial combinations: {plan.stack_rank} with all, {plan.stack_full} with all candidates)"
+        f"Without one sensor (inertial combinations: {plan.stack_rank} with this set, "
+        f"{plan.stack_full} with every candidate)"
     )
     table = _table(title, "without", "rank(S_b V_x) of each sample", "combinations, all samples together")
     for removal in plan.removals:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from rich.progress import Progress
 
 from torchid.analysis.accuracy import error_directions
 from torchid.errors import LogError, TorchidWarning
-from torchid.estimators import LeastSquares
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.samples import check_forces, measured_components
 from torchid.problem.streaming import compress_parts
@@ -61,9 +61,9 @@ def _accuracy(
     settings, robot = scene.config.estimator, scene.robot
     builder = RowBuilder(robot, scene.contacts, sensors).to(scene.config.device)
     problem = problem_of(compress_parts(train, builder), builder, robot, settings, source)
-    plain = LeastSquares(settings.ridge, settings.rank_tolerance)
-    consistent = settings.name == "consistent"
-    estimator = batch_estimator(settings, stated_conditions(settings, robot, source)) if consistent else plain
+    if settings.name == "sgd":
+        settings = replace(settings, name="least_squares")
+    estimator = batch_estimator(settings, stated_conditions(settings, robot, source))
     estimate = estimator.solve(problem)
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling

@@ -1,0 +1,54 @@
+"""Exchanging one sensor at a time climbs to the most informative of the smallest sets."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+from synthetic import SOLO12, load
+
+from torchid.analysis.candidates import Candidate, candidates, sensor_set
+from torchid.analysis.demands import demands
+from torchid.analysis.exchange import exchanged
+from torchid.analysis.minimal_sets import Component, all_minimal_sets, components
+from torchid.analysis.ranking import SetRanking, best_first
+from torchid.analysis.structure import structural_problem, structural_samples
+from torchid.sensing import Contact, SensorNoise
+
+FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
+STATES = ((True,) * 4,)
+
+
+@cache
+def leg() -> tuple[SetRanking, Component, list[tuple[float, tuple[Candidate, ...]]]]:
+    """Ranking, demands and all minimal sets, best first, of one leg of a quadruped whose other feet are measured."""
+    robot = load(SOLO12)
+    offered = candidates(robot, FEET, per="axis")
+    part = components(demands(robot, FEET, STATES, offered), offered)[0]
+    others = [c for c in offered if c.contact is not None and c not in part.candidates]
+    everything = structural_problem(robot, FEET, sensor_set(robot, FEET, offered), STATES)
+    logs = structural_samples(robot, FEET, STATES, 40)
+    prior = everything.scale * everything.free
+    ranking = SetRanking(robot, FEET, logs, part.candidates, others, SensorNoise(), prior)
+    sets = all_minimal_sets(part.demands, part.candidates)
+    assert sets is not None
+    return ranking, part, best_first(ranking, sets)
+
+
+def test_every_start_leads_to_the_best_of_all_minimal_sets() -> None:
+    ranking, part, ranked = leg()
+    assert ranked[0][0] > ranked[-1][0] + 1.0, "sets must differ for the test to mean anything"
+    for _, start in ranked:
+        climbed = exchanged(ranking, part, start, frozenset(), frozenset())
+        assert [bits for bits, _ in climbed] == sorted((bits for bits, _ in climbed), reverse=True)
+        assert {chosen for _, chosen in climbed} <= {chosen for _, chosen in ranked}
+        assert climbed[0][0] == pytest.approx(ranked[0][0], rel=1e-9)
+
+
+def test_what_is_kept_stays_and_what_is_excluded_is_not_taken() -> None:
+    ranking, part, ranked = leg()
+    worst, best = ranked[-1][1], ranked[0][1]
+    kept = frozenset(c for c in worst if c not in best)
+    assert all(kept <= set(chosen) for _, chosen in exchanged(ranking, part, worst, kept, frozenset()))
+    barred = frozenset(c for c in best if c not in worst)
+    assert all(not barred & set(chosen) for _, chosen in exchanged(ranking, part, worst, frozenset(), barred))
