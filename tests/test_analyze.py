@@ -16,11 +16,14 @@ from refusals import files_in, refusal
 import torchid
 from torchid.analysis.base_check import StateCheck, Values
 from torchid.cli import main
+from torchid.config import load_analysis
+from torchid.errors import TorchidWarning
 from torchid.report.accuracy import SetAccuracy, accuracy_figure
 from torchid.report.expected import ExpectedErrors
 from torchid.report.metrics import GROUPS
 from torchid.report.plan_tables import check_lines
 from torchid.report.tree_figure import tree_figure
+from torchid.run import analyze
 from torchid.run.experiment import Scene
 
 DEMO = Path(torchid.__file__).parent / "demo"
@@ -309,3 +312,31 @@ def test_what_is_planned_for_flight_is_not_compared_on_logs_of_a_robot_that_stan
     answers = json.loads((experiment / "air.analysis" / "analysis.json").read_text())
     assert list(answers["accuracy"]) == ["full"]
     assert answers["scenarios"]["air"]["sensors"] == []
+
+
+def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(experiment: Path) -> None:
+    time, rng = np.arange(200) * 0.01, np.random.default_rng(0)
+    position = np.stack([np.sin((1.0 + 0.3 * j) * time + j) for j in range(len(TORQUES))], axis=1)
+    np.savez(
+        experiment / "bolted.npz",
+        time=time,
+        joint_names=np.array(TORQUES),
+        joint_position=position,
+        joint_torque=rng.normal(size=position.shape),
+    )
+    file = asked(
+        experiment,
+        robot={"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True},
+        contacts=[],
+        logs={"train": ["bolted.npz"], "test": ["bolted.npz"]},
+        sensors="joints",
+        output=str(experiment / "bolted"),
+    )
+    with pytest.warns(TorchidWarning):  # fitted on what it is tested on, and torques that no robot needs
+        analysis = analyze(load_analysis(file), file)
+    (scenario,) = analysis.scenarios
+    assert scenario.plan.question.criterion == "stack"
+    assert scenario.plan.stack_rank == scenario.plan.stack_full == scenario.base.rank - 2 * len(TORQUES)
+    assert scenario.plan.cost < len(TORQUES)
+    assert set(analysis.accuracies) == {"proposed", "planned for logs"}
+    assert {removal.base_rank for removal in scenario.plan.removals} == {None}

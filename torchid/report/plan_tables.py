@@ -24,10 +24,11 @@ def set_text(chosen: Sequence[Candidate]) -> str:
 def branch_table(plan: SensorPlan) -> Table:
     """Branches of the robot, which contacts constrain them, and what each group of contacts needs."""
     table = _table("Branches", "branch", "contacts beyond it", "sensors needed")
+    nothing = "" if plan.question.robot.fixed_base else "none"
     for branch in plan.branches:
         needed = [f"{n.needed} for {' + '.join(n.contacts)}" for n in plan.needs if branch.name in n.branches]
         contacts = ", ".join(branch.contacts) or "free"
-        table.add_row(Text(branch.name), Text(contacts), Text("; ".join(needed) or "none"))
+        table.add_row(Text(branch.name), Text(contacts), Text("; ".join(needed) or nothing))
     for need in plan.needs:
         if not need.branches:
             table.add_row("(base)", Text(", ".join(need.contacts)), str(need.needed))

@@ -16,6 +16,7 @@ from torchid.analysis.structure import structural_problem
 from torchid.config import AnalyzeConfig
 from torchid.errors import ConfigError
 from torchid.problem import LinearProblem, Samples
+from torchid.problem.chunks import by_state
 from torchid.problem.plan import State
 from torchid.problem.samples import measured_components
 from torchid.run.accuracy import accuracies
@@ -130,7 +131,7 @@ def same_sensors(a: SensorSet, b: SensorSet, contacts: Sequence[Contact]) -> boo
 def _compared(ask: Asked, found: Sequence[Scenario], train: Sequence[Samples]) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
     scene, sets = ask.scene, dict(ask.named)
-    recorded = {tuple(state) for samples in train for state in samples.active.unique(dim=0).tolist()}
+    recorded = {state for samples in train for state, _ in by_state(samples)}
     for scenario in found:
         planned = sensor_set(scene.robot, scene.contacts, scenario.plan.chosen, scene.noise)
         if recorded & set(scenario.states) and not any(
