@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
 from synthetic import load
 
 from torchid.robot import Robot
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a run started in the background inherits one that is ignored
 
 
 @pytest.fixture(scope="module")
