@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from demo import shortened_demo
 from refusals import files_in, refusal
 
 import torchid
-from torchid.analysis.base_check import StateCheck, Values
+from torchid.analysis.base_check import PostureSummary, StateCheck
 from torchid.cli import main
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
@@ -26,7 +26,6 @@ from torchid.report.tree_figure import tree_figure
 from torchid.run import analyze
 from torchid.run.experiment import Scene
 
-DEMO = Path(torchid.__file__).parent / "demo"
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 FEET = tuple(f"{leg}_foot" for leg in LEGS)
 TORQUES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "thigh", "knee"))
@@ -35,13 +34,7 @@ TORQUES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "thigh", "
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demo's robot and shortened logs."""
-    folder = tmp_path_factory.mktemp("analysis") / "experiment"
-    shutil.copytree(DEMO, folder)
-    for name in ("sway_train", "sway_test"):
-        with np.load(folder / f"{name}.npz") as log:
-            short = {key: x if key in ("joint_names", "contact_names") else x[:800] for key, x in log.items()}
-        np.savez(folder / f"{name}.npz", **short)
-    return folder
+    return shortened_demo(tmp_path_factory.mktemp("analysis") / "experiment", 800)
 
 
 def asked(folder: Path, **settings: Any) -> Path:
@@ -266,7 +259,8 @@ def test_no_two_labels_of_the_tree_lie_on_each_other(experiment: Path) -> None:
 
 def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
     def checked(low: float) -> StateCheck:
-        return StateCheck((True,), "sole", Values(6, 0.1, low, low), Values(6, 0.1, 0.1, 0.1), None, None, ())
+        random, zero = PostureSummary(6, 0.1, low, low), PostureSummary(6, 0.1, 0.1, 0.1)
+        return StateCheck((True,), "sole", random, zero, None, None, ())
 
     (line,) = check_lines([checked(1e-3), checked(1e-8)])
     assert "in 1 of 2 contact states" in line
@@ -280,6 +274,13 @@ def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
     labels = [text.get_text() for axes in figure.axes for text in axes.yaxis.get_ticklabels(which="both")]
     assert any(labels)
     assert not any("$" in label for label in labels)
+
+
+def test_a_key_of_another_estimator_is_refused_without_logs_too(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = asked(experiment, estimator={"name": "least_squares", "total_mass": 12.0})
+    assert "estimator.total_mass" in refusal(["analyze", str(file)], experiment, capsys)
 
 
 def test_a_bolted_robot_cannot_lose_its_base_and_is_told_so(

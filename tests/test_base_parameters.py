@@ -18,8 +18,8 @@ from urdfs import BASE, inertial, joint, link, write
 from torchid import parameters
 from torchid.analysis.base_parameters import BaseParameters, base_parameters
 from torchid.analysis.rank import rank_and_gap, structural_rank
+from torchid.analysis.relations import relations, unseen
 from torchid.analysis.structure import structural_problem
-from torchid.analysis.words import relations, unseen
 from torchid.errors import NumericalWarning
 from torchid.estimators import LeastSquares
 from torchid.problem.linear import LinearProblem
@@ -229,7 +229,7 @@ def test_least_squares_finds_the_same_forces_in_base_parameters(frozen: str) -> 
         free &= rng.random(free.shape) > 0.3
     nominal = problem.nominal + problem.scale * rng.normal(size=problem.scale.shape)  # friction too
     b = problem.A @ (nominal + problem.scale * rng.normal(size=nominal.shape)) + rng.normal(size=problem.b.shape)
-    problem = replace(problem, free=free.flatten(), nominal=nominal, b=b)
+    problem = replace(problem, free=free.flatten(), nominal=nominal, b=b, oversampling=1.7)
     base = base_parameters(problem)
     whole, reduced = LeastSquares().solve(problem), LeastSquares().solve(base.problem(problem))
     constant = np.where(problem.free, 0.0, nominal)
@@ -238,6 +238,8 @@ def test_least_squares_finds_the_same_forces_in_base_parameters(frozen: str) -> 
     np.testing.assert_allclose(found, forces, rtol=0, atol=1e-9 * np.abs(forces).max())
     assert reduced.rank == whole.rank == base.rank == len(base.kept)
     assert reduced.identifiable.all()
+    assert reduced.oversampling == whole.oversampling
+    assert reduced.residual_std == pytest.approx(whole.residual_std, rel=1e-9)
     assert reduced.cost == pytest.approx(whole.cost, rel=1e-9)
     lifted = base.lift(reduced.phi, nominal)
     np.testing.assert_allclose((lifted - whole.phi) / problem.scale, 0.0, atol=1e-6)  # both are the nearest

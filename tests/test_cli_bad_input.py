@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 from collections.abc import Callable
 from contextlib import suppress
@@ -11,25 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from demo import shortened_demo
 from refusals import files_in, refusal
 
-import torchid
 from torchid.cli import _interrupt_held_back, main
 
-DEMO = Path(torchid.__file__).parent / "demo"
 Edit = Callable[[Path], None]
 
 
 @pytest.fixture
 def experiment(tmp_path: Path) -> Path:
     """A copy of the demo, shortened, that would run."""
-    folder = tmp_path / "experiment"
-    shutil.copytree(DEMO, folder)
-    for name in ("sway_train", "sway_test"):
-        with np.load(folder / f"{name}.npz") as log:
-            short = {key: x if key in ("joint_names", "contact_names") else x[:300] for key, x in log.items()}
-        np.savez(folder / f"{name}.npz", **short)
-    return folder
+    return shortened_demo(tmp_path / "experiment", 300)
 
 
 def edit_log(**changes: object) -> Edit:

@@ -20,7 +20,7 @@ from torchid.analysis.demands import demands
 from torchid.analysis.least_cost import least_cost
 from torchid.analysis.minimal_sets import all_minimal_sets, components
 from torchid.analysis.postures import random_postures
-from torchid.analysis.screws import simplest_basis, words
+from torchid.analysis.screws import simplest_basis, wrench_words
 from torchid.errors import SensorError, UnknownNameError
 from torchid.parameters import Array
 from torchid.problem.plan import State
@@ -305,7 +305,7 @@ def test_flight_sees_the_whole_base_without_a_sensor(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrench_is_put_in_words(wrench: tuple[float, ...], text: str) -> None:
-    assert words(np.array(wrench, dtype=float)) == text
+    assert wrench_words(np.array(wrench, dtype=float)) == text
 
 
 @pytest.mark.parametrize("kept", [(0, 4), (2, 3, 5), (0, 1, 2, 3, 4, 5)])

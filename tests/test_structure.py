@@ -16,9 +16,9 @@ import torchid
 from torchid import parameters
 from torchid.analysis.base_parameters import BaseParameters, base_parameters
 from torchid.analysis.rank import structural_rank
+from torchid.analysis.relations import unseen
 from torchid.analysis.standing import standing_samples, standing_states
 from torchid.analysis.structure import structural_problem, structural_samples
-from torchid.analysis.words import unseen
 from torchid.problem.plan import State
 from torchid.regressor import motion_from_state
 from torchid.robot import Robot

@@ -12,7 +12,7 @@ import torch
 from torchid.analysis.candidates import Candidate, candidates, chosen_from
 from torchid.analysis.demands import TOLERANCE, Demand, demands, orthonormal
 from torchid.analysis.postures import at_rest, random_postures
-from torchid.analysis.screws import simplest_basis, words
+from torchid.analysis.screws import simplest_basis, wrench_words
 from torchid.parameters import Array
 from torchid.problem.plan import State, state_name
 from torchid.problem.rows import RowBuilder
@@ -26,7 +26,7 @@ _CHUNK = 1024
 
 
 @dataclass(frozen=True, eq=False)
-class Values:
+class PostureSummary:
     """Smallest singular value of S_b V_x over some postures, and the best rank among them."""
 
     rank: int
@@ -35,7 +35,7 @@ class Values:
     least: float
 
     @classmethod
-    def of(cls, singular_values: torch.Tensor) -> Values:
+    def of(cls, singular_values: torch.Tensor) -> PostureSummary:
         """From singular values (B, 6); `low` is the fifth percentile."""
         smallest = singular_values[:, -1].numpy()
         low, median = np.quantile(smallest, (0.05, 0.5))
@@ -77,9 +77,9 @@ class StateCheck:
 
     state: State
     name: str
-    generic: Values
-    zero: Values
-    recorded: Values | None
+    generic: PostureSummary
+    zero: PostureSummary
+    recorded: PostureSummary | None
     lost: LostBase | None
     coincident: tuple[tuple[str, ...], ...]
 
@@ -187,9 +187,9 @@ def _check(builder: RowBuilder, state: State, drawn: Array, recorded: Array | No
     return StateCheck(
         state,
         state_name(builder.contacts, state),
-        Values.of(generic),
-        Values.of(straight),
-        None if recorded is None else Values.of(base_values(builder, state, recorded)),
+        PostureSummary.of(generic),
+        PostureSummary.of(straight),
+        None if recorded is None else PostureSummary.of(base_values(builder, state, recorded)),
         lost,
         cause.alike(),
     )
@@ -204,7 +204,7 @@ def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> L
     return LostBase(
         posture[0],
         directions,
-        tuple(words(wrench) for wrench in simplest_basis(directions)),
+        tuple(wrench_words(wrench) for wrench in simplest_basis(directions)),
         tuple((demand.frames, dimensions) for demand, dimensions in groups if dimensions),
         tuple(c for c in cause.choice if sum(cause.missing(c)) < sum(short)),
     )

@@ -6,6 +6,8 @@ base inertial parameters of robots", J. Robotic Systems 1991.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.linalg
 import torch
@@ -88,11 +90,10 @@ class BaseParameters(nn.Module):
         if not np.array_equal(problem.free, self.free):
             raise ValueError("free: found other parameters than these base parameters were made from; accepted: those")
         constant = np.where(self.free, 0.0, problem.nominal)
-        return LinearProblem(
+        return replace(
+            problem,
             A=problem.A[:, self.kept],
             b=problem.b - problem.A @ constant,
-            residual=problem.residual,
-            rows=problem.rows,
             nominal=self.of(problem.nominal),
             scale=problem.scale[self.kept],
             free=np.ones(len(self.kept), dtype=bool),

@@ -55,10 +55,7 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State])
     used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
     tree = KinematicTree(robot)
     above = {frame: tree.path(robot.link(frame)[0]) for frame in used}
-    children: list[list[int]] = [[] for _ in robot.bodies]
-    for index, body in enumerate(robot.bodies[1:], start=1):
-        children[body.parent].append(index)
-    found = []
+    children, found = robot.children, []
     for first, body in enumerate(robot.bodies[1:], start=1):
         if body.parent > 0 and len(children[body.parent]) == 1:
             continue

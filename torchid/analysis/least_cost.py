@@ -81,8 +81,8 @@ def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.n
     if g == len(rest):
         yield np.ones(rest.shape[1], dtype=bool)
         return
-    spanning = combinations(np.flatnonzero(~inside).tolist(), g)
-    while some := list(islice(spanning, _BATCH)):
+    generators = combinations(np.flatnonzero(~inside).tolist(), g)
+    while some := list(islice(generators, _BATCH)):
         picked = np.array(some, dtype=int).reshape(len(some), g)
         basis = orthonormal(rest[:, picked].transpose(1, 0, 2))  # (some, dimensions, g)
         member = (np.linalg.norm(outside(rest, basis), axis=1) <= TOLERANCE) | inside

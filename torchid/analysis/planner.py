@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import count
 
 import numpy as np
@@ -18,7 +19,6 @@ from torchid.analysis.minimal_sets import Component, all_minimal_sets, component
 from torchid.analysis.postures import random_postures
 from torchid.analysis.ranking import SetRanking, best_first
 from torchid.analysis.stack import MotionStack, sparse_set
-from torchid.analysis.structure import structural_samples
 from torchid.errors import SensorError
 from torchid.parameters import Array
 from torchid.problem.chunks import spread_by_state
@@ -64,6 +64,11 @@ class Question:
     logs: tuple[Samples, ...] = ()
     criterion: str = "per_sample"
     seed: int = 0
+
+    @cached_property
+    def stack(self) -> MotionStack:
+        """Random motion in the scenario's states, drawn once."""
+        return MotionStack(self.robot, self.contacts, self.states, self.candidates, self.seed)
 
 
 @dataclass(frozen=True)
@@ -129,7 +134,7 @@ def plan_sensors(question: Question, progress: Progress | None = None) -> Sensor
         raise SensorError("sensors", "criterion", f"'{ask.criterion}'", ", ".join(CRITERIA))
     if ask.criterion == "per_sample" and ask.robot.fixed_base:
         raise SensorError("sensors", "criterion", "per_sample, with a bolted base, which cannot be lost", "stack")
-    stack = MotionStack(ask.robot, ask.contacts, ask.states, ask.candidates, ask.seed)
+    stack = ask.stack
     parts: tuple[PartPlan, ...] = ()
     if ask.criterion == "stack":
         chosen = sparse_set(stack, ask.keep, ask.exclude, _counted(tell, "leaving sensors out", len(ask.candidates)))
@@ -152,7 +157,7 @@ def plan_sensors(question: Question, progress: Progress | None = None) -> Sensor
         checks=tuple(check(ask, sensors)),
         stack_rank=stack.rank(chosen),
         stack_full=stack.full,
-        removals=tuple(_removals(ask, stack, chosen, tell)),
+        removals=tuple(_removals(ask, chosen, tell)),
     )
 
 
@@ -174,7 +179,7 @@ def _best_parts(
     Parts are ranked in turn, with the best sets of those before and the first sets of those after.
     """
     chosen = frozenset(least.chosen)
-    logs = ask.logs or tuple(structural_samples(ask.robot, ask.contacts, ask.states, seed=ask.seed))
+    logs = ask.logs or ask.stack.samples
     out = []
     for part in parts:
         frames = tuple(dict.fromkeys(frame for demand in part.demands for frame in demand.frames))
@@ -196,11 +201,11 @@ def _best_parts(
     return tuple(out), tuple(c for c in ask.candidates if c in chosen)
 
 
-def _removals(ask: Question, stack: MotionStack, chosen: Sequence[Candidate], tell: Progress) -> Iterable[Removal]:
+def _removals(ask: Question, chosen: Sequence[Candidate], tell: Progress) -> Iterable[Removal]:
     step = _counted(tell, "leaving sensors out", len(chosen))
     for candidate in chosen:
         fewer = [c for c in chosen if c is not candidate]
-        yield Removal(candidate, _base_rank(ask, fewer), stack.rank(fewer))
+        yield Removal(candidate, _base_rank(ask, fewer), ask.stack.rank(fewer))
         step()
 
 

@@ -31,7 +31,7 @@ def simplest_basis(space: Array) -> list[Array]:
     return list(rows[:done])
 
 
-def words(wrench: Array) -> str:
+def wrench_words(wrench: Array) -> str:
     """A wrench (6,) at the base origin along the base frame's axes, up to scale and sign.
 
     "moment about (0.71, 0, 0.71)"; "force along (0, 0, 1)", if its line does not pass through the base origin "through

@@ -7,13 +7,13 @@ from functools import cached_property
 
 from torchid.analysis.candidates import Candidate, sensor_set
 from torchid.analysis.rank import structural_rank
-from torchid.analysis.structure import structural_samples
+from torchid.analysis.structure import structural_problem, structural_samples
 from torchid.errors import SensorError
+from torchid.problem.linear import LinearProblem
 from torchid.problem.plan import State
-from torchid.problem.rows import RowBuilder
-from torchid.problem.streaming import compress, linear_problem
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
+from torchid.sensing.sensors import SensorSet
 
 
 class MotionStack:
@@ -32,14 +32,17 @@ class MotionStack:
         seed: int = 0,
     ) -> None:
         """Draw samples of every contact state, to be used for all sets."""
-        self.robot, self.contacts, self.candidates = robot, tuple(contacts), tuple(candidates)
-        self._samples = structural_samples(robot, contacts, states, seed=seed)
+        self.robot, self.contacts, self.states = robot, tuple(contacts), tuple(states)
+        self.candidates = tuple(candidates)
+        self.samples = structural_samples(robot, contacts, states, seed=seed)
+
+    def problem(self, sensors: SensorSet, friction: bool = True) -> LinearProblem:
+        """What a sensor set sees of the samples, as `structural_problem`."""
+        return structural_problem(self.robot, self.contacts, sensors, self.states, friction, self.samples)
 
     def rank(self, chosen: Iterable[Candidate]) -> int:
         """Independent combinations of inertial parameters that a set of sensors determines."""
-        builder = RowBuilder(self.robot, self.contacts, sensor_set(self.robot, self.contacts, chosen))
-        problem = linear_problem(compress(self._samples, builder), builder, self.robot, friction=False)
-        return structural_rank(problem).rank
+        return structural_rank(self.problem(sensor_set(self.robot, self.contacts, chosen), friction=False)).rank
 
     @cached_property
     def full(self) -> int:

@@ -42,6 +42,7 @@ def structural_problem(
     sensors: SensorSet,
     states: Sequence[State],
     friction: bool = True,
+    samples: Sequence[Samples] | None = None,
 ) -> LinearProblem:
     """What a sensor set sees of the parameters if the robot may move as it likes in some contact states.
 
@@ -53,6 +54,8 @@ def structural_problem(
         sensors: which forces are measured.
         states: contact states the robot may be in.
         friction: whether friction is free.
+        samples: of these states, if they have been drawn already.
     """
     builder = RowBuilder(robot, contacts, sensors)
-    return linear_problem(compress(structural_samples(robot, contacts, states), builder), builder, robot, friction)
+    drawn = structural_samples(robot, contacts, states) if samples is None else samples
+    return linear_problem(compress(drawn, builder), builder, robot, friction)

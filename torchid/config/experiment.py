@@ -127,6 +127,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     path = Path(path)
     config = load(_EXPERIMENT, path, overrides)
     check_choice(path, "sensors", config.sensors)
+    check_keys(config.estimator, path)
     return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
 
 
@@ -135,6 +136,7 @@ def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeCon
     path = Path(path)
     config = load(_ANALYSIS, path, overrides)
     check_choice(path, "sensors", config.sensors, may_be_empty=True)
+    check_keys(config.estimator, path)
     for name, choice in config.analysis.compare.items():
         check_choice(path, f"analysis.compare.{name}", choice)
     if config.logs is None:
@@ -146,7 +148,6 @@ def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeCon
 
 def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
     """The logs with patterns resolved, after checks of what they are used for."""
-    check_keys(config.estimator, path)
     _check_held_out(path, config.estimator, logs)
     found = {key: _matching(path, f"logs.{key}", getattr(logs, key)) for key in ("train", "test", "validation")}
     for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):

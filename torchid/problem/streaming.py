@@ -108,18 +108,21 @@ def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> Triangul
     return out
 
 
+def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
+    """What can be fitted, (12 L,) bool: no inertia of massless bodies, no friction if `friction` is False."""
+    free = np.ones(robot.nominal.shape, dtype=bool)
+    free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
+    free[0 if friction else slice(None), parameters.FRICTION] = False
+    return free.flatten()
+
+
 @one_thread()
 def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
     """The problem in all 12 L parameters from the factor of the regrouped columns.
 
-    Inertia of massless bodies stays out, and friction if `friction` is False.
+    What is free is said by `free_parameters`.
     """
     R = factor.triangle().numpy()
-    free = np.ones(robot.nominal.shape, dtype=bool)
-    free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
-    free[0, parameters.FRICTION] = False
-    if not friction:
-        free[:, parameters.FRICTION] = False
     return LinearProblem(
         A=R[:-1, :-1] @ builder.columns.from_parameters(),
         b=R[:-1, -1],
@@ -127,6 +130,6 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
         rows=factor.rows,
         nominal=robot.nominal.flatten(),
         scale=parameter_scale(robot.nominal).flatten(),
-        free=free.flatten(),
+        free=free_parameters(robot, friction),
         oversampling=factor.oversampling,
     )

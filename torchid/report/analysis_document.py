@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 from textwrap import wrap
 from typing import Any
 
-from torchid.analysis.base_check import StateCheck, Values
+from torchid.analysis.base_check import PostureSummary, StateCheck
 from torchid.analysis.base_parameters import BaseParameters
 from torchid.analysis.candidates import Candidate
 from torchid.analysis.planner import SensorPlan
-from torchid.analysis.words import relations, unseen
+from torchid.analysis.relations import relations, unseen
 
 _WIDTH = 100
 
@@ -103,5 +103,5 @@ def _names(chosen: Iterable[Candidate]) -> list[str]:
     return [candidate.name for candidate in chosen]
 
 
-def _values(values: Values) -> dict[str, float | int]:
+def _values(values: PostureSummary) -> dict[str, float | int]:
     return {"rank": values.rank, "median": values.median, "low": values.low, "least": values.least}

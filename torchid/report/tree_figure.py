@@ -67,10 +67,8 @@ def tree_figure(
 def _places(robot: Robot, contacts: Sequence[Contact]) -> list[Place]:
     """Column and row of every body: leaves side by side, bodies above their contacts and their children's middle."""
     hanging = Counter(robot.link(contact.frame)[0] for contact in contacts)
-    children: dict[int, list[int]] = {body: [] for body in range(len(robot.bodies))}
-    row = [0] * len(robot.bodies)
+    children, row = robot.children, [0] * len(robot.bodies)
     for body, link in enumerate(robot.bodies[1:], start=1):
-        children[link.parent].append(body)
         row[body] = row[link.parent] + 1 + hanging[link.parent]
     column, free = [0.0] * len(robot.bodies), 0
     for body in reversed(range(len(robot.bodies))):  # children come after their parents

@@ -72,6 +72,14 @@ class Robot:
         """Names of the L bodies: the link each joint moves; the base link for the base."""
         return tuple(body.name for body in self.bodies)
 
+    @cached_property
+    def children(self) -> tuple[tuple[int, ...], ...]:
+        """Bodies that hang on each of the L bodies, depth first."""
+        return tuple(
+            tuple(child for child, body in enumerate(self.bodies) if child and body.parent == parent)
+            for parent in range(len(self.bodies))
+        )
+
     @property
     def massless(self) -> tuple[str, ...]:
         """Bodies without mass or inertia: their inertial parameters stay out of the fit."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +13,17 @@ from torchid.analysis.base_check import StateCheck
 from torchid.analysis.base_parameters import base_parameters
 from torchid.analysis.candidates import sensor_set
 from torchid.analysis.planner import Question, check, plan_sensors
-from torchid.analysis.structure import structural_problem
 from torchid.config import AnalyzeConfig
 from torchid.errors import ConfigError
-from torchid.problem import LinearProblem, Samples
+from torchid.problem import Samples
 from torchid.problem.chunks import by_state
+from torchid.problem.linear import parameter_scale
 from torchid.problem.plan import State
 from torchid.problem.samples import measured_components
+from torchid.problem.streaming import free_parameters
 from torchid.run.accuracy import accuracies
 from torchid.run.analysis_results import Analysis, Scenario, write_analysis
-from torchid.run.estimation import with_frozen
+from torchid.run.estimation import frozen_parameters
 from torchid.run.experiment import set_up_scene
 from torchid.run.folder import ANALYSIS, check_free
 from torchid.run.progress import progress_bars
@@ -78,13 +80,14 @@ def _answered(ask: Asked, name: str, states: tuple[State, ...], train: Sequence[
     """Everything that is asked of one scenario."""
     scene, settings = ask.scene, ask.scene.config.analysis
     robot, contacts = scene.robot, scene.contacts
-    everything = _at_best(ask, sensor_set(robot, contacts, ask.offered), states)
+    estimator = scene.config.estimator
+    free = free_parameters(robot, estimator.friction) & ~frozen_parameters(estimator, robot, ask.source)
     question = Question(
         robot=robot,
         contacts=contacts,
         states=states,
         candidates=ask.offered,
-        prior=everything.scale * everything.free,
+        prior=parameter_scale(robot.nominal).flatten() * free,
         keep=ask.keep,
         exclude=ask.exclude,
         noise=scene.noise,
@@ -103,16 +106,10 @@ def _answered(ask: Asked, name: str, states: tuple[State, ...], train: Sequence[
     planned, checks = sensor_set(robot, contacts, plan.chosen), None
     if ask.proposal is not None:
         checks = _checks(question, ask.proposal, planned, plan.checks)
-    base = base_parameters(_at_best(ask, planned if ask.proposal is None else ask.proposal, states))
+    at_best = question.stack.problem(planned if ask.proposal is None else ask.proposal)
+    base = base_parameters(replace(at_best, free=free))
     progress("done", 1, 1)
     return Scenario(name, states, plan, checks, base)
-
-
-def _at_best(ask: Asked, sensors: SensorSet, states: tuple[State, ...]) -> LinearProblem:
-    """What a sensor set could see of the parameters that are to be fitted."""
-    scene, settings = ask.scene, ask.scene.config.estimator
-    problem = structural_problem(scene.robot, scene.contacts, sensors, states, settings.friction)
-    return with_frozen(problem, settings, scene.robot, ask.source)
 
 
 def _checks(

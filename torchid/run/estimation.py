@@ -38,12 +38,21 @@ def with_frozen(
     Raises:
         UnknownNameError: a frozen body that the robot does not have.
     """
+    return replace(problem, free=problem.free & ~frozen_parameters(settings, robot, source))
+
+
+def frozen_parameters(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> np.ndarray:
+    """Parameters of frozen bodies, (12 L,) bool.
+
+    Raises:
+        UnknownNameError: a frozen body that the robot does not have.
+    """
     frozen = np.zeros((len(robot.bodies), PER_BODY), dtype=bool)
     for name in settings.frozen:
         if name not in robot.body_names:
             raise UnknownNameError(source, "estimator.frozen", name, robot.body_names)
         frozen[robot.body_names.index(name)] = True
-    return replace(problem, free=problem.free & ~frozen.flatten())
+    return frozen.flatten()
 
 
 def stated_conditions(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> Conditions:
