@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.logs.fields import BoolArray, FloatArray, Shape
+from torchid.logs.fields import SHAPES, BoolArray, FloatArray, Shape
 
 #: How far a quaternion's norm may be from 1 before it is refused rather than renormalised.
 QUATERNION_TOLERANCE = 1e-3
@@ -86,7 +86,7 @@ def unit_quaternion(source: str, name: str, quat: FloatArray) -> FloatArray:
 
 def as_names(source: str, name: str, array: NDArray[Any]) -> tuple[str, ...]:
     """The names in a one-dimensional array of strings or UTF-8 bytes, LogError on anything else or a duplicate."""
-    check_shape(source, name, array, ("n" if name == "joint_names" else "C",), {})
+    check_shape(source, name, array, SHAPES[name] or (1,), {})
     if array.size and array.dtype.kind not in "US":
         raise LogError(source, name, f"values of type {array.dtype}", "strings")
     try:
@@ -100,6 +100,13 @@ def as_names(source: str, name: str, array: NDArray[Any]) -> tuple[str, ...]:
             raise LogError(source, name, found, "names that are all different")
         seen.add(item)
     return names
+
+
+def as_frame(source: str, name: str, array: NDArray[Any]) -> str:
+    """The one name in an array of strings or UTF-8 bytes of any shape, LogError on anything else."""
+    if array.size != 1:
+        raise LogError(source, name, f"{array.size} values", "one name")
+    return as_names(source, name, array.reshape(1))[0]
 
 
 def as_flags(source: str, name: str, array: NDArray[Any], labels: tuple[str, ...]) -> BoolArray:

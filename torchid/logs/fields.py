@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Shape = tuple[str | int, ...]
 
-#: Shape of every field that a `Log` holds, in the letters N samples, n joints, C contacts.
+#: Shape of every field that a `Log` holds, in the letters N samples, n joints, C contacts, F force/torque sensors.
 SHAPES: dict[str, Shape] = {
     "time": ("N",),
     "joint_names": ("n",),
@@ -27,6 +29,12 @@ SHAPES: dict[str, Shape] = {
     "contact_active": ("N", "C"),
     "contact_wrench_local": ("N", "C", 6),
     "contact_wrench_world": ("N", "C", 6),
+    "ft_names": ("F",),
+    "ft_wrench": ("N", "F", 6),
+    "imu_frame": (),
+    "imu_specific_force": ("N", 3),
+    "imu_angular_velocity": ("N", 3),
+    "imu_angular_acceleration": ("N", 3),
 }
 
 #: Fields a file may hold in place of a `Log`'s own: another quaternion order or another frame.
@@ -39,17 +47,25 @@ VARIANTS: dict[str, str] = {
 }
 
 REQUIRED = ("time", "joint_names", "joint_position")
-NAMES = ("joint_names", "contact_names")
+
+#: Fields that name columns, and the letter of their number.
+NAMES = {"joint_names": "n", "contact_names": "C", "ft_names": "F"}
 WRENCHES = ("contact_wrench_local", "contact_wrench_world")
 
 #: NaN marks "not measured here" in these fields and is an error in all others.
-NAN_ALLOWED = ("joint_torque", *WRENCHES)
+NAN_ALLOWED = ("joint_torque", *WRENCHES, "ft_wrench")
+
+IMU = ("imu_frame", "imu_specific_force", "imu_angular_velocity")
+
+#: Fields that mean nothing without others.
+NEEDED: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("contact_active", *WRENCHES), ("contact_names", "contact_active")),
+    "ft_wrench": ("ft_names",),
+    **dict.fromkeys((*IMU, "imu_angular_acceleration"), IMU),
+}
 
 #: Pairs that say the same thing twice: a file gives at most one of each.
 EXCLUSIVE = (*VARIANTS.items(), WRENCHES)
-
-#: Names of the format that are not read yet.
-UNSUPPORTED = ("imu_specific_force", "imu_angular_velocity", "imu_frame", "ft_names", "ft_wrench")
 
 
 def is_quaternion(name: str) -> bool:
@@ -57,8 +73,12 @@ def is_quaternion(name: str) -> bool:
     return name.startswith("base_quat")
 
 
-def labels_of(name: str, joint_names: tuple[str, ...], contact_names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names of the columns of the field `name`, or nothing where they are plain components."""
-    if name.startswith("joint_"):
-        return joint_names
-    return contact_names if name.startswith("contact_") else ()
+def labels_of(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """The names of the columns of the field `name`, or nothing where they are plain components.
+
+    Args:
+        name: the field.
+        names: by `NAMES`.
+    """
+    of = f"{name.partition('_')[0]}_names"
+    return names[of] if of in NAMES else ()

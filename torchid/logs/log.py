@@ -16,7 +16,7 @@ from torchid.logs.fields import NAMES, SHAPES, WRENCHES, BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A recording of N samples of n joints and C contacts; None marks a quantity that was not recorded.
+    """A recording of N samples of n joints, C contacts and F force/torque sensors; None marks what was not recorded.
 
     Shapes and types are checked on construction, values are not (`read_log` does).
 
@@ -39,6 +39,15 @@ class Log:
         contact_wrench_local: (N, C, 6) [N, N m] on the robot at the contact frame's origin, in that frame's axes;
             NaN where not measured.
         contact_wrench_world: as `contact_wrench_local` but in world axes; at most one of the two is given.
+        ft_names: F names of fixed joints with a force/torque sensor.
+        ft_wrench: (N, F, 6) [N, N m] that the parent side exerts on the child side, in the joint's child frame; NaN
+            where not measured.
+        imu_frame: frame of the URDF, on the base body, whose specific force and angular velocity an IMU gives.
+        imu_specific_force: (N, 3) [m/s^2], acceleration of the frame's origin minus gravity, in that frame.
+        imu_angular_velocity: (N, 3) [rad/s], in that frame.
+        imu_angular_acceleration: (N, 3) [rad/s^2], in that frame.
+        contact_share: (N, C), what the filter makes of a reading that is 1 while the contact is active and 0 else; None
+            in a log that was not filtered, where it is `contact_active`. No part of a file.
         noise_bandwidth_hz: [Hz], up to where `preprocess` has left the sensors' noise white; None if it did not filter.
             No part of a file.
 
@@ -63,12 +72,19 @@ class Log:
     contact_active: BoolArray | None = None
     contact_wrench_local: FloatArray | None = None
     contact_wrench_world: FloatArray | None = None
+    ft_names: tuple[str, ...] = ()
+    ft_wrench: FloatArray | None = None
+    imu_frame: str = ""
+    imu_specific_force: FloatArray | None = None
+    imu_angular_velocity: FloatArray | None = None
+    imu_angular_acceleration: FloatArray | None = None
+    contact_share: FloatArray | None = None
     noise_bandwidth_hz: float | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and types."""
         check_shape(self.source, "time", self.time, SHAPES["time"], {})
-        sizes = {"N": len(self.time), "n": len(self.joint_names), "C": len(self.contact_names)}
+        sizes = {"N": len(self.time)} | {NAMES[name]: len(labels) for name, labels in self.names.items()}
         for name, array in self.arrays().items():
             check_shape(self.source, name, array, SHAPES[name], sizes)
             wanted = np.dtype(np.bool_ if name == "contact_active" else np.float64)
@@ -81,12 +97,19 @@ class Log:
         """Number of samples N."""
         return len(self.time)
 
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Names of joints, contacts and force/torque sensors, by field."""
+        return {name: getattr(self, name) for name in NAMES}
+
     def arrays(self) -> dict[str, FloatArray | BoolArray]:
-        """Every array that is present and has the sample axis first, by field name."""
-        present = {name: getattr(self, name) for name in SHAPES if name not in NAMES}
+        """Every array of the file format that is present and has the sample axis first, by field name."""
+        present = {name: getattr(self, name) for name, shape in SHAPES.items() if shape[:1] == ("N",)}
         return {name: array for name, array in present.items() if array is not None}
 
     def select(self, index: slice | NDArray[np.intp] | BoolArray) -> Log:
         """The log of the chosen samples: a slice (no data is copied), sample numbers (M,) or a mask (N,)."""
         chosen: dict[str, Any] = {name: array[index] for name, array in self.arrays().items()}
+        if self.contact_share is not None:
+            chosen["contact_share"] = self.contact_share[index]
         return dataclasses.replace(self, **chosen)

@@ -24,7 +24,7 @@ def carry_measured(log: Log, name: str, timeline: Timeline) -> FloatArray:
     names it.
     """
     values: FloatArray = getattr(log, name)
-    labels = labels_of(name, log.joint_names, log.contact_names)
+    labels = labels_of(name, log.names)
     check_finite(log.source, name, values, allow_nan=True, labels=labels)
     if timeline.low_pass is None and timeline.output is None:
         return values[timeline.kept]

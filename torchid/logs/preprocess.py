@@ -21,6 +21,8 @@ CHAINS = (
     ("joint_position", "joint_velocity", "joint_acceleration"),
     ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world"),
     ("base_angular_velocity_base", "base_angular_acceleration_base"),
+    ("imu_specific_force",),
+    ("imu_angular_velocity", "imu_angular_acceleration"),
 )
 ANGULAR = CHAINS[2]
 #: A filtered quaternion whose norm falls below this turns faster than the filter lets pass.
@@ -76,6 +78,9 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
             fields[name] = carry_measured(log, name, timeline)
     if log.contact_active is not None:
         fields["contact_active"] = timeline.active(log.contact_active)
+        if timeline.low_pass is not None or timeline.output is not None:
+            share = log.contact_active if log.contact_share is None else log.contact_share
+            fields["contact_share"] = timeline.evaluate(timeline.smooth(share.astype(np.float64)), (0,))[0]
     if timeline.low_pass is not None:
         half_rate = 0.5 / float(np.median(np.diff(timeline.grid)))
         passed = timeline.low_pass.noise_share * half_rate
@@ -101,7 +106,7 @@ def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, Fl
         values = getattr(log, name)
         if values is None:
             continue
-        check_finite(log.source, name, values, labels=labels_of(name, log.joint_names, log.contact_names))
+        check_finite(log.source, name, values, labels=labels_of(name, log.names))
         missing = [name]
         while i + len(missing) < len(chain) and getattr(log, chain[i + len(missing)]) is None:
             missing.append(chain[i + len(missing)])

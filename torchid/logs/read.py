@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -11,18 +10,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, TorchidWarning, UnknownNameError
-from torchid.logs.checks import as_flags, as_names, as_real, check_finite, check_shape, check_time, unit_quaternion
+from torchid.errors import LogError, UnknownNameError
+from torchid.logs.checks import (
+    as_flags,
+    as_frame,
+    as_names,
+    as_real,
+    check_finite,
+    check_shape,
+    check_time,
+    unit_quaternion,
+)
 from torchid.logs.container import open_container, translated
 from torchid.logs.fields import (
     EXCLUSIVE,
     NAMES,
     NAN_ALLOWED,
+    NEEDED,
     REQUIRED,
     SHAPES,
-    UNSUPPORTED,
     VARIANTS,
-    WRENCHES,
     FloatArray,
     is_quaternion,
     labels_of,
@@ -52,25 +59,20 @@ def read_log(path: str | os.PathLike[str]) -> Log:
         _check_combination(source, names)
         raw: dict[str, NDArray[Any]] = {}
         for name in names:
-            if name not in UNSUPPORTED:
-                with translated(source, name, "a plain array of numbers, truth values or text"):
-                    raw[name] = container.load(name)
+            with translated(source, name, "a plain array of numbers, truth values or text"):
+                raw[name] = container.load(name)
     return _canonical(source, _checked(source, raw))
 
 
 def _check_names(source: str, names: Collection[str]) -> None:
-    """Raise LogError on unknown or missing fields, warn of those not supported yet."""
+    """Raise LogError on unknown or missing fields."""
     known = (*SHAPES, *VARIANTS)
     for name in names:
-        if name not in known and name not in UNSUPPORTED:
+        if name not in known:
             raise UnknownFieldError(source, "field", name, known)
     for name in REQUIRED:
         if name not in names:
             raise LogError(source, name, "missing", f"a log with {', '.join(REQUIRED)}")
-    ignored = [name for name in UNSUPPORTED if name in names]
-    if ignored:
-        message = f"{source}: {', '.join(ignored)}: not supported yet, ignored"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
 
 
 def _check_combination(source: str, names: Collection[str]) -> None:
@@ -78,10 +80,10 @@ def _check_combination(source: str, names: Collection[str]) -> None:
     for one, other in EXCLUSIVE:
         if one in names and other in names:
             raise LogError(source, one, f"given together with {other}", "one of the two")
-    for name in ("contact_active", *WRENCHES):
-        for needed in ("contact_names", "contact_active"):
-            if name in names and needed not in names:
-                raise LogError(source, name, f"given without {needed}", f"{name} together with {needed}")
+    for name, others in NEEDED.items():
+        missing = [other for other in others if other not in names]
+        if name in names and missing:
+            raise LogError(source, name, f"given without {missing[0]}", f"{name} together with {missing[0]}")
     for name, canonical in VARIANTS.items():
         if name in names and not is_quaternion(name) and not any(map(is_quaternion, names)):
             accepted = f"with base_quat_wxyz or base_quat_xyzw, or as {canonical}"
@@ -91,17 +93,18 @@ def _check_combination(source: str, names: Collection[str]) -> None:
 def _checked(source: str, raw: dict[str, NDArray[Any]]) -> dict[str, Any]:
     """Every field of the file in its canonical type, each checked by itself and against the sizes N, n, C."""
     names = {name: as_names(source, name, raw[name]) if name in raw else () for name in NAMES}
-    joint_names, contact_names = (names[name] for name in NAMES)
     check_shape(source, "time", raw["time"], SHAPES["time"], {})
-    sizes = {"N": len(raw["time"]), "n": len(joint_names), "C": len(contact_names)}
+    sizes = {"N": len(raw["time"])} | {NAMES[name]: len(labels) for name, labels in names.items()}
     time = as_real(source, "time", raw["time"])
     check_time(source, time)
     fields: dict[str, Any] = {**names, "time": time}
+    if "imu_frame" in raw:
+        fields["imu_frame"] = as_frame(source, "imu_frame", raw["imu_frame"])
     for name, array in raw.items():
         if name in fields:
             continue
         check_shape(source, name, array, SHAPES[VARIANTS.get(name, name)], sizes)
-        labels = labels_of(name, joint_names, contact_names)
+        labels = labels_of(name, names)
         if name == "contact_active":
             fields[name] = as_flags(source, name, array, labels)
             continue

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs.container import save_arrays
-from torchid.logs.fields import NAMES
 from torchid.logs.log import Log
 
 
@@ -23,8 +22,9 @@ def write_log(log: Log, path: str | os.PathLike[str]) -> None:
         LogError: the extension is unknown or the file cannot be written.
     """
     arrays: dict[str, NDArray[Any]] = dict(log.arrays())
-    for name in NAMES:
-        names = getattr(log, name)
+    for name, names in log.names.items():
         if names or name == "joint_names":
             arrays[name] = np.array(names, dtype=np.str_)
+    if log.imu_frame:
+        arrays["imu_frame"] = np.array(log.imu_frame)
     save_arrays(Path(path), arrays)
