@@ -28,6 +28,7 @@ from torchid.errors import TorchidWarning
 from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturbed
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
+from torchid.problem.base_motion import BaseMotion
 from torchid.problem.rows import ChunkTerms
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
@@ -74,12 +75,7 @@ def random_samples(robot: Robot, contacts: int, count: int) -> Samples:
 
     active = torch.ones(count, contacts, dtype=torch.bool)
     active[2 * count // 3 :, 0] = False
-    base = {
-        "base_quat_xyzw": torch.nn.functional.normalize(normal(count, 4)),
-        "base_angular_velocity_base": normal(count, 3),
-        "base_angular_acceleration_base": normal(count, 3),
-        "base_linear_acceleration_world": normal(count, 3),
-    }
+    base = BaseMotion(torch.nn.functional.normalize(normal(count, 4)), *(normal(count, 3) for _ in range(3)))
     position, velocity, acceleration, torque = (normal(count, robot.n) for _ in range(4))
     time_stamps = torch.arange(count, dtype=torch.float64)
     return Samples("random", time_stamps, position, velocity, acceleration, base, torque, None, False, active)
@@ -104,14 +100,12 @@ class PerSample:
         """Pinocchio's q, v, a and the torques in its order."""
         count, model = len(samples), self.model
         q, v, a, f = (np.zeros((count, size)) for size in (model.nq, model.nv, model.nv, model.nv))
-        q[:, 3:7] = samples.base["base_quat_xyzw"]
+        base_q, base_v, base_a = (x.numpy() for x in samples.coordinates())
+        q[:, 3:7] = base_q[:, 3:7]
         q[:, self.q_place] = samples.joint_position
-        v[:, 3:6] = samples.base["base_angular_velocity_base"]
+        v[:, :6] = base_v[:, :6]
         v[:, self.v_place] = samples.joint_velocity
-        rotation = samples.rotation_world_base
-        assert rotation is not None
-        a[:, :3] = (rotation.mT @ samples.base["base_linear_acceleration_world"][..., None])[..., 0]
-        a[:, 3:6] = samples.base["base_angular_acceleration_base"]
+        a[:, :6] = base_a[:, :6]
         a[:, self.v_place] = samples.joint_acceleration
         f[:, self.v_place] = samples.torque
         return q, v, a, f

@@ -15,6 +15,7 @@ from synthetic import DRONE, G1, PANDA, ROBOTS, Array, load, random_states
 from torch import Tensor
 
 from torchid.problem import Batch, MiniBatches, RowBuilder, Samples, compress, linear_problem
+from torchid.problem.base_motion import BaseMotion
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors
@@ -42,14 +43,6 @@ def recorded(robot: Robot, contacts: Sequence[Contact], count: int, seed: int, w
     """Unrelated random motion and forces in three contact states: rows do not mind whether the dynamics close."""
     rng = np.random.default_rng(seed)
     q, v, a = map(torch.from_numpy, random_states(rng, robot.n, count, robot.fixed_base))
-    base = {}
-    if not robot.fixed_base:
-        base = {
-            "base_quat_xyzw": q[:, 3:7],
-            "base_linear_acceleration_world": torch.from_numpy(3.0 * rng.normal(size=(count, 3))),
-            "base_angular_velocity_base": v[:, 3:6],
-            "base_angular_acceleration_base": a[:, 3:6],
-        }
     torque, wrench = 20.0 * rng.normal(size=(count, robot.n)), 20.0 * rng.normal(size=(count, len(contacts), 6))
     return Samples(
         source=f"{seed}.npz",
@@ -57,7 +50,7 @@ def recorded(robot: Robot, contacts: Sequence[Contact], count: int, seed: int, w
         joint_position=q[:, q.shape[1] - robot.n :],
         joint_velocity=v[:, v.shape[1] - robot.n :],
         joint_acceleration=a[:, a.shape[1] - robot.n :],
-        base=base,
+        base=BaseMotion.of(q, v, a, robot.fixed_base),
         torque=torch.from_numpy(torque),
         wrench=torch.from_numpy(wrench),
         wrench_in_world=world,
@@ -293,8 +286,9 @@ def test_a_tilted_bolted_arm_feels_gravity_along_its_own_axes() -> None:
     w, phi = world("bolted arm in free motion", "joints"), world("bolted arm in free motion", "joints").random_phi(3)
     tilt = torch.tensor([0.3, -0.5, 0.2, 0.0], dtype=torch.float64)
     tilt[3] = (1.0 - tilt.square().sum()).sqrt()
-    log = replace(w.logs[0], base={"base_quat_xyzw": tilt.expand(len(w.logs[0]), 4)})
-    gravity = log.rotation_world_base[0].mT @ torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
+    log = replace(w.logs[0], base=BaseMotion(tilt.expand(len(w.logs[0]), 4)))
+    assert log.base.rotation is not None
+    gravity = log.base.rotation[0].mT @ torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
     regressor = Regressor(w.robot, tuple(gravity.tolist()))
     batches = MiniBatches([log], w.builder, 16)
     for batch in batches.epoch(1):

@@ -15,16 +15,12 @@ URDF = Path(torchid.__file__).parent / "demo" / "quadruped.urdf"
 FIT = """
 import json, resource, sys, torch, torchid
 from torchid.problem import Samples
+from torchid.problem.base_motion import BaseMotion
 robot, count = torchid.load_robot(sys.argv[1]), int(sys.argv[2])
 contacts = [torchid.Contact(f"{leg}_foot", "point") for leg in ("front_left", "front_right", "rear_left", "rear_right")]
 generator = torch.Generator().manual_seed(0)
 normal = lambda *shape: torch.randn(count, *shape, generator=generator, dtype=torch.float64)
-base = {
-    "base_quat_xyzw": torch.nn.functional.normalize(normal(4)),
-    "base_angular_velocity_base": normal(3),
-    "base_angular_acceleration_base": normal(3),
-    "base_linear_acceleration_world": normal(3),
-}
+base = BaseMotion(torch.nn.functional.normalize(normal(4)), normal(3), normal(3), normal(3))
 time, active = torch.arange(count, dtype=torch.float64), torch.rand(count, 4, generator=generator) < 0.9
 samples = Samples("random", time, normal(12), normal(12), normal(12), base, normal(12), None, False, active)
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

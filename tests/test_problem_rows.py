@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from synthetic import ANYMAL, DRONE, G1, PANDA, ROBOTS, SOLO12, Array, load, ran
 
 from torchid.logs import Log
 from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem.base_motion import BaseMotion
 from torchid.problem.predict import force_series
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
@@ -252,9 +254,9 @@ def test_a_tilted_bolted_arm_feels_gravity_along_its_own_axes() -> None:
     robot = load(PANDA, fixed_base=True)
     samples, state = recorded(robot, [], np.random.default_rng(3))
     tilt = Rotation.from_rotvec([0.4, -0.7, 0.2])
-    samples.base["base_quat_xyzw"] = torch.from_numpy(np.tile(tilt.as_quat(), (len(samples), 1)))
+    mounted = BaseMotion(torch.from_numpy(np.tile(tilt.as_quat(), (len(samples), 1))))
     builder = RowBuilder(robot, [], named_sensors("joints", robot.n, 0, NOISE))
-    A = linear_problem(compress([samples], builder), builder, robot).A
+    A = linear_problem(compress([replace(samples, base=mounted)], builder), builder, robot).A
     gravity = tilt.inv().apply([0.0, 0.0, -9.81])
     K = Regressor(robot, tuple(gravity.tolist()))(*map(torch.from_numpy, state)).flatten(0, 1).numpy()
     K /= NOISE.joint_torque

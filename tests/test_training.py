@@ -22,6 +22,7 @@ from torchid.errors import InputError
 from torchid.estimators import Epoch, LeastSquares, Sgd, SgdEstimate, Trainer
 from torchid.estimators.optimizers import optimizer_names
 from torchid.problem import LinearProblem, MiniBatches, RowBuilder, Samples, compress, linear_problem
+from torchid.problem.base_motion import BaseMotion
 from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.run.checkpoint import load_checkpoint, save_checkpoint
@@ -80,7 +81,7 @@ def arm_log(robot: Robot, phi: Array, seed: int, count: int, noise: float = 0.1,
     if extra is not None:
         torque = torque + extra(q, v, a)
     time_, active = torch.arange(count, dtype=torch.float64), torch.zeros(count, 0, dtype=torch.bool)
-    return Samples(f"{seed}.npz", time_, q, v, a, {}, torque, None, False, active)
+    return Samples(f"{seed}.npz", time_, q, v, a, BaseMotion(), torque, None, False, active)
 
 
 def arm_world(phi: Array | None = None, seed: int = 1, count: int = 300, extra: Any = None) -> World:

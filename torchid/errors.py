@@ -76,6 +76,10 @@ class BaseLostWarning(TorchidWarning):
     """As BaseLostError, for those who asked to go on."""
 
 
+class ConfoundedWarning(TorchidWarning):
+    """Parameters that the data cannot tell from a sensor's offset or scale."""
+
+
 class NumericalWarning(TorchidWarning):
     """A result whose accuracy is limited by the conditioning of the problem."""
 

@@ -54,7 +54,7 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State])
     """All branches with joints of their own, depth first; a finger that only mimics has none."""
     used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
     tree = KinematicTree(robot)
-    above = {frame: tree.path(robot.link(frame)[0]) for frame in used}
+    above = {frame: {tree.body_of[node] for node in tree.path(tree.frame(robot, frame)[0])} for frame in used}
     children, found = robot.children, []
     for first, body in enumerate(robot.bodies[1:], start=1):
         if body.parent > 0 and len(children[body.parent]) == 1:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchid.errors import SensorError, UnknownNameError
-from torchid.problem.samples import measured_components
+from torchid.problem.measured import measured_components
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import SensorNoise, SensorSet

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 import torch
 from torch import Tensor
 
@@ -41,9 +42,10 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
     """N, (columns, M), so that rows X in the builder's columns have the information `N^T X^T X N`.
 
     `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
-    `prior`, (12 L,), 0 where they are known.
+    `prior`, (12 L,), 0 where they are known, and extras with that of their size.
     """
-    return triangle((builder.columns.from_parameters() * prior).T).T
+    rigid = triangle((builder.columns.from_parameters() * prior).T).T
+    return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
 
 
 def triangle(X: Array) -> Array:

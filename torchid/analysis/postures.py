@@ -6,8 +6,10 @@ import numpy as np
 import torch
 
 from torchid.parameters import Array
+from torchid.problem.base_motion import BaseMotion
 from torchid.problem.plan import State
 from torchid.problem.samples import Samples
+from torchid.regressor.motion import GRAVITY_WORLD
 from torchid.robot import Robot
 
 _ANGLE, _STROKE = 1.5, 0.3  # [rad], [m] either way
@@ -22,15 +24,15 @@ def random_postures(robot: Robot, count: int, rng: np.random.Generator) -> Array
 def at_rest(joint_position: Array, state: State) -> Samples:
     """Samples of an upright robot at rest, at joint positions (N, n) [rad or m] in a contact state, without forces."""
     q = torch.from_numpy(np.ascontiguousarray(joint_position, dtype=float))
-    upright = q.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(q), 4)
-    still = torch.zeros_like(q)
+    still, base = torch.zeros_like(q), q.new_zeros(len(q), 3)
+    upright, gravity = (q.new_tensor(x).expand(len(q), -1) for x in ((0.0, 0.0, 0.0, 1.0), GRAVITY_WORLD))
     return Samples(
         source="postures",
         time=q.new_zeros(len(q)),
         joint_position=q,
         joint_velocity=still,
         joint_acceleration=still,
-        base={"base_quat_xyzw": upright},
+        base=BaseMotion(upright, -gravity, base, base),
         torque=None,
         wrench=None,
         wrench_in_world=False,

@@ -13,8 +13,8 @@ from torchid.analysis.information import DEPENDENT, information_in, unit_reading
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import by_state, spread_by_state
+from torchid.problem.measured import measured_components
 from torchid.problem.plan import State
-from torchid.problem.samples import measured_components
 from torchid.problem.threads import one_thread
 
 _SAMPLES = 2000  # whose rows stand for those of all
@@ -51,7 +51,7 @@ def sensor_information(
     joints = np.flatnonzero(builder.sensors.torque).tolist()
     components = measured_components(builder.contacts, builder.sensors)
     contacts = np.flatnonzero(components.any(axis=1)).tolist()
-    count, base = builder.columns.count, builder.tree.base_rows
+    count, base = builder.width, builder.tree.base_rows
     nv = base + len(builder.columns.joint_rows)
     torques = torch.eye(nv, dtype=torch.float64, device=builder.device)[[base + joint for joint in joints]]
     total = torch.zeros(1 + len(joints) + len(contacts), count, count, dtype=torch.float64, device=builder.device)

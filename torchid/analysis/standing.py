@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchid.analysis.postures import random_postures
+from torchid.problem.base_motion import BaseMotion
 from torchid.problem.plan import State
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
 from torchid.regressor.jacobian import FrameJacobian
 from torchid.regressor.kinematics import BodyStates, body_states, cross, joint_states
-from torchid.regressor.motion import motion_from_state, rotation_matrix
+from torchid.regressor.motion import motion_from_state
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
@@ -41,23 +42,15 @@ def standing_samples(
         rng: draws them.
     """
     q, v, a = standing_states(robot, contacts, state, count, rng)
-    rows, base = robot.base_rows, {}
-    if rows:
-        linear = a[:, :3] + torch.linalg.cross(v[:, 3:6], v[:, :3])
-        base = {
-            "base_quat_xyzw": q[:, 3:7],
-            "base_angular_velocity_base": v[:, 3:6],
-            "base_angular_acceleration_base": a[:, 3:6],
-            "base_linear_acceleration_world": (rotation_matrix(q[:, 3:7]) @ linear[..., None])[..., 0],
-        }
+    rows = robot.base_rows
     return Samples(
         source="standing samples",
         time=torch.arange(count, dtype=torch.float64),
         joint_position=q[:, q.shape[1] - robot.n :],
         joint_velocity=v[:, rows:],
         joint_acceleration=a[:, rows:],
-        base=base,
-        torque=q.new_zeros(count, robot.n),
+        base=BaseMotion.of(q, v, a, robot.fixed_base),
+        torque=q.new_zeros(count, robot.dofs),
         wrench=q.new_zeros(count, len(contacts), 6),
         wrench_in_world=False,
         active=torch.tensor(state, dtype=torch.bool).expand(count, len(contacts)),
@@ -77,7 +70,7 @@ def standing_states(
     """
     q, v, a = _drawn(robot, 2 * count, rng)
     held = [contact for contact, active in zip(contacts, state, strict=True) if active]
-    rows = [FrameJacobian(robot, contact.frame)(q)[:, list(contact.components)] for contact in held]
+    rows = [FrameJacobian(robot, contact.frame)(q)[:, list(contact.components), : robot.nv] for contact in held]
     J = torch.cat([q.new_zeros(len(q), 0, robot.nv), *rows], dim=1)
     if not held:
         return q[:count], v[:count], a[:count]
@@ -115,9 +108,8 @@ def _drift(robot: Robot, held: Sequence[Contact], q: Tensor, v: Tensor) -> Tenso
     states = body_states(tree, motion, joint_states(tree, motion))
     rows = []
     for contact in held:
-        body, T_link_frame = robot.link(contact.frame)
-        T_joint_frame = v.new_tensor(tree.T_joint_link[body] @ T_link_frame)
-        rows.append(_acceleration(states, body, T_joint_frame)[list(contact.components)])
+        node, T_joint_frame = tree.frame(robot, contact.frame)
+        rows.append(_acceleration(states, node, v.new_tensor(T_joint_frame))[list(contact.components)])
     return torch.cat(rows).T
 
 

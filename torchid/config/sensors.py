@@ -6,11 +6,12 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
 from torchid.config.types import STRICT, Positive
 from torchid.errors import ConfigError
+from torchid.problem.extras import CHANNELS
 from torchid.sensing.sensors import SensorNoise
 
 Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
@@ -18,35 +19,58 @@ Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
 
 @dataclass(config=STRICT, frozen=True)
 class NoiseConfig:
-    """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m] (None: one contact's)."""
+    """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m].
+
+    None for sensors in limbs (`ft`) and base rows: as a contact's.
+    """
 
     joint_torque: Positive = SensorNoise.joint_torque
     contact_force: Positive = SensorNoise.contact_force
     contact_moment: Positive = SensorNoise.contact_moment
     base_force: Positive | None = None
     base_moment: Positive | None = None
+    ft_force: Positive | None = None
+    ft_moment: Positive | None = None
 
 
 @dataclass(config=STRICT, frozen=True)
 class ChoiceConfig:
-    """A named set, or sensors by name; `full` is short for `{set: full}`."""
+    """A named set, or sensors by name; `full` is short for `{set: full}`.
+
+    `ft_sensors`, the fixed joints that carry a force/torque sensor, may stand beside a named set too.
+    """
 
     set: Literal["full", "contacts", "joints"] | None = None
     joint_torques: list[str] = dataclasses.field(default_factory=list)
     contact_wrenches: dict[str, list[Component]] = dataclasses.field(default_factory=dict)
-    ft_sensors: Annotated[list[str], Field(max_length=0)] = dataclasses.field(default_factory=list)
+    ft_sensors: list[str] = dataclasses.field(default_factory=list)
 
     @property
     def empty(self) -> bool:
         """Whether nothing is chosen."""
-        return self.set is None and not (self.joint_torques or any(self.contact_wrenches.values()))
+        return self.set is None and not (self.joint_torques or any(self.contact_wrenches.values()) or self.ft_sensors)
+
+
+def _every_channel(value: object) -> object:
+    """A scope for every kind of channel, where it is a name alone."""
+    return dict.fromkeys(CHANNELS, value) if isinstance(value, str) else value
+
+
+Channel = Literal["joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment"]
+Scopes = Annotated[dict[Channel, Literal["log", "all"]], BeforeValidator(_every_channel)]
 
 
 @dataclass(config=STRICT, frozen=True)
 class SensorsConfig(ChoiceConfig):
-    """The sensors of a run, their noise, and what to do where they lose the base."""
+    """The sensors of a run, their noise and calibration, and what to do where they lose the base.
+
+    `offsets` and `scales` say which channels have an unknown one, constant over a `log` or over `all`; a scope alone is
+    short for every kind of channel.
+    """
 
     noise: NoiseConfig = dataclasses.field(default_factory=NoiseConfig)
+    offsets: Scopes = dataclasses.field(default_factory=dict)
+    scales: Scopes = dataclasses.field(default_factory=dict)
     on_base_lost: Literal["error", "warn"] = "error"
 
 
@@ -68,5 +92,5 @@ def check_choice(path: Path, field: str, sensors: ChoiceConfig, may_be_empty: bo
     if sensors.set is not None and (sensors.joint_torques or sensors.contact_wrenches):
         raise ConfigError(path, field, f"set: {sensors.set} together with sensors by name", "one of the two")
     if sensors.empty and not may_be_empty:
-        accepted = "full, contacts, joints, or joint_torques and contact_wrenches by name"
+        accepted = "full, contacts, joints, or joint_torques, contact_wrenches and ft_sensors by name"
         raise ConfigError(path, field, "no sensor", accepted)

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.problem.samples import measured_components
+from torchid.problem.extras import Extra
+from torchid.problem.measured import measured_components
 from torchid.regressor.dynamics import JointRow, joint_rows
 from torchid.regressor.jacobian import wrench_map
 from torchid.regressor.reduction import reduced_layout, reduction_matrix
@@ -61,12 +62,13 @@ class Columns:
 
     def from_parameters(self) -> Array:
         """Matrix M, (count, 12 L), that takes parameters to these columns: `K = K_columns @ M`."""
-        matrix = np.zeros((self.count, self.tree.bodies, parameters.PER_BODY))
-        inertial = reduction_matrix(self.tree).reshape(self.layout.count, self.tree.bodies, -1)
+        nodes = self.tree.node_of
+        matrix = np.zeros((self.count, len(nodes), parameters.PER_BODY))
+        inertial = reduction_matrix(self.tree).reshape(self.layout.count, len(nodes), -1)
         matrix[: self.layout.count, :, parameters.INERTIAL] = inertial
-        for body in range(1, self.tree.bodies):
-            matrix[self.friction(body), body, parameters.COULOMB] = 1.0
-            matrix[self.friction(body) + 1, body, parameters.VISCOUS] = 1.0
+        for body, node in list(enumerate(nodes))[1:]:
+            matrix[self.friction(node), body, parameters.COULOMB] = 1.0
+            matrix[self.friction(node) + 1, body, parameters.VISCOUS] = 1.0
         return matrix.reshape(self.count, -1)
 
 
@@ -92,6 +94,7 @@ class StatePlan:
 
     `moved`: bodies that mixed joints move directly, ascending, with the joint's place among the mixed ones and the
     ratio of its motion. `bodies`: on whose parameters mixed rows depend, by the columns `inertial` and `friction`.
+    `extras`: columns of unknowns beside the bodies' parameters.
     `row_std`: noise of the base rows and mixed joints; `wrench_std`: of the measured components, body by body.
     """
 
@@ -104,27 +107,33 @@ class StatePlan:
     friction: tuple[int, ...]
     row_std: Tensor
     wrench_std: Tensor
+    extras: tuple[int, ...]
 
     @property
     def support(self) -> tuple[int, ...]:
         """Columns of mixed rows."""
-        return (*self.inertial, *self.friction)
+        return (*self.inertial, *self.friction, *self.extras)
 
 
 class Planner:
     """Makes the plans of one robot with its contacts and sensors."""
 
-    def __init__(self, robot: Robot, columns: Columns, contacts: Sequence[Contact], sensors: SensorSet) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        columns: Columns,
+        contacts: Sequence[Contact],
+        sensors: SensorSet,
+        extras: Sequence[Extra] = (),
+    ) -> None:
         """Look the contacts' frames up."""
+        self.extras = tuple(extras)
         self.columns = columns
         self.contacts = tuple(contacts)
         self.sensors = sensors
-        self.frames = [self._frame(robot, contact) for contact in contacts]
+        self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
-
-    def _frame(self, robot: Robot, contact: Contact) -> tuple[int, Array]:
-        body, T_link_frame = robot.link(contact.frame)
-        return body, self.columns.tree.T_joint_link[body] @ T_link_frame
+        self.dof_std = sensors.noise.dofs(robot.n, robot.dofs)
 
     def plan(self, state: State) -> StatePlan:
         """The plan of a contact state."""
@@ -151,8 +160,13 @@ class Planner:
             bodies_below,
             range(starts[bodies_below.start], starts[bodies_below.stop]),
             tuple(self.columns.friction(body) + k for body, _, _ in moved for k in (0, 1)),
-            self._tensor(np.append(noise.base[:base_rows], np.full(len(mixed), noise.joint_torque))),
+            self._tensor(np.append(noise.base[:base_rows], self.dof_std[list(mixed)])),
             self._tensor(noise.wrench[[k for body in bodies for _, k in body.components]]),
+            tuple(
+                self.columns.count + number
+                for number, extra in enumerate(self.extras)
+                if extra.dof in mixed or (extra.contact is not None and state[extra.contact[0]])
+            ),
         )
 
     def _bodies_below(self, moved: list[int]) -> range:

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem.chunks import by_state
+from torchid.problem.extra_columns import dof_column
+from torchid.problem.extras import ACTUATORS
 from torchid.problem.plan import State
 from torchid.problem.rows import ChunkTerms, RowBuilder
 from torchid.problem.samples import Samples
@@ -31,7 +33,7 @@ class Forces:
 
 
 def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Tensor:
-    """K phi, (nv, B), for parameters in the builder's columns, (columns,).
+    """K phi, (nv, B), for parameters in the builder's columns, (columns,), without extras.
 
     Bodies' wrenches, summed over subtrees, work along screw axes: the rows of K are never formed.
     """
@@ -43,9 +45,9 @@ def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Ten
     wrench = by_body @ terms.wrenches  # (6, L, B)
     below = tree.ancestors.T @ wrench
     torque = (terms.directions * below).sum(0)
-    coulomb, viscous = phi[layout.count :].unflatten(0, (-1, 2)).unbind(1)
+    coulomb, viscous = phi[layout.count : builder.columns.count].unflatten(0, (-1, 2)).unbind(1)
     velocity = terms.joints.velocity[1:]
-    torque[1:] += coulomb[:, None] * torch.sign(velocity) + viscous[:, None] * velocity
+    torque[1:] += coulomb[:, None] * tree.coulomb_sign(velocity) + viscous[:, None] * velocity
     joints = tree.joint_map.T @ torque
     return torch.cat([wrench.sum(1), joints]) if tree.base_rows else joints
 
@@ -68,17 +70,25 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: State, terms: C
 
 
 def forces(builder: RowBuilder, samples: Samples, state: State, phi: Tensor) -> Forces:
-    """Measured and predicted forces of samples that share a contact state; `phi` is (M, columns)."""
+    """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
+
+    Sensors count as calibrated: of the extras, those of actuators alone enter.
+    """
     terms = builder.terms(samples)
     base_rows = builder.tree.base_rows
     torque = torch.nn.functional.pad(builder.torque(samples), (base_rows, 0))
     measured = torque + contact_forces(builder, samples, state, terms).T
-    return Forces(measured, torque, torch.stack([predicted_forces(builder, terms, p).T for p in phi]))
+    predicted = torch.stack([predicted_forces(builder, terms, p).T for p in phi])
+    for number, extra in enumerate(builder.extras, start=builder.columns.count):
+        if extra.dof is not None and extra.what in ACTUATORS:
+            column = dof_column(extra, samples, builder.tree)
+            predicted[..., base_rows + extra.dof] += phi[:, number, None] * column
+    return Forces(measured, torque, predicted)
 
 
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
-    """Measured (N, nv) and predicted (M, N, nv) forces of a whole log in its own order, parameters (M, 12 L)."""
-    columns = torch.from_numpy(phi @ builder.columns.from_parameters().T).to(builder.device)
+    """Measured (N, nv) and predicted (M, N, nv) forces of a whole log in its own order, parameters as `columns_of`."""
+    columns = builder.columns_of(phi)
     nv = builder.tree.base_rows + len(builder.columns.joint_rows)
     measured, predicted = np.empty((len(samples), nv)), np.empty((len(phi), len(samples), nv))
     with torch.no_grad(), one_thread():

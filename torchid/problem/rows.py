@@ -10,11 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.parameters import Array
+from torchid.problem.extra_columns import dof_column, mixed_columns
+from torchid.problem.extras import ExtraTerms, extras_of
 from torchid.problem.plan import Columns, Planner, State, StatePlan
 from torchid.problem.samples import Samples
 from torchid.problem.workspace import Workspace
@@ -58,14 +61,18 @@ class ChunkTerms:
 class RowBuilder(nn.Module):
     """Rows of `W^T [K_columns | f]`: W a basis of V_x's span under which the projected sensor noise is white."""
 
-    def __init__(self, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> None:
-        """Fix robot, contacts and sensors."""
+    def __init__(
+        self, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms | None = None
+    ) -> None:
+        """Fix robot, contacts, sensors, and which unknowns there are beside the bodies' parameters."""
         super().__init__()
-        self.tree = KinematicTree(robot)
+        terms = terms or ExtraTerms()
+        self.extras = extras_of(robot, contacts, sensors, terms)
+        self.tree = KinematicTree(robot, terms.sign_width)
         self.columns = Columns(self.tree)
         self.contacts = tuple(contacts)
         self.sensors = sensors
-        self._planner = Planner(robot, self.columns, contacts, sensors)
+        self._planner = Planner(robot, self.columns, contacts, sensors, self.extras)
         self._plans: dict[State, StatePlan] = {}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
@@ -77,6 +84,17 @@ class RowBuilder(nn.Module):
     def frames(self) -> list[tuple[int, Array]]:
         """Body of each contact, and the pose (4, 4) of the contact frame in the body's joint frame."""
         return self._planner.frames
+
+    @property
+    def width(self) -> int:
+        """Number of all columns: those of the bodies' parameters, then one for each of `extras`."""
+        return self.columns.count + len(self.extras)
+
+    def columns_of(self, phi: Array) -> Tensor:
+        """Parameters (M, 12 L), or (M, 12 L + E) with values of the `extras`, in these columns: (M, width)."""
+        rigid = self.columns.from_parameters()
+        extra = phi[:, rigid.shape[1] :] if phi.shape[1] > rigid.shape[1] else np.zeros((len(phi), len(self.extras)))
+        return torch.from_numpy(np.hstack([phi[:, : rigid.shape[1]] @ rigid.T, extra])).to(self.device)
 
     @property
     def device(self) -> torch.device:
@@ -99,7 +117,7 @@ class RowBuilder(nn.Module):
         if workspace is not None:
             out = workspace.zeros("wrenches", states.position, 6, layout.count, len(samples))
         wrenches = all_wrench_columns(states, layout, out)
-        return ChunkTerms(joints, states, directions, wrenches, samples.rotation_world_base)
+        return ChunkTerms(joints, states, directions, wrenches, samples.base.rotation)
 
     def rows(
         self, samples: Samples, state: State, workspace: Workspace | None = None
@@ -122,15 +140,15 @@ class RowBuilder(nn.Module):
         """The same rows sample by sample, for samples that share a contact state.
 
         Returns:
-            (B, nv, columns + 1), `W^T [K | f]` with rows of zeros where there are fewer than nv, and W, (B, nv, nv).
+            (B, nv, width + 1), `W^T [K | f]` with rows of zeros where there are fewer than nv, and W, (B, nv, nv).
         """
         plan, terms = self.plan(state), self.terms(samples)
         base, mixed = self.tree.base_rows, self.tree.base_rows + len(plan.mixed_joints)
         nv = base + len(self.columns.joint_rows)
-        rows = samples.time.new_zeros(len(samples), nv, self.columns.count + 1)
+        rows = samples.time.new_zeros(len(samples), nv, self.width + 1)
         W = samples.time.new_zeros(len(samples), nv, nv)
         moved = self._index([*range(base), *(base + joint for joint in plan.mixed_joints)])
-        support = self._index([*plan.support, self.columns.count])
+        support = self._index([*plan.support, self.width])
         for index, basis, found in self._mixed_rows(samples, plan, terms, Workspace()):
             here = torch.arange(len(samples), device=self.device)[index][:, None, None]
             slots = torch.arange(found.shape[1], device=self.device)
@@ -138,8 +156,8 @@ class RowBuilder(nn.Module):
             W[here, moved[:, None], slots] = basis
         for slot, joint in enumerate(plan.lone_joints, start=mixed):
             columns, found = self._lone_row(joint, samples, terms)
-            rows[:, slot, self._index([*columns, self.columns.count])] = found.T
-            W[:, base + joint, slot] = 1.0 / self.sensors.noise.joint_torque
+            rows[:, slot, self._index([*columns, self.width])] = found.T
+            W[:, base + joint, slot] = 1.0 / self._planner.dof_std[joint]
         return rows, W
 
     def bases(self, samples: Samples, state: State) -> Iterator[tuple[Tensor | slice, Tensor]]:
@@ -166,23 +184,30 @@ class RowBuilder(nn.Module):
         wrench = samples.wrench[:, contact]
         if not samples.wrench_in_world:
             return wrench
+        return (self._rotation(contact, terms).mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
+
+    def _rotation(self, contact: int, terms: ChunkTerms) -> Tensor:
+        """Rotation contact frame to world, (B, 3, 3); to a bolted base whose mounting is not known."""
         body, T_joint_frame = self.frames[contact]
-        rotation = terms.states.rotation[:, :, body].permute(2, 0, 1) @ wrench.new_tensor(T_joint_frame[:3, :3])
-        if terms.rotation_world_base is not None:
-            rotation = terms.rotation_world_base @ rotation
-        return (rotation.mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
+        in_body = terms.wrenches.new_tensor(T_joint_frame[:3, :3])
+        rotation = terms.states.rotation[:, :, body].permute(2, 0, 1) @ in_body
+        return rotation if terms.rotation_world_base is None else terms.rotation_world_base @ rotation
 
     def torque(self, samples: Samples) -> Tensor:
-        """Recorded joint torques, (B, n), NaN where there are none."""
-        return torch.full_like(samples.joint_position, torch.nan) if samples.torque is None else samples.torque
+        """Recorded torques and wrenches in limbs, (B, n + 6 F), NaN where there are none."""
+        if samples.torque is None:
+            return samples.time.new_full((len(samples), len(self.columns.joint_rows)), torch.nan)
+        return samples.torque
 
     def _lone_row(self, joint: int, samples: Samples, terms: ChunkTerms) -> tuple[tuple[int, ...], Tensor]:
         row = self.columns.joint_rows[joint]
         inertial = joint_row(row, self.tree, self.columns.layout, terms.directions, terms.wrenches)
-        friction = [x for _, *pair in friction_columns(row, terms.joints) for x in pair]
-        block = torch.cat([inertial, torch.stack([*friction, self.torque(samples)[:, joint]])])
-        columns = (*range(row.start, row.end), *self.columns.friction_of(joint))
-        return columns, block / self.sensors.noise.joint_torque
+        friction = [x for _, *pair in friction_columns(row, self.tree, terms.joints) for x in pair]
+        own = {self.columns.count + number: extra for number, extra in enumerate(self.extras) if extra.dof == joint}
+        extra = [dof_column(extra, samples, self.tree) for extra in own.values()]
+        block = torch.cat([inertial, torch.stack([*friction, *extra, self.torque(samples)[:, joint]])])
+        columns = (*range(row.start, row.end), *self.columns.friction_of(joint), *own)
+        return columns, block / self._planner.dof_std[joint]
 
     def _mixed_rows(
         self, samples: Samples, plan: StatePlan, terms: ChunkTerms, workspace: Workspace
@@ -196,8 +221,20 @@ class RowBuilder(nn.Module):
         if len(plan.wrench_std):
             f = f + (measured.mT @ self._measured_wrench(samples, plan, terms)[..., None])[..., 0]
         for index, W in whitened_null_space(unmeasured, plan.row_std, measured, plan.wrench_std):
-            rows = self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, plan, terms.select(index), workspace)
+            chosen = terms.select(index)
+            rows = self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, plan, chosen, workspace)
+            if plan.extras:
+                rows[-1 - len(plan.extras) : -1] = self._mixed_extras(samples[index], plan, chosen, measured[index], W)
             yield index, W, rows
+
+    def _mixed_extras(
+        self, samples: Samples, plan: StatePlan, terms: ChunkTerms, measured: Tensor, W: Tensor
+    ) -> Tensor:
+        """Columns of the unknowns beside the bodies' parameters, (extras of the plan, r, B)."""
+        extras = [self.extras[column - self.columns.count] for column in plan.extras]
+        touching = {extra.contact[0] for extra in extras if extra.contact is not None}
+        rotations = {k: self._rotation(k, terms) for k in touching} if samples.wrench_in_world else {}
+        return torch.stack(list(mixed_columns(extras, samples, plan, self.tree, measured, W, rotations)))
 
     def _projected(self, W: Tensor, f: Tensor, plan: StatePlan, terms: ChunkTerms, workspace: Workspace) -> Tensor:
         """Rows W^T [K | f], (columns + 1, r, B), for a basis W, (base rows + mixed joints, r, B), and f, (..., B).
@@ -213,8 +250,8 @@ class RowBuilder(nn.Module):
         own = W[self._index(tree.base_rows + place for _, place, _ in plan.moved)]
         own *= own.new_tensor([ratio for _, _, ratio in plan.moved])[:, None, None]
         velocity = terms.joints.velocity[self._index(moved)][:, None]
-        friction = X[len(inertial) : -1].unflatten(0, (len(moved), 2))
-        torch.mul(own, torch.sign(velocity), out=friction[:, 0])
+        friction = X[len(inertial) : len(inertial) + 2 * len(moved)].unflatten(0, (len(moved), 2))
+        torch.mul(own, tree.coulomb_sign(velocity), out=friction[:, 0])
         torch.mul(own, velocity, out=friction[:, 1])
 
         carried = workspace.zeros("carried", W, 6, tree.bodies, *W.shape[1:])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,24 +12,15 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
+from torchid.problem.base_motion import BaseMotion, base_motion
+from torchid.problem.measured import read_components
 from torchid.regressor.motion import GRAVITY_WORLD, Motion, rotation_matrix
 from torchid.robot import Robot
-from torchid.sensing.contacts import COMPONENTS, Contact
+from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import SensorSet
+from torchid.wrenches import COMPONENTS
 
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
-_MOTION_FIELDS = (
-    "base_quat_xyzw",
-    "base_angular_velocity_base",
-    "base_angular_acceleration_base",
-    "base_linear_acceleration_world",
-)
-
-_ACCEPTED = {
-    "base_quat_xyzw": "base_quat_wxyz or base_quat_xyzw",
-    "base_linear_acceleration_world": "base_position_world, base_linear_velocity_{world,base} or "
-    "base_linear_acceleration_{world,base}",
-}
 
 
 @dataclass(frozen=True)
@@ -39,12 +31,14 @@ class Samples:
         source: the log's file, for messages and tables.
         time: (N,) [s].
         joint_position, joint_velocity, joint_acceleration: (N, n).
-        base: `base_quat_xyzw` (N, 4) and the base's twist derivatives (N, 3); empty for a bolted base without them.
-        torque: (N, n) [N m], NaN where not measured, or None.
+        base: how the base moves and, if known, stands; None for a bolted base.
+        torque: (N, n + 6 F) [N m, N, N m] by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs;
+            NaN where not measured, or None.
         wrench: (N, C, 6), NaN where not measured, or None; along world axes if `wrench_in_world`, else the frames'.
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
+        share: (N, C), what is left of a constant contact reading, as `Log.contact_share`; None where it is `active`.
     """
 
     source: str
@@ -52,88 +46,66 @@ class Samples:
     joint_position: Tensor
     joint_velocity: Tensor
     joint_acceleration: Tensor
-    base: dict[str, Tensor]
+    base: BaseMotion
     torque: Tensor | None
     wrench: Tensor | None
     wrench_in_world: bool
     active: Tensor
     oversampling: float = 1.0
+    share: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.time)
 
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Samples:
+        """The samples with every tensor changed."""
+        changed: dict[str, Any] = {name: change(x) for name, x in vars(self).items() if isinstance(x, Tensor)}
+        return replace(self, base=self.base.each(change), **changed)
+
     def __getitem__(self, index: slice | Tensor) -> Samples:
         """Some of the samples."""
-        return Samples(
-            self.source,
-            self.time[index],
-            self.joint_position[index],
-            self.joint_velocity[index],
-            self.joint_acceleration[index],
-            {name: x[index] for name, x in self.base.items()},
-            None if self.torque is None else self.torque[index],
-            None if self.wrench is None else self.wrench[index],
-            self.wrench_in_world,
-            self.active[index],
-            self.oversampling,
-        )
+        return self._each(lambda x: x[index])
 
     def to(self, device: torch.device | str) -> Samples:
         """The samples on another device."""
-
-        def move(x: Tensor | None) -> Tensor | None:
-            return None if x is None else x.to(device)
-
-        moved = {name: x.to(device) for name, x in self.base.items()}
-        position, velocity = self.joint_position.to(device), self.joint_velocity.to(device)
-        return Samples(
-            self.source,
-            self.time.to(device),
-            position,
-            velocity,
-            self.joint_acceleration.to(device),
-            moved,
-            move(self.torque),
-            move(self.wrench),
-            self.wrench_in_world,
-            self.active.to(device),
-            self.oversampling,
-        )
+        return self._each(lambda x: x.to(device))
 
     @property
     def rotation_world_base(self) -> Tensor | None:
-        """(N, 3, 3), or None for a bolted base without a recorded orientation."""
-        quat = self.base.get("base_quat_xyzw")
-        return None if quat is None else rotation_matrix(quat)
+        """(N, 3, 3), or None where nobody recorded it."""
+        return self.base.rotation
 
     def motion(self) -> Motion:
         """What the regressor needs of these samples."""
-        rotation = self.rotation_world_base
-        gravity = self.time.new_tensor(GRAVITY_WORLD)
-        still = self.time.new_zeros(len(self), 3)
-        acceleration = self.base.get("base_linear_acceleration_world", still)
-        force = acceleration - gravity
-        if rotation is not None:
-            force = (rotation.mT @ force[..., None])[..., 0]
-        omega = self.base.get("base_angular_velocity_base", still)
-        alpha = self.base.get("base_angular_acceleration_base", still)
+        base, still = self.base, self.time.new_zeros(len(self), 3)
+        force = base.specific_force
+        if force is None:  # of a bolted base
+            force = still - still.new_tensor(GRAVITY_WORLD)
+            if (rotation := base.rotation) is not None:
+                force = (rotation.mT @ force[..., None])[..., 0]
+        omega = still if base.angular_velocity is None else base.angular_velocity
+        alpha = still if base.angular_acceleration is None else base.angular_acceleration
         return Motion(self.joint_position, self.joint_velocity, self.joint_acceleration, omega, alpha, force)
 
     def coordinates(self) -> tuple[Tensor, Tensor, Tensor]:
         """Generalized coordinates q, v, a as `Regressor` takes them.
 
         Base position and base linear velocity are 0: the dynamics do not depend on them, and logs need not hold them.
+        Nor do they depend on an orientation that nobody measured beside the specific force: it is the identity then.
         A bolted base has joints only.
         """
         joints = (self.joint_position, self.joint_velocity, self.joint_acceleration)
-        rotation, still = self.rotation_world_base, self.time.new_zeros(len(self), 3)
-        if rotation is None or "base_linear_acceleration_world" not in self.base:
+        found, still = self.base, self.time.new_zeros(len(self), 3)
+        if found.specific_force is None or found.angular_velocity is None or found.angular_acceleration is None:
             return joints
-        linear = (rotation.mT @ self.base["base_linear_acceleration_world"][..., None])[..., 0]
+        quat = (
+            still.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(self), 4) if found.quat_xyzw is None else found.quat_xyzw
+        )
+        g_base = (rotation_matrix(quat).mT @ still.new_tensor(GRAVITY_WORLD)[:, None])[..., 0]
         base = (
-            torch.cat([still, self.base["base_quat_xyzw"]], dim=1),
-            torch.cat([still, self.base["base_angular_velocity_base"]], dim=1),
-            torch.cat([linear, self.base["base_angular_acceleration_base"]], dim=1),
+            torch.cat([still, quat], dim=1),
+            torch.cat([still, found.angular_velocity], dim=1),
+            torch.cat([found.specific_force + g_base, found.angular_acceleration], dim=1),
         )
         q, v, a = (torch.cat(pair, dim=1) for pair in zip(base, joints, strict=True))
         return q, v, a
@@ -154,13 +126,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
     """
     order = _joint_order(log, robot)
     position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
-    base = {name: torch.from_numpy(x) for name in _MOTION_FIELDS if (x := getattr(log, name)) is not None}
-    if not robot.fixed_base and len(base) < len(_MOTION_FIELDS):
-        missing = next(name for name in _MOTION_FIELDS if name not in base)
-        accepted = _ACCEPTED.get(missing, f"{missing}, or a log passed through preprocess()")
-        raise LogError(log.source, missing, "missing, though the base floats", accepted)
-    if robot.fixed_base:
-        base = {name: x for name, x in base.items() if name == "base_quat_xyzw"}  # how the base is mounted
+    base = base_motion(log, robot)
     chosen, active = _contacts(log, robot, contacts)
     wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
     samples = Samples(
@@ -170,11 +136,12 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
         velocity,
         acceleration,
         base,
-        None if log.joint_torque is None else torch.from_numpy(_columns(log.joint_torque, order)),
+        _torques(log, robot, order),
         None if wrench is None else torch.from_numpy(_columns(wrench, chosen)),
         log.contact_wrench_world is not None,
         torch.from_numpy(active),
         _oversampling(log),
+        None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
     )
     if required is not None:
         check_forces(samples, robot, contacts, required)
@@ -194,6 +161,20 @@ def _joints(log: Log, name: str, order: list[int]) -> Tensor:
     if values is None:
         raise LogError(log.source, name, "missing", "the field, or a log passed through preprocess()")
     return torch.from_numpy(_columns(values, order))
+
+
+def _torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
+    """Joint torques and wrenches in limbs, (N, n + 6 F); None if neither was recorded."""
+    if log.joint_torque is None and not (robot.ft_names and log.ft_wrench is not None):
+        return None
+    nothing = np.full((len(log), robot.n), np.nan)
+    parts = [nothing if log.joint_torque is None else _columns(log.joint_torque, order)]
+    for name in robot.ft_names:
+        if log.ft_wrench is None or name not in log.ft_names:
+            parts.append(np.full((len(log), 6), np.nan))
+        else:
+            parts.append(log.ft_wrench[:, log.ft_names.index(name)])
+    return torch.from_numpy(parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1))
 
 
 def _columns(x: np.ndarray, order: list[int]) -> np.ndarray:
@@ -238,15 +219,16 @@ def check_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], re
         LogError: one that is missing.
     """
     if required.torque.any():
+        torques = required.torque[: robot.n].any()
         if samples.torque is None:
-            raise LogError(samples.source, "joint_torque", "missing", "the field, or sensors without joint torques")
+            field = "joint_torque" if torques else "ft_wrench"
+            raise LogError(samples.source, field, "missing", f"the field, or sensors without {field.replace('_', ' ')}")
         bad = ~torch.isfinite(samples.torque) & torch.from_numpy(required.torque)
         if bad.any():
-            sample, joint = torch.nonzero(bad)[0].tolist()
-            found = f"not a finite number at sample {sample} ({int(bad[:, joint].sum())} in all)"
-            raise LogError(
-                samples.source, f"joint_torque '{robot.joint_names[joint]}'", found, "a value: it is a sensor"
-            )
+            sample, dof = torch.nonzero(bad)[0].tolist()
+            found = f"not a finite number at sample {sample} ({int(bad[:, dof].sum())} in all)"
+            field = "ft_wrench" if dof >= robot.n else "joint_torque"
+            raise LogError(samples.source, f"{field} '{robot.dof_names[dof]}'", found, "a value: it is a sensor")
     needed = read_components(contacts, required, samples.wrench_in_world)
     if needed.any() and samples.active.any():
         if samples.wrench is None:
@@ -258,20 +240,3 @@ def check_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], re
             raise LogError(
                 samples.source, f"contact_wrench '{contacts[contact].frame}'", found, "a value: it is a sensor"
             )
-
-
-def read_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
-    """Recorded components (C, 6) that the measured ones are computed from: along world axes, whole vectors."""
-    measured = measured_components(contacts, sensors)
-    if not in_world:
-        return measured
-    whole = measured.reshape(-1, 2, 3).any(axis=2)
-    return np.repeat(whole, 3, axis=1)
-
-
-def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
-    """Measured components (C, 6) that the contacts can exert, along the frames' axes."""
-    possible = np.zeros((len(contacts), 6), dtype=bool)
-    for index, contact in enumerate(contacts):
-        possible[index, list(contact.components)] = True
-    return possible & sensors.wrench

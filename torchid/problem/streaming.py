@@ -10,6 +10,7 @@ from itertools import chain
 import numpy as np
 
 from torchid import parameters
+from torchid.parameters import Array
 from torchid.problem.chunks import CHUNK, Progress, over_chunks
 from torchid.problem.linear import LinearProblem, parameter_scale
 from torchid.problem.plan import State
@@ -80,7 +81,7 @@ def _fold(builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: 
     for samples, state in chunks:
         key = samples.source if by_log else "", state
         if key not in parts:
-            parts[key] = Part(*key, TriangularFactor(builder.columns.count), 0)
+            parts[key] = Part(*key, TriangularFactor(builder.width), 0)
         parts[key].samples += len(samples)
         for support, rows in builder.rows(samples, state, workspace):
             parts[key].factor.add(support, rows, samples.oversampling)
@@ -102,17 +103,18 @@ def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
 @one_thread()
 def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
     """The factor of all that some factors have seen."""
-    out = TriangularFactor(builder.columns.count)
+    out = TriangularFactor(builder.width)
     for factor in factors:
         out.merge(factor)
     return out
 
 
 def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
-    """What can be fitted, (12 L,) bool: no inertia of massless bodies, no friction if `friction` is False."""
+    """What can be fitted, (12 L,) bool: no inertia of massless bodies, no friction of welds, none if not `friction`."""
     free = np.ones(robot.nominal.shape, dtype=bool)
     free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
-    free[0 if friction else slice(None), parameters.FRICTION] = False
+    still = [body.joint is None or body.joint.kind == "fixed" for body in robot.bodies]
+    free[still if friction else slice(None), parameters.FRICTION] = False
     return free.flatten()
 
 
@@ -121,15 +123,36 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     """The problem in all 12 L parameters from the factor of the regrouped columns.
 
     What is free is said by `free_parameters`.
+
+    Raises:
+        ValueError: the builder has unknowns beside these parameters, which take `assemble`.
     """
-    R = factor.triangle().numpy()
+    if builder.extras:
+        raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
+    return posed(factor.triangle().numpy(), factor.rows, factor.oversampling, builder, robot, friction)
+
+
+def posed(
+    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool = True
+) -> LinearProblem:
+    """The problem of a triangular factor in the regrouped columns, right-hand side last.
+
+    Args:
+        R: (M, columns + 1).
+        rows: that went into it.
+        oversampling: of them.
+        builder: of the rows.
+        robot: the robot.
+        friction: whether friction is free.
+    """
+    count = builder.columns.count
     return LinearProblem(
-        A=R[:-1, :-1] @ builder.columns.from_parameters(),
-        b=R[:-1, -1],
-        residual=float(R[-1, -1] ** 2),
-        rows=factor.rows,
+        A=R[:count, :-1] @ builder.columns.from_parameters(),
+        b=R[:count, -1],
+        residual=float(np.square(R[count:, -1]).sum()),
+        rows=rows,
         nominal=robot.nominal.flatten(),
         scale=parameter_scale(robot.nominal).flatten(),
         free=free_parameters(robot, friction),
-        oversampling=factor.oversampling,
+        oversampling=oversampling,
     )

@@ -78,7 +78,7 @@ def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, directio
     return total
 
 
-def friction_columns(row: JointRow, joints: JointStates) -> list[tuple[int, Tensor, Tensor]]:
+def friction_columns(row: JointRow, tree: KinematicTree, joints: JointStates) -> list[tuple[int, Tensor, Tensor]]:
     """Friction entries of one joint's row: body, column of fc, column of fv, each (B,).
 
     Friction resists: it adds `fc sign(v) + fv v` to the torque the actuator must give.
@@ -86,7 +86,7 @@ def friction_columns(row: JointRow, joints: JointStates) -> list[tuple[int, Tens
     entries = []
     for body, ratio in row.moved:
         velocity = joints.velocity[body]
-        entries.append((body, ratio * torch.sign(velocity), ratio * velocity))
+        entries.append((body, ratio * tree.coulomb_sign(velocity), ratio * velocity))
     return entries
 
 

@@ -65,17 +65,19 @@ class FrameJacobian(nn.Module):
         """
         super().__init__()
         self.tree = KinematicTree(robot)
-        self._body, T_link_frame = robot.link(frame)
-        unit_wrenches = wrench_map(self.tree.T_joint_link[self._body] @ T_link_frame).T
+        self._body, T_joint_frame = self.tree.frame(robot, frame)
+        unit_wrenches = wrench_map(T_joint_frame).T
         self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
-        self._joints = range(robot.n)
+        self._joints = range(robot.dofs)
 
     def forward(self, q: Tensor) -> Tensor:
-        """Jacobian (B, 6, nv) at coordinates `q`, (B, n + 7) or (B, n) for a fixed base (see `Regressor`)."""
+        """Jacobian (B, 6, nv) at coordinates `q`, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
+
+        Force/torque sensors in limbs add six columns each, after those of the joints.
+        """
         tree = self.tree
-        n = len(self._joints)
-        still = q.new_zeros(q.shape[0], n + tree.base_rows)
-        motion = motion_from_state(q, still, still, n, not tree.base_rows, GRAVITY_WORLD)
+        still = q.new_zeros(q.shape[0], tree.n + tree.base_rows)
+        motion = motion_from_state(q, still, still, tree.n, not tree.base_rows, GRAVITY_WORLD)
         states = body_states(tree, motion, joint_states(tree, motion))
         wrenches = wrenches_at_base(states, self._body, self.get_buffer("unit_wrenches"))
         J = generalized_forces(tree, joint_directions(tree, states), self._body, wrenches, self._joints)

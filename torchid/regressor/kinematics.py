@@ -49,8 +49,9 @@ def joint_states(tree: KinematicTree, motion: Motion) -> JointStates:
     found, own = motion.joint_position.dtype, tree.joint_map.dtype
     if found != own:
         raise TypeError(f"motion: found {found}; accepted: {own}, or the module moved with .to({found})")
-    position = tree.joint_map @ motion.joint_position.T + tree.joint_constant
-    return JointStates(position, tree.joint_map @ motion.joint_velocity.T, tree.joint_map @ motion.joint_acceleration.T)
+    moving = tree.joint_map[:, : tree.n]
+    position = moving @ motion.joint_position.T + tree.joint_constant
+    return JointStates(position, moving @ motion.joint_velocity.T, moving @ motion.joint_acceleration.T)
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
@@ -69,7 +70,7 @@ def poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation (3, 3, L, B) and position (3, L, B) of all joint frames, for joint positions (L, B)."""
     position = position.index_select(0, tree.by_depth)
     angle = position * tree.revolute.index_select(0, tree.by_depth)
-    slide = position * tree.prismatic.index_select(0, tree.by_depth) if any(tree.is_prismatic) else None
+    slide = position * tree.prismatic.index_select(0, tree.by_depth) if any(tree.slides) else None
     cosine, sine = torch.cos(angle), torch.sin(angle)
     identity = torch.eye(3, 4, dtype=position.dtype, device=position.device)[..., None, None]
     above = identity.expand(3, 4, 1, position.shape[-1])
@@ -108,7 +109,7 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointStates) -> Bod
     alpha = motion.base_angular_acceleration.T[:, None] + tree.ancestors @ own
     step = position - of_parent(position)
     carried = cross(of_parent(alpha), step) + cross(parent_omega, cross(parent_omega, step))
-    if any(tree.is_prismatic):
+    if any(tree.slides):
         slide = axis * tree.prismatic
         carried = carried + slide * joints.acceleration + 2.0 * cross(parent_omega, slide * joints.velocity)
     force = motion.base_specific_force.T[:, None] + tree.ancestors @ carried

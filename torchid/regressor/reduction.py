@@ -56,13 +56,18 @@ def full_layout(tree: KinematicTree) -> ColumnLayout:
 
 def reduced_layout(tree: KinematicTree) -> ColumnLayout:
     """The columns that are left after regrouping; a fixed base has none."""
-    base = ALL_INERTIAL if tree.base_rows else ()
-    joints = (_PRISMATIC_KEPT if slides else _REVOLUTE_KEPT for slides in tree.is_prismatic[1:])
-    return ColumnLayout((base, *joints))
+    kept = {
+        "base": ALL_INERTIAL if tree.base_rows else (),
+        "revolute": _REVOLUTE_KEPT,
+        "prismatic": _PRISMATIC_KEPT,
+        "welded": ALL_INERTIAL,  # the sensor sees what no joint does
+        "massless": (),
+    }
+    return ColumnLayout(tuple(kept[kind] for kind in tree.kinds))
 
 
 def reduction_matrix(tree: KinematicTree) -> Array:
-    """B, (columns of `reduced_layout`, 10 L), with `K = K_reduced @ B` for the inertial columns of K."""
+    """B, (columns of `reduced_layout`, 10 L) for L bodies, with `K = K_reduced @ B` for the inertial columns of K."""
     layout, width = reduced_layout(tree), parameters.INERTIAL.stop
     effective = np.zeros((tree.bodies, width, width * tree.bodies))
     for body in range(tree.bodies):
@@ -74,11 +79,12 @@ def reduction_matrix(tree: KinematicTree) -> Array:
         for column in layout.kept[body]:
             kept[column, column] = 1.0
         gone -= kept
-        if body > 0 and not tree.is_prismatic[body]:
+        if tree.kinds[body] == "revolute":
             kept[_IXX, _IYY] = -1.0
             gone[_IXX, _IYY] = 1.0
         rows[layout.starts[body] : layout.starts[body + 1]] = (kept @ effective[body])[list(layout.kept[body])]
         if body > 0:
             X = parameters.change_of_frame(tree.T_parent_joint[body])
             effective[tree.parents[body]] += X @ gone @ effective[body]
-    return rows
+    own_columns = rows.reshape(layout.count, tree.bodies, width)[:, tree.node_of]
+    return np.asarray(own_columns.reshape(layout.count, -1))

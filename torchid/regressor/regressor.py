@@ -18,19 +18,22 @@ class Regressor(nn.Module):
 
     Differentiable; `.to(device, dtype)` moves it. Columns: 12 per body, bodies in `robot.body_names`' order,
     parameters in `torchid.parameters`' order. Rows: base force, base moment (base frame, about the base origin), then
-    joints by `robot.joint_names`; a fixed base has joint rows only.
+    `robot.dof_names`: joints, and the wrenches of force/torque sensors in limbs; a fixed base has no base rows.
     """
 
-    def __init__(self, robot: Robot, gravity: tuple[float, float, float] = GRAVITY_WORLD) -> None:
+    def __init__(
+        self, robot: Robot, gravity: tuple[float, float, float] = GRAVITY_WORLD, sign_width: float | None = None
+    ) -> None:
         """Build the constants.
 
         Args:
             robot: the robot.
             gravity: (3,), in the world (in the base frame if the base is fixed) [m/s^2].
+            sign_width: Coulomb friction goes with tanh(velocity / width) instead of the sign [rad/s or m/s].
         """
         super().__init__()
         self.gravity = gravity
-        self.tree = KinematicTree(robot)
+        self.tree = KinematicTree(robot, sign_width)
         self._layout = full_layout(self.tree)
         self._rows = joint_rows(self.tree, self._layout)
 
@@ -43,12 +46,13 @@ class Regressor(nn.Module):
             a: (B, nv), d/dt of `v`.
 
         Returns:
-            (B, nv, 12 L), a strided view of a batch-last tensor: call `.contiguous()` where layout matters.
+            (B, nv + 6 F, 12 L) for F force/torque sensors in limbs, a strided view of a batch-last tensor: call
+            `.contiguous()` where layout matters.
 
         Raises:
             ValueError: the shapes do not belong together.
         """
-        return self.from_motion(motion_from_state(q, v, a, len(self._rows), not self.tree.base_rows, self.gravity))
+        return self.from_motion(motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity))
 
     def from_motion(self, motion: Motion) -> Tensor:
         """As `forward`, from a `Motion` (which knows no base position, heading or linear velocity)."""
@@ -65,7 +69,9 @@ class Regressor(nn.Module):
         for index, row in enumerate(self._rows, start=tree.base_rows):
             part = joint_row(row, tree, layout, directions, wrenches)
             inertial[index, row.start // width : row.end // width] = part.unflatten(0, (-1, width))
-            for body, coulomb, viscous in friction_columns(row, joints):
+            for body, coulomb, viscous in friction_columns(row, tree, joints):
                 K[index, body, parameters.COULOMB] = coulomb
                 K[index, body, parameters.VISCOUS] = viscous
+        if len(tree.node_of) < tree.bodies:
+            K = K[:, tree.node_of]
         return K.flatten(1, 2).permute(2, 0, 1)

@@ -1,6 +1,10 @@
 """Constants of a robot's tree in the frames the dynamics are computed in.
 
-Every body gets a *joint frame* whose z axis is the joint axis: a joint's motion then touches two columns of a rotation
+A weld through a force/torque sensor is six motionless joints in a row, slides along x, y, z, then hinges about them,
+whose generalized forces are the components of the wrench it transmits: the nodes of this tree are the bodies and five
+without mass before each body beyond such a sensor.
+
+Every node gets a *joint frame* whose z axis is the joint axis: a joint's motion then touches two columns of a rotation
 only, and the parameters that a joint cannot tell from its parent's have fixed places (see `reduction`).
 """
 
@@ -12,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from torchid.parameters import Array
+from torchid.regressor.nodes import nodes_of
 from torchid.robot import Robot
 
 
@@ -20,12 +25,16 @@ class KinematicTree(nn.Module):
 
     Attributes (buffers, so `.to()` moves and casts them):
         pose: (3, 4, L, 1), rotation and offset [m] of every joint frame at position 0 in its parent's joint frame,
-            bodies sorted by depth (`by_depth`; `depth_first` sorts back).
-        link_rotation, (3, 3, L, 1), and link_offset, (3, L, 1): the body's link frame in its joint frame.
+            nodes sorted by depth (`by_depth`; `depth_first` sorts back). L counts nodes here.
+        link_rotation, (3, 3, L, 1), and link_offset, (3, L, 1): the node's link frame in its joint frame.
         revolute, prismatic: (L, 1) of 0 and 1.
-        parent: (L,), index of the parent body, 0 for the base.
-        ancestors: (L, L), 1 where column j's joint moves body i.
-        joint_map, joint_constant: positions of the base (0) and all L - 1 joints from the n independent ones.
+        parent: (L,), index of the parent node, 0 for the base.
+        ancestors: (L, L), 1 where column j's joint moves node i.
+        joint_map, (L, n + 6 F), joint_constant: positions of the base (0) and all L - 1 joints from the robot's degrees
+            of freedom, of which the first n move.
+
+    `sign_width`: as in `Regressor`. `node_of`: node of each of the robot's bodies. `body_of`: body of each node, that
+    beyond the weld if it is massless.
     """
 
     pose: Tensor
@@ -41,20 +50,25 @@ class KinematicTree(nn.Module):
     joint_constant: Tensor
     place_above: Tensor
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, sign_width: float | None = None) -> None:
         super().__init__()
-        geometry = robot.geometry
-        self.parents = [body.parent for body in robot.bodies]
-        self.is_prismatic = [bool(p) for p in geometry.prismatic]
-        self.base_rows = robot.base_rows
-        count = len(self.parents)
+        self.sign_width = sign_width
+        nodes = nodes_of(robot)
+        self.node_of = [index for index, node in enumerate(nodes) if node.body is not None]
+        self.body_of = np.searchsorted(self.node_of, np.arange(len(nodes))).tolist()
+        self.parents = [node.parent for node in nodes]
+        self.slides = [node.slides for node in nodes]
+        self.kinds = [node.kind for node in nodes]
+        self.base_rows, self.n = robot.base_rows, robot.n
+        count = len(nodes)
         joint_frame = np.tile(np.eye(4), (count, 1, 1))
-        for body in range(1, count):
-            joint_frame[body, :3, :3] = _rotation_to_z(geometry.axis[body])
-        in_parent = np.linalg.inv(joint_frame[self.parents]) @ geometry.T_parent_joint @ joint_frame
+        for index, node in enumerate(nodes[1:], start=1):
+            joint_frame[index, :3, :3] = _rotation_to_z(node.axis)
+        T_parent_joint: Array = np.stack([node.T_parent_joint for node in nodes])
+        in_parent: Array = np.asarray(np.linalg.inv(joint_frame[self.parents]) @ T_parent_joint @ joint_frame, float)
         in_parent[0] = np.eye(4)
         self.T_parent_joint: Array = in_parent
-        self.T_joint_link: Array = np.linalg.inv(joint_frame) @ geometry.T_joint_link
+        self.T_joint_link: Array = np.linalg.inv(joint_frame) @ np.stack([node.T_joint_link for node in nodes])
 
         is_ancestor = np.eye(count)
         depth = np.zeros(count, dtype=int)
@@ -68,15 +82,14 @@ class KinematicTree(nn.Module):
         self.level_sizes = np.bincount(depth).tolist()
 
         moving = np.arange(count) > 0
-        matrix, constant = robot.joint_map
         self._register("pose", in_parent[by_depth, :3].transpose(1, 2, 0)[..., None])
         self._register("link_rotation", self.T_joint_link[:, :3, :3].transpose(1, 2, 0)[..., None])
         self._register("link_offset", self.T_joint_link[:, :3, 3].T[..., None])
-        self._register("revolute", (moving & ~geometry.prismatic)[:, None])
-        self._register("prismatic", (moving & geometry.prismatic)[:, None])
+        self._register("revolute", (moving & ~np.array(self.slides))[:, None])
+        self._register("prismatic", np.array(self.slides)[:, None])
         self._register("ancestors", is_ancestor)
-        self._register("joint_map", np.vstack([np.zeros(robot.n), matrix]))
-        self._register("joint_constant", np.append(0.0, constant)[:, None])
+        self._register("joint_map", np.stack([node.motion for node in nodes]))
+        self._register("joint_constant", np.array([node.offset for node in nodes])[:, None])
         parent = np.maximum(self.parents, 0)
         level_start = np.repeat(np.cumsum([0, 0, *self.level_sizes[:-1]])[:-1], self.level_sizes)
         self._register("parent", parent)
@@ -90,11 +103,25 @@ class KinematicTree(nn.Module):
 
     @property
     def bodies(self) -> int:
-        """Number L of bodies."""
+        """Number L of nodes."""
         return len(self.parents)
 
+    def coulomb_sign(self, velocity: Tensor) -> Tensor:
+        """Sign of velocities [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""
+        return torch.sign(velocity) if self.sign_width is None else torch.tanh(velocity / self.sign_width)
+
+    def frame(self, robot: Robot, link: str) -> tuple[int, Array]:
+        """Node that carries a URDF link of the robot, and the link's pose, (4, 4) [m], in the node's joint frame.
+
+        Raises:
+            UnknownNameError: the URDF has no such link.
+        """
+        body, T_body_link = robot.link(link)
+        node = self.node_of[body]
+        return node, self.T_joint_link[node] @ T_body_link
+
     def path(self, body: int) -> list[int]:
-        """Bodies whose joints move `body`, from the base outward, itself included, the base not."""
+        """Nodes whose joints move node `body`, from the base outward, itself included, the base not."""
         path: list[int] = []
         while body > 0:
             path.insert(0, body)

@@ -71,7 +71,8 @@ def expected_errors(
             sums.rows.add(_together(errors), weight)
             for inside in projected(builder, samples, state, without_contacts):
                 sums.projected.add(_together(inside).flatten()[:, None], weight)
-    return ExpectedErrors(*({group: figure(x) for group, x in sums.rms(base).items()} for sums in (model, sensors)))
+    found = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
+    return ExpectedErrors(*({group: figure(rms[group]) for group in GROUPS} for rms in found))
 
 
 def _together(errors: Tensor) -> Tensor:
@@ -82,7 +83,7 @@ def _together(errors: Tensor) -> Tensor:
 def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:
     """One standard deviation of each base row's floor and each torque sensor, as generalized forces (nv, B, nv)."""
     n, base = len(builder.columns.joint_rows), builder.tree.base_rows
-    std = np.append(noise.base[:base], np.full(n, noise.joint_torque))
+    std = np.append(noise.base[:base], noise.dofs(builder.tree.n, n))
     return torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
 
 

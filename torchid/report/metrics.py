@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
 from torchid.parameters import Array
 from torchid.problem.chunks import over_chunks
+from torchid.problem.extras import ExtraTerms
 from torchid.problem.plan import State
 from torchid.problem.predict import forces
 from torchid.problem.rows import RowBuilder
@@ -26,6 +27,9 @@ GROUPS = {
     "nullspace": "projected [N, N m]",
 }
 """Groups of rows that errors are given for, with a name and unit to show."""
+
+LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
+"""Readings of force/torque sensors in limbs, of robots that have some."""
 
 SETS = ("train", "test")
 """Sets of logs that errors are given for."""
@@ -46,7 +50,7 @@ class Metrics:
     `rms` and `relative` by group; `by_joint_rms` and `by_joint_relative` by joint. Relative means rms of the error over
     rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
     the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
-    mostly weight.
+    mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
     """
 
     rms: dict[str, float | None]
@@ -54,14 +58,17 @@ class Metrics:
     by_joint_rms: dict[str, float | None]
     by_joint_relative: dict[str, float | None]
     base_force_of_variation: float | None
+    limb_rms: dict[str, float | None] = field(default_factory=dict)
+    limb_relative: dict[str, float | None] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
         """As `metrics.json` has it."""
         out: dict[str, object] = {}
-        for suffix, groups, joints in (
-            ("rms", self.rms, self.by_joint_rms),
-            ("rms_relative", self.relative, self.by_joint_relative),
+        for suffix, groups, joints, limbs in (
+            ("rms", self.rms, self.by_joint_rms, self.limb_rms),
+            ("rms_relative", self.relative, self.by_joint_relative, self.limb_relative),
         ):
+            out |= {f"{group}_{suffix}": x for group, x in limbs.items()}
             for group in GROUPS:
                 out[f"{group}_{suffix}"] = groups[group]
                 if group == "joint_torque":
@@ -72,20 +79,24 @@ class Metrics:
 class Evaluation:
     """Evaluates several parameter vectors at once, in one pass over the logs."""
 
-    def __init__(self, robot: Robot, contacts: Sequence[Contact], device: str = "cpu") -> None:
-        """Fix robot and contacts; sensors do not matter, whatever a log has is used."""
+    def __init__(
+        self, robot: Robot, contacts: Sequence[Contact], device: str = "cpu", terms: ExtraTerms | None = None
+    ) -> None:
+        """Fix robot, contacts and what actuators add; sensors do not matter, whatever a log has is used."""
+        actuators = replace(terms or ExtraTerms(), offsets={}, scales={})
         self.robot = robot
-        self.builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts))).to(device)
+        sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
+        self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
 
     def metrics(
         self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
     ) -> list[Metrics]:
-        """One `Metrics` per row of `phi`, (M, 12 L), over all samples of the logs together."""
+        """One `Metrics` per row of `phi`, as `RowBuilder.columns_of`, over all samples of the logs together."""
         builder = self.builder
-        columns = torch.from_numpy(phi @ builder.columns.from_parameters().T).to(builder.device)
+        columns = builder.columns_of(phi)
 
         def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
-            sums = [ForceSums(self.robot.nv) for _ in range(len(phi) + 1)]
+            sums = [ForceSums(self.robot.base_rows + self.robot.dofs) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
                 found = forces(builder, samples, state, columns)
                 for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
@@ -102,15 +113,18 @@ class Evaluation:
 
     def _summary(self, errors: ForceSums, measured: ForceSums) -> Metrics:
         base = self.robot.base_rows
-        rms, size = errors.rms(base), measured.rms(base)
-        by_joint, joint_size = errors.rows.rms(slice(base, None)), measured.rows.rms(slice(base, None))
-        names = self.robot.joint_names
+        rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
+        joints = slice(base, base + self.robot.n)
+        by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
+        names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
         return Metrics(
             {group: figure(rms[group]) for group in GROUPS},
             {group: _ratio(rms[group], size[group]) for group in GROUPS},
             {name: figure(x) for name, x in zip(names, by_joint, strict=True)},
             {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
             _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
+            {group: figure(rms[group]) for group in limbs},
+            {group: _ratio(rms[group], size[group]) for group in limbs},
         )
 
 

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchid.analysis.calibration import ExtraEstimate
 from torchid.errors import InputError
 from torchid.estimators import Estimate
 from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
 from torchid.robot import Robot
 
 
-def parameters_document(robot: Robot, estimate: Estimate, by_state: Mapping[str, Estimate]) -> dict[str, Any]:
+def parameters_document(
+    robot: Robot, estimate: Estimate, by_state: Mapping[str, Estimate], extras: Sequence[ExtraEstimate] = ()
+) -> dict[str, Any]:
     """What `parameters.json` holds; a standard error or a share that the data do not give is null.
 
     Args:
         robot: the robot.
         estimate: of all data.
         by_state: of the data of each contact state alone.
+        extras: unknowns beside the bodies' parameters.
     """
     nominal = [{"nominal": _named(phi)} for phi in robot.nominal]
     found = _bodies(robot, {"identified": estimate.phi} | _judged(estimate))
@@ -31,6 +35,7 @@ def parameters_document(robot: Robot, estimate: Estimate, by_state: Mapping[str,
         "massless": list(robot.massless),
         "verdicts": estimate.verdict_counts(),
         "bodies": [{"name": body["name"]} | before | body for body, before in zip(found, nominal, strict=True)],
+        "extras": [_extra(x) for x in extras],
         "contact_states": [
             {
                 "name": name,
@@ -60,6 +65,43 @@ def _bodies(robot: Robot, columns: Mapping[str, np.ndarray]) -> list[dict[str, A
     ]
 
 
+def _extra(found: ExtraEstimate) -> dict[str, Any]:
+    """An unknown beside the bodies' parameters; `log` is null for one of all logs."""
+    extra = found.extra
+    return {
+        "what": extra.what,
+        "name": extra.name,
+        "component": extra.component or None,
+        "log": found.log or None,
+        "unit": extra.unit,
+        "value": found.value,
+        "standard_error": _plain(found.standard_error),
+        "inflation": _plain(found.inflation),
+        "told_apart": found.told_apart,
+        "mixed_with": list(found.mixed_with),
+        "label": extra.label,
+    }
+
+
+def read_shared_extras(path: Path) -> dict[str, float]:
+    """Values of the unknowns of all logs, by `Extra.label`, of a run's `parameters.json`.
+
+    Raises:
+        InputError: an entry that is none.
+    """
+    entries = _document(path).get("extras", [])
+    out = {}
+    for entry in entries if isinstance(entries, list) else [None]:
+        if not (isinstance(entry, dict) and isinstance(entry.get("label"), str)):
+            raise InputError(path, "extras", "an entry without a label", "what torchid identify wrote")
+        value = entry.get("value")
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+            raise InputError(path, f"extras, {entry['label']}, value", f"{value!r}", "a finite number")
+        if entry.get("log") is None:
+            out[entry["label"]] = float(value)
+    return out
+
+
 def _named(values: np.ndarray) -> dict[str, Any]:
     return {name: _plain(x) for name, x in zip(PARAMETERS, values, strict=True)}
 
@@ -70,15 +112,19 @@ def read_parameters(path: Path, robot: Robot) -> Array:
     Raises:
         InputError: the file cannot be read or holds other bodies.
     """
-    try:
-        document = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(path, "file", f"not readable as JSON ({error})", "a run's parameters.json") from error
-    bodies = document.get("bodies") if isinstance(document, dict) else None
+    bodies = _document(path).get("bodies")
     names = [body.get("name") if isinstance(body, dict) else None for body in bodies or []]
     if names != list(robot.body_names):
         raise InputError(path, "bodies", f"not the bodies of {robot.path}", ", ".join(robot.body_names))
     return np.array([[_number(path, body, name) for name in PARAMETERS] for body in bodies or []])
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(path, "file", f"not readable as JSON ({error})", "a run's parameters.json") from error
+    return document if isinstance(document, dict) else {}
 
 
 def _number(path: Path, body: dict[str, Any], name: str) -> float:

@@ -70,15 +70,25 @@ class ForceSums:
             out.projected.merge(part.projected)
         return out
 
-    def rms(self, base_rows: int) -> dict[str, float]:
-        """By group of rows, NaN where there are none."""
-        joints = self.rows.rms(slice(base_rows, None))
+    def rms(self, base_rows: int, n: int) -> dict[str, float]:
+        """By group of rows, NaN where there are none, of a robot with so many base rows and joints."""
+        joints = self.rows.rms(slice(base_rows, base_rows + n))
+        force, moment = self._in_limbs(base_rows + n)
         return {
             "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
             "base_force": self.rows.pooled(slice(0, 3)) if base_rows else np.nan,
             "base_moment": self.rows.pooled(slice(3, 6)) if base_rows else np.nan,
+            "ft_force": force,
+            "ft_moment": moment,
             "nullspace": self.projected.pooled(slice(None)),
         }
+
+    def _in_limbs(self, first: int) -> tuple[float, float]:
+        """Of forces and of moments of the sensors in limbs."""
+        squares, count = (x[first:].reshape(-1, 2, 3).sum((0, 2)) for x in (self.rows.sum, self.rows.count))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            force, moment = np.sqrt(squares / count)
+        return float(force), float(moment)
 
 
 def projected(builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor) -> Iterator[torch.Tensor]:

@@ -24,12 +24,13 @@ class JointGeometry:
     """Where joint frames sit, one row per body of the chain; the base's row is the identity.
 
     `T_parent_joint`, (L, 4, 4): joint frame at position 0 in the parent's joint frame [m]. `axis`, (L, 3), unit
-    length. `prismatic`, (L,) bool. `T_joint_link`, (L, 4, 4): the body's link frame in its moved joint frame.
+    length. `prismatic`, `welded`, (L,) bool. `T_joint_link`, (L, 4, 4): the body's link frame in its moved joint frame.
     """
 
     T_parent_joint: Array
     axis: Array
     prismatic: np.ndarray
+    welded: np.ndarray
     T_joint_link: Array
 
 
@@ -65,6 +66,7 @@ def joint_geometry(chain: pk.Chain, body_names: tuple[str, ...]) -> JointGeometr
         T_parent_joint=np.stack([_matrix(frame.joint.offset) for frame in moved]),
         axis=np.stack([frame.joint.axis.numpy() for frame in moved]),
         prismatic=np.array([frame.joint.joint_type == "prismatic" for frame in moved]),
+        welded=np.array([frame.joint.joint_type == "fixed" for frame in moved]) & (np.arange(len(moved)) > 0),
         T_joint_link=np.stack([_matrix(frame.joint.offset) for frame in links]),
     )
 

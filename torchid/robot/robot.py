@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from torchid.robot.chain import JointGeometry, build_chain, joint_geometry, link
 from torchid.robot.nominal import nominal_parameters
 from torchid.robot.tree import BodyJoint, build_tree
 from torchid.robot.urdf import read_urdf
+from torchid.wrenches import COMPONENTS
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,27 @@ class Robot:
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
-        """The n independent joints, depth first; a mimic joint is not one of them."""
-        return tuple(body.joint.name for body in self.bodies if body.joint is not None and body.joint.mimic is None)
+        """The n independent joints, depth first; a mimic joint is not one of them, nor is a weld."""
+        moving = (body.joint for body in self.bodies if body.joint is not None and body.joint.kind != "fixed")
+        return tuple(joint.name for joint in moving if joint.mimic is None)
+
+    @cached_property
+    def ft_names(self) -> tuple[str, ...]:
+        """The F fixed joints with a force/torque sensor, depth first."""
+        return tuple(body.joint.name for body in self.bodies if body.joint is not None and body.joint.kind == "fixed")
+
+    @cached_property
+    def dof_names(self) -> tuple[str, ...]:
+        """Rows of K below the base's: the n joints, then the six components of each force/torque sensor.
+
+        Such a sensor counts as six motionless degrees of freedom whose generalized force is measured.
+        """
+        return (*self.joint_names, *(f"{name}.{k}" for name in self.ft_names for k in COMPONENTS))
+
+    @property
+    def dofs(self) -> int:
+        """Number of `dof_names`, n + 6 F."""
+        return len(self.dof_names)
 
     @property
     def n(self) -> int:
@@ -99,7 +120,7 @@ class Robot:
             if joint is not None and joint.mimic is not None:
                 matrix[row, self.joint_names.index(joint.mimic.master)] = joint.mimic.multiplier
                 constant[row] = joint.mimic.offset
-            elif joint is not None:
+            elif joint is not None and joint.kind != "fixed":
                 matrix[row, self.joint_names.index(joint.name)] = 1.0
         return matrix, constant
 
@@ -134,13 +155,16 @@ class Robot:
         return self.links[name]
 
 
-def load_robot(path: str | Path, base_link: str | None = None, fixed_base: bool = False) -> Robot:
+def load_robot(
+    path: str | Path, base_link: str | None = None, fixed_base: bool = False, ft_joints: Sequence[str] = ()
+) -> Robot:
     """Read a URDF into a `Robot`.
 
     Args:
         path: the URDF file; meshes are never opened.
         base_link: the link that becomes the floating (or bolted) base, by default the URDF's root.
         fixed_base: True if the base does not move.
+        ft_joints: fixed joints with a force/torque sensor: what lies beyond is a body of its own.
 
     Raises:
         UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass.
@@ -151,7 +175,7 @@ def load_robot(path: str | Path, base_link: str | None = None, fixed_base: bool 
     """
     path = Path(path)
     links, joints = read_urdf(path)
-    tree = build_tree(path, links, joints, base_link)
+    tree = build_tree(path, links, joints, base_link, ft_joints)
     nominal = nominal_parameters(path, tree, {link.name: link for link in links})
     massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
     if massless.all():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,11 +27,12 @@ class Mimic:
 
 @dataclass(frozen=True)
 class BodyJoint:
-    """The joint that moves a body.
+    """The joint that moves a body; of kind "fixed", the weld through a force/torque sensor.
 
     `T_parent_joint`, (4, 4), is the pose of the joint frame at position 0 in the parent body's link frame; the joint
     moves that frame about or along `axis`, (3,), of unit length in it. `T_joint_link`, (4, 4), is the pose of the
-    body's link frame in the moved joint frame: the identity unless the base link turned the joint around.
+    body's link frame in the moved joint frame: the identity unless the base link turned the joint around. The axis of
+    a weld is z, or -z where the joint is turned around, so that the sensor reads the opposite wrench.
     """
 
     name: str
@@ -53,11 +55,13 @@ class BodyTree:
     links: dict[str, tuple[int, Array]]
 
 
-def build_tree(path: Path, links: list[Link], joints: list[Joint], base_link: str | None) -> BodyTree:
-    """Depth-first tree of bodies from `base_link` (the URDF's root if None).
+def build_tree(
+    path: Path, links: list[Link], joints: list[Joint], base_link: str | None, ft_joints: Sequence[str] = ()
+) -> BodyTree:
+    """Depth-first tree of bodies from `base_link` (the URDF's root if None); `ft_joints` are not lumped.
 
     Raises:
-        UnknownNameError: `base_link` names no link.
+        UnknownNameError: `base_link` names no link, or one of `ft_joints` no fixed joint.
         UrdfError: the joints do not form one tree, or a mimic chain closes on itself.
     """
     root = _find_root(path, links, joints)
@@ -66,6 +70,10 @@ def build_tree(path: Path, links: list[Link], joints: list[Joint], base_link: st
     names = [link.name for link in links]
     if base_link not in names:
         raise UnknownNameError(path, "robot.base_link", base_link, names)
+    welds = [joint.name for joint in joints if joint.type not in MOVING_TYPES]
+    for name in ft_joints:
+        if name not in welds:
+            raise UnknownNameError(path, "force/torque sensor at a fixed joint", name, welds)
     mimics = _resolve_mimics(path, joints)
     neighbours: dict[str, list[tuple[Joint, bool]]] = {name: [] for name in names}
     for joint in joints:  # a parent's own children come first, in the URDF's order
@@ -79,7 +87,7 @@ def build_tree(path: Path, links: list[Link], joints: list[Joint], base_link: st
         name, joint, reverse = stack.pop()
         if joint is None:
             _start_body(tree, name, None)
-        elif joint.type in MOVING_TYPES and not _is_locked(joint, mimics):
+        elif joint.name in ft_joints or (joint.type in MOVING_TYPES and not _is_locked(joint, mimics)):
             _start_body(tree, name, _body_joint(tree, joint, reverse, mimics.get(joint.name)))
         else:
             parent = joint.child if reverse else joint.parent
@@ -165,10 +173,11 @@ def _inverse(T: Array) -> Array:
 def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None) -> BodyJoint:
     """The joint as seen from the base: turned around, its frame sits at the child link and its axis flips."""
     body, T_body_near = tree.links[joint.child if reverse else joint.parent]
-    axis = joint.axis / np.linalg.norm(joint.axis)
+    weld = joint.type not in MOVING_TYPES
+    axis = np.array([0.0, 0.0, 1.0]) if weld else joint.axis / np.linalg.norm(joint.axis)
     return BodyJoint(
         name=joint.name,
-        kind="prismatic" if joint.type == "prismatic" else "revolute",
+        kind="fixed" if weld else "prismatic" if joint.type == "prismatic" else "revolute",
         parent=body,
         axis=-axis if reverse else axis,
         T_parent_joint=T_body_near if reverse else T_body_near @ _origin(joint),

@@ -11,12 +11,13 @@ from rich.progress import Progress
 from torchid.analysis.accuracy import error_directions
 from torchid.errors import LogError, TorchidWarning
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.samples import check_forces, measured_components
+from torchid.problem.measured import measured_components
+from torchid.problem.samples import check_forces
 from torchid.problem.streaming import compress_parts
 from torchid.report.accuracy import SetAccuracy
 from torchid.report.expected import expected_errors
 from torchid.report.metrics import Evaluation
-from torchid.run.estimation import batch_estimator, problem_of, stated_conditions
+from torchid.run.estimation import assembled, batch_estimator, stated_conditions
 from torchid.run.experiment import Scene
 from torchid.sensing import SensorSet
 
@@ -59,8 +60,8 @@ def _accuracy(
     source: object,
 ) -> SetAccuracy:
     settings, robot = scene.config.estimator, scene.robot
-    builder = RowBuilder(robot, scene.contacts, sensors).to(scene.config.device)
-    problem = problem_of(compress_parts(train, builder), builder, robot, settings, source)
+    builder = RowBuilder(robot, scene.contacts, sensors, scene.terms).to(scene.config.device)
+    problem = assembled(compress_parts(train, builder), builder, robot, settings, source).problem
     if settings.name == "sgd":
         settings = replace(settings, name="least_squares")
     estimator = batch_estimator(settings, stated_conditions(settings, robot, source))

@@ -18,8 +18,8 @@ from torchid.errors import ConfigError
 from torchid.problem import Samples
 from torchid.problem.chunks import by_state
 from torchid.problem.linear import parameter_scale
+from torchid.problem.measured import measured_components
 from torchid.problem.plan import State
-from torchid.problem.samples import measured_components
 from torchid.problem.streaming import free_parameters
 from torchid.run.accuracy import accuracies
 from torchid.run.analysis_results import Analysis, Scenario, write_analysis

@@ -11,23 +11,23 @@ from torchid.config.estimator import EstimatorConfig
 from torchid.errors import UnknownNameError
 from torchid.estimators import Conditions, Consistent, LeastSquares
 from torchid.parameters import PER_BODY
-from torchid.problem import LinearProblem, RowBuilder, linear_problem
-from torchid.problem.streaming import Part, merged
+from torchid.problem import LinearProblem, RowBuilder
+from torchid.problem.elimination import Assembly, assemble
+from torchid.problem.streaming import Part
 from torchid.robot import Robot
 from torchid.run.conditions import conditions_from
 
 
-def problem_of(
+def assembled(
     parts: Sequence[Part], builder: RowBuilder, robot: Robot, settings: EstimatorConfig, source: object = "experiment"
-) -> LinearProblem:
+) -> Assembly:
     """The problem that parts of logs pose together, with what the settings leave free.
 
     Raises:
         UnknownNameError: a frozen body that the robot does not have.
     """
-    factor = merged((part.factor for part in parts), builder)
-    problem = linear_problem(factor, builder, robot, settings.friction)
-    return with_frozen(problem, settings, robot, source)
+    assembly = assemble(parts, builder, robot, settings.friction)
+    return replace(assembly, problem=with_frozen(assembly.problem, settings, robot, source))
 
 
 def with_frozen(

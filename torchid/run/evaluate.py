@@ -6,17 +6,16 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from torchid.config import load_config
 from torchid.errors import ConfigError, TorchidWarning
 from torchid.report.figures import error_figure
 from torchid.report.metrics import Evaluation, Metrics
-from torchid.report.parameters_json import read_parameters
+from torchid.report.parameters_json import read_parameters, read_shared_extras
+from torchid.run.calibration import Calibration
 from torchid.run.experiment import set_up
 from torchid.run.folder import check_free, new_folder, write_json
 from torchid.run.progress import progress_bars
-from torchid.run.results import forces_of
+from torchid.run.results import candidates, forces_of
 
 
 def evaluate(
@@ -50,15 +49,17 @@ def evaluate(
     with progress_bars() as bars:
         experiment = set_up(config, folder / "config.yaml")
         robot = experiment.robot
-        phi = read_parameters(folder / "parameters.json", robot)
-        candidates = np.stack([robot.nominal.flatten(), phi.flatten()])
+        phi = read_parameters(folder / "parameters.json", robot).flatten()
+        calibration = Calibration(experiment, phi, read_shared_extras(folder / "parameters.json"))
         reading = bars.add_task("reading logs", total=len(logs))
         samples = experiment.read([Path(log) for log in logs], False, lambda _: bars.advance(reading))
-        evaluation = Evaluation(robot, experiment.contacts, config.device)
+        samples = calibration.logs(samples)
+        evaluation = Evaluation(robot, experiment.contacts, config.device, experiment.terms)
+        both = candidates(robot, calibration.parameters(evaluation))
         evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
         metrics = {}
         for log in samples:
-            nominal, identified = evaluation.metrics([log], candidates, lambda n: bars.advance(evaluating, n))
+            nominal, identified = evaluation.metrics([log], both, lambda n: bars.advance(evaluating, n))
             metrics[Path(log.source).stem] = (nominal, identified)
             if not any(x is not None for x in identified.rms.values()):
                 message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
@@ -70,6 +71,6 @@ def evaluate(
         with new_folder(output, overwrite=True) as new:
             (new / "config.yaml").write_text((folder / "config.yaml").read_text())
             write_json(new / "metrics.json", document)
-            forces_of(evaluation, samples[0], candidates, robot).savefig(new / "forces.png", dpi=130)
+            forces_of(evaluation, samples[0], both, robot).savefig(new / "forces.png", dpi=130)
             error_figure(metrics).savefig(new / "errors.png", dpi=130)
     return metrics, output

@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 from rich.progress import Progress
 
+from torchid.analysis.calibration import estimate_extras
 from torchid.analysis.contributions import Contributions, contributions
 from torchid.config import ExperimentConfig
 from torchid.errors import NumericalWarning, SensorError
@@ -23,7 +24,8 @@ from torchid.problem.plan import State, state_name
 from torchid.problem.states import check_base, state_reports
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
-from torchid.run.estimation import batch_estimator, problem_of, stated_conditions
+from torchid.run.calibration import Calibration, warn_of_confounded
+from torchid.run.estimation import assembled, batch_estimator, stated_conditions
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
@@ -68,12 +70,14 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
             estimator = training or batch_estimator(config.estimator, conditions)
             logs = _read(experiment, bars)
         with clock("compress"):
-            builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(config.device)
+            scene = experiment.robot, experiment.contacts, experiment.sensors, experiment.terms
+            builder = RowBuilder(*scene).to(config.device)
             states = state_reports(logs["train"], builder)
             check_base(states, config.sensors.on_base_lost)
             parts = _compressed(builder, logs["train"], bars)
-            problem = problem_of(parts, builder, experiment.robot, config.estimator, source)
-        evaluation = Evaluation(experiment.robot, experiment.contacts, config.device)
+            assembly = assembled(parts, builder, experiment.robot, config.estimator, source)
+            problem = assembly.problem
+        evaluation = Evaluation(experiment.robot, experiment.contacts, config.device, experiment.terms)
         with clock("solve"):
             if isinstance(estimator, Training):
                 evaluate = partial(_identified_metrics, evaluation, logs)
@@ -81,17 +85,23 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
             else:
                 estimate = estimator.solve(problem)
             _check_sense(estimate, source)
+            tolerance = config.estimator.rank_tolerance
+            extras = estimate_extras(assembly, estimate, experiment.robot.body_names, tolerance)
+            warn_of_confounded(extras, source)
         with clock("identifiability"):
             alone = _by_state(experiment, builder, parts, source)
             adds = _contributions(experiment, builder, parts, logs["train"], problem, bars)
             del parts
         with clock("evaluate"):
-            metrics = _metrics(evaluation, logs, estimate.phi, bars)
+            calibration = Calibration.of(experiment, estimate.phi, extras)
+            logs = {name: calibration.logs(same) for name, same in logs.items()}
+            metrics = _metrics(evaluation, logs, calibration.parameters(evaluation), bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
         samples = sum(map(len, logs["train"]))
-        run = Identification(experiment, estimate, states, alone, adds, metrics, broken, clock.seconds, samples)
+        run = Identification(experiment, estimate, extras, states, alone, adds, metrics, broken, clock.seconds, samples)
         bars.add_task("writing", total=None)
-        write_run(run, evaluation, (logs["test"] or logs["train"])[0], training)
+        shown = (logs["test"] or logs["train"])[0]
+        write_run(run, evaluation, shown, calibration.parameters(evaluation), training)
     return run
 
 
@@ -120,7 +130,7 @@ def _by_state(
     estimator, out = LeastSquares(settings.ridge, settings.rank_tolerance), {}
     for state, _ in samples.most_common():
         of_state = [part for part in parts if part.state == state]
-        problem = problem_of(of_state, builder, experiment.robot, settings, source)
+        problem = assembled(of_state, builder, experiment.robot, settings, source).problem
         out[state_name(builder.contacts, state)] = estimator.solve(problem)
     return out
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from torchid.analysis.calibration import ExtraEstimate
 from torchid.analysis.contributions import Contributions
 from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
@@ -35,11 +36,12 @@ _PLOTTED_SAMPLES = 3000
 class Identification:
     """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
 
-    `adds`: what each training log, contact state and sensor adds.
+    `extras`: unknowns beside the bodies' parameters. `adds`: what each training log, contact state and sensor adds.
     """
 
     experiment: Experiment
     estimate: Estimate
+    extras: list[ExtraEstimate]
     states: list[StateReport]
     by_state: dict[str, Estimate]
     adds: Contributions
@@ -65,22 +67,26 @@ class Identification:
 
 
 def candidates(robot: Robot, phi: Array) -> Array:
-    """Nominal and identified parameters, (2, 12 L), from the latter (12 L,)."""
-    return np.stack([robot.nominal.flatten(), phi])
+    """Nominal and identified parameters, (2, 12 L + E), from the latter, of which E belong to actuators."""
+    nominal = robot.nominal.flatten()
+    return np.stack([np.pad(nominal, (0, len(phi) - len(nominal))), phi])
 
 
-def write_run(run: Identification, evaluation: Evaluation, shown: Samples, training: Training | None) -> None:
+def write_run(
+    run: Identification, evaluation: Evaluation, shown: Samples, phi: Array, training: Training | None
+) -> None:
     """Write the run folder.
 
     Args:
         run: what to write.
         evaluation: for the predicted forces.
-        shown: log of the figure of forces.
+        shown: log of the figure of forces, calibrated.
+        phi: (12 L + E,), identified parameters with those of actuators.
         training: whose curves go into the folder, and whose checkpoint is then no longer needed.
     """
     config, robot = run.experiment.config, run.experiment.robot
     figures = {
-        "forces": forces_of(evaluation, shown, candidates(robot, run.estimate.phi), robot),
+        "forces": forces_of(evaluation, shown, candidates(robot, phi), robot),
         "errors": error_figure(run.metrics),
         "parameters": parameter_figure(
             robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
@@ -90,7 +96,7 @@ def write_run(run: Identification, evaluation: Evaluation, shown: Samples, train
     }
     with new_folder(config.output, config.overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
-        write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state))
+        write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", metrics_document(run))
         (folder / "identified.urdf").write_bytes(identified_urdf(robot, run.phi))
         for name, figure in figures.items():
@@ -103,7 +109,7 @@ def write_run(run: Identification, evaluation: Evaluation, shown: Samples, train
 
 
 def forces_of(evaluation: Evaluation, samples: Samples, phi: Array, robot: Robot) -> Figure:
-    """The figure of measured forces of a log's first samples, and those of nominal and identified phi, (2, 12 L)."""
+    """The figure of measured forces of a log's first samples, and those of nominal and identified phi, (2, ...)."""
     part = samples[:_PLOTTED_SAMPLES]
     measured, (nominal, identified) = force_series(evaluation.builder, part, phi)
     series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured, nominal, identified)

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 from torchid.errors import SensorError
 from torchid.robot import Robot
-
-COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
-"""Of a wrench at the contact frame's origin, along the contact frame's own axes."""
+from torchid.wrenches import COMPONENTS
 
 _FORCES, _MOMENTS = (0, 1, 2), (3, 4, 5)
 CONTACT_TYPES = ("point", "line", "flat")

@@ -6,13 +6,15 @@ Full sensing, contacts only and joints only are three masks; nothing downstream 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from torchid.errors import SensorError, UnknownNameError
 from torchid.parameters import Array
-from torchid.sensing.contacts import COMPONENTS, Contact
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+from torchid.wrenches import COMPONENTS
 
 NAMED_SETS = ("full", "contacts", "joints")
 
@@ -23,7 +25,7 @@ class SensorNoise:
 
     `base_force` and `base_moment` stand for what no force sensor sees (differentiated motion, soft contacts): without
     them a base row in flight, where no sensor contributes noise, would count as exact. By default one contact sensor's
-    noise.
+    noise. So are force/torque sensors in limbs.
     """
 
     joint_torque: float = 0.5
@@ -31,6 +33,8 @@ class SensorNoise:
     contact_moment: float = 0.2
     base_force: float | None = None
     base_moment: float | None = None
+    ft_force: float | None = None
+    ft_moment: float | None = None
 
     @property
     def base(self) -> Array:
@@ -38,6 +42,12 @@ class SensorNoise:
         force = self.contact_force if self.base_force is None else self.base_force
         moment = self.contact_moment if self.base_moment is None else self.base_moment
         return np.array([force] * 3 + [moment] * 3)
+
+    def dofs(self, n: int, count: int) -> Array:
+        """Of n joint torques, then of the wrenches of force/torque sensors in limbs, (count,) [N m, N, N m]."""
+        force = self.contact_force if self.ft_force is None else self.ft_force
+        moment = self.contact_moment if self.ft_moment is None else self.ft_moment
+        return np.append(np.full(n, self.joint_torque), np.tile([force] * 3 + [moment] * 3, (count - n) // 6))
 
     def times(self, factor: float) -> SensorNoise:
         """All of them, larger by a factor."""
@@ -54,7 +64,8 @@ class SensorNoise:
 class SensorSet:
     """Which forces are measured.
 
-    `torque`, (n,) bool, by the robot's joints; `wrench`, (C, 6) bool, by contacts and `COMPONENTS`.
+    `torque`, (n + 6 F,) bool, by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs; `wrench`,
+    (C, 6) bool, by contacts and `COMPONENTS`.
     """
 
     torque: np.ndarray
@@ -62,8 +73,8 @@ class SensorSet:
     noise: SensorNoise = field(default_factory=SensorNoise)
 
 
-def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = None) -> SensorSet:
-    """One of the three sets that have a name: "full", "contacts" or "joints".
+def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = None, ft: int = 0) -> SensorSet:
+    """One of the three sets that have a name: "full", "contacts" or "joints", without the `ft` sensors in limbs.
 
     Raises:
         SensorError: another name.
@@ -71,7 +82,23 @@ def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = 
     if name not in NAMED_SETS:
         raise SensorError("sensors", "name", f"'{name}'", f"{', '.join(NAMED_SETS)}, or a mapping of sensors")
     torque, wrench = name in ("full", "joints"), name in ("full", "contacts")
-    return SensorSet(np.full(n, torque), np.full((contacts, 6), wrench), noise or SensorNoise())
+    torques = np.append(np.full(n, torque), np.zeros(6 * ft, dtype=bool))
+    return SensorSet(torques, np.full((contacts, 6), wrench), noise or SensorNoise())
+
+
+def with_ft_sensors(sensors: SensorSet, robot: Robot, names: Iterable[str], source: object = "sensors") -> SensorSet:
+    """The set with force/torque sensors in limbs, by the names of their fixed joints, beside what it has.
+
+    Raises:
+        UnknownNameError: one that the robot was not loaded with.
+    """
+    torque = sensors.torque.copy()
+    for name in names:
+        if name not in robot.ft_names:
+            raise UnknownNameError(source, "sensors.ft_sensors", name, robot.ft_names)
+        first = robot.n + 6 * robot.ft_names.index(name)
+        torque[first : first + 6] = True
+    return replace(sensors, torque=torque)
 
 
 def chosen_sensors(
@@ -81,6 +108,7 @@ def chosen_sensors(
     contact_wrenches: Mapping[str, Iterable[str]],
     noise: SensorNoise | None = None,
     source: object = "sensors",
+    ft: int = 0,
 ) -> SensorSet:
     """A set chosen by name.
 
@@ -91,12 +119,13 @@ def chosen_sensors(
         contact_wrenches: measured components ("fx" ... "mz") by contact frame.
         noise: of the sensors.
         source: named in errors.
+        ft: force/torque sensors in limbs that the robot has; none of them is in the set.
 
     Raises:
         UnknownNameError: a joint, contact or component that does not exist.
         SensorError: a component that its contact cannot exert.
     """
-    torque = np.zeros(len(joint_names), dtype=bool)
+    torque = np.zeros(len(joint_names) + 6 * ft, dtype=bool)
     for name in joint_torques:
         if name not in joint_names:
             raise UnknownNameError(source, "sensors.joint_torques", name, joint_names)

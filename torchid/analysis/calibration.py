@@ -1,0 +1,161 @@
+"""What offsets and scales of sensors, and terms of actuators, are, and which of them cannot be told from masses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchid import parameters
+from torchid.estimators.result import Estimate
+from torchid.parameters import Array
+from torchid.problem.elimination import Assembly, Elimination
+from torchid.problem.extras import Extra
+from torchid.problem.threads import one_thread
+
+APART = 10.0
+"""An unknown whose standard error grows more than this by not knowing all others cannot be told from them.
+
+It is a variance inflation of 100, ten times what is commonly taken for serious collinearity; source: Belsley, Kuh,
+Welsch, "Regression Diagnostics", 1980.
+"""
+
+_ROUNDING = 1e-6
+_NAMED = 4  # parameters, at most, that a message names
+
+
+@dataclass(frozen=True)
+class ExtraEstimate:
+    """An unknown beside the bodies' parameters, found.
+
+    Attributes:
+        extra: which.
+        log: whose, "" of all.
+        value: in its unit.
+        standard_error: without the pull to nominal parameters, infinite where the data do not determine it.
+        inflation: of the standard error by not knowing all other unknowns and parameters, at least 1.
+        mixed_with: what it cannot be told from, most first; empty if it can.
+    """
+
+    extra: Extra
+    log: str
+    value: float
+    standard_error: float
+    inflation: float
+    mixed_with: tuple[str, ...]
+
+    @property
+    def told_apart(self) -> bool:
+        """Whether the data tell it from everything else."""
+        return self.inflation <= APART
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What the rows say of the free parameters, in units of their scale and of the rows' noise.
+
+    `root`, (P', rank): its outer product is their covariance; `hidden`, (P', ...): directions that no row sees.
+    """
+
+    root: Array
+    hidden: Array
+    scale: Array
+    free: np.ndarray
+
+    @classmethod
+    def of(cls, assembly: Assembly, rank_tolerance: float) -> _Known:
+        problem = assembly.problem
+        scale = problem.scale[problem.free]
+        _, values, Vt = np.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=True)
+        least = max(rank_tolerance, np.finfo(float).eps * max(problem.A.shape)) * values.max(initial=0.0)
+        rank = int((values > least).sum())
+        return cls(Vt[:rank].T / values[:rank], Vt[rank:].T, scale, problem.free)
+
+    def reached(self, sensitivity: Array) -> Array:
+        """Sensitivities to all parameters, (M, 12 L), as those to the scaled free ones, (M, P')."""
+        return np.asarray(sensitivity[:, self.free] * self.scale)
+
+
+@one_thread()
+def estimate_extras(
+    assembly: Assembly, estimate: Estimate, body_names: Sequence[str], rank_tolerance: float = 1e-10
+) -> list[ExtraEstimate]:
+    """All unknowns that were eliminated, at the estimated parameters; those that no row has are left out.
+
+    Args:
+        assembly: from `assemble`.
+        estimate: of its problem.
+        body_names: the robot's.
+        rank_tolerance: as in `LeastSquares`.
+    """
+    known, names = _Known.of(assembly, rank_tolerance), _names(assembly.problem.free, body_names)
+    noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
+    shared = next((found for found in assembly.eliminations if not found.log), None)
+    of_all = None if shared is None else shared.inverse @ (shared.z - shared.C @ estimate.phi)
+    out = []
+    for found in assembly.eliminations:
+        P = len(estimate.phi)
+        left = found.C[:, :P] @ estimate.phi
+        through = None
+        if found is not shared and shared is not None and of_all is not None:
+            left = left + found.C[:, P:] @ of_all
+            through = found.inverse @ found.C[:, P:]
+        value = found.inverse @ (found.z - left)
+        out += _found(found, value, noise, known, names, None if through is None else (through, shared))
+    return out
+
+
+def _found(
+    found: Elimination,
+    value: Array,
+    noise: float,
+    known: _Known,
+    names: Sequence[str],
+    through: tuple[Array, Elimination | None] | None,
+) -> list[ExtraEstimate]:
+    """The unknowns of one elimination; `through`: how they depend on those of all logs, and these."""
+    P = len(known.free)
+    sensitivity, own, hidden = found.inverse @ found.C[:, :P], [found.inverse], [found.hidden]
+    if through is not None and through[1] is not None:
+        shared = through[1]
+        sensitivity = sensitivity - through[0] @ shared.inverse @ shared.C[:, :P]
+        own.append(through[0] @ shared.inverse)
+        hidden.append(through[0] @ shared.hidden)
+    G = known.reached(sensitivity)
+    unseen = G @ known.hidden
+    size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
+    lost = np.linalg.norm(unseen, axis=1) > _ROUNDING * size
+    variance = sum((x**2).sum(1) for x in (*own, G @ known.root))
+    undetermined = lost | ~found.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > _ROUNDING)
+    deviation = np.where(undetermined, np.inf, np.sqrt(variance))
+    out = []
+    for k, extra in enumerate(found.extras):
+        if not np.isfinite(found.alone[k]):
+            continue
+        inflation = float(deviation[k] / found.alone[k])
+        mixed: tuple[str, ...] = ()
+        if inflation > APART:
+            along = known.hidden @ unseen[k] if lost[k] else known.root @ (known.root.T @ G[k])
+            mixed = _largest(along, names) if np.abs(along).max(initial=0.0) > 0.0 else ()
+            others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.hidden[k]), _labels(found))
+            mixed = (*mixed, *others)
+        out.append(ExtraEstimate(extra, found.log, float(value[k]), noise * float(deviation[k]), inflation, mixed))
+    return out
+
+
+def _labels(found: Elimination) -> list[str]:
+    return [extra.label for extra in found.extras]
+
+
+def _largest(along: Array, names: Sequence[str]) -> tuple[str, ...]:
+    """Names of the largest components of a direction, none that is small beside them."""
+    order = np.argsort(-np.abs(along))[:_NAMED]
+    least = max(0.2 * np.abs(along).max(initial=0.0), _ROUNDING)
+    return tuple(names[k] for k in order if np.abs(along[k]) > least)
+
+
+def _names(free: np.ndarray, body_names: Sequence[str]) -> list[str]:
+    """Names of the free parameters: "pelvis m"."""
+    every = [f"{body} {name}" for body in body_names for name in parameters.PARAMETERS]
+    return [name for name, chosen in zip(every, free, strict=True) if chosen]

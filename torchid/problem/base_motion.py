@@ -1,0 +1,102 @@
+"""How the base moves: from its pose, or from an IMU anywhere on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from torchid.errors import LogError
+from torchid.logs import Log
+from torchid.parameters import Array
+from torchid.regressor.motion import GRAVITY_WORLD, motion_from_state, rotation_matrix
+from torchid.robot import Robot
+
+_POSE_FIELDS = (
+    "base_quat_xyzw",
+    "base_angular_velocity_base",
+    "base_angular_acceleration_base",
+    "base_linear_acceleration_world",
+)
+_IMU_FIELDS = ("imu_specific_force", "imu_angular_velocity", "imu_angular_acceleration")
+_ACCEPTED = {
+    "base_quat_xyzw": "base_quat_wxyz or base_quat_xyzw, or imu_frame, imu_specific_force and imu_angular_velocity",
+    "base_linear_acceleration_world": "base_position_world, base_linear_velocity_{world,base} or "
+    "base_linear_acceleration_{world,base}, or an IMU's readings",
+}
+
+
+@dataclass(frozen=True)
+class BaseMotion:
+    """All that the dynamics depend on of the base at N samples, in the base frame; None where it is not known.
+
+    Attributes:
+        quat_xyzw: (N, 4), rotates base to world.
+        specific_force: (N, 3), acceleration of the base origin minus gravity [m/s^2].
+        angular_velocity, angular_acceleration: (N, 3) [rad/s, rad/s^2].
+    """
+
+    quat_xyzw: Tensor | None = None
+    specific_force: Tensor | None = None
+    angular_velocity: Tensor | None = None
+    angular_acceleration: Tensor | None = None
+
+    @classmethod
+    def of(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
+        """Of generalized coordinates as `Regressor` takes them; nothing of a bolted base."""
+        if fixed_base:
+            return cls()
+        found = motion_from_state(q, v, a, q.shape[1] - 7)
+        return cls(q[:, 3:7], found.base_specific_force, found.base_angular_velocity, found.base_angular_acceleration)
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> BaseMotion:
+        """With every tensor changed."""
+        return BaseMotion(**{name: change(x) for name, x in vars(self).items() if x is not None})
+
+    @property
+    def rotation(self) -> Tensor | None:
+        """Rotation base to world, (N, 3, 3), if it is known."""
+        return None if self.quat_xyzw is None else rotation_matrix(self.quat_xyzw)
+
+
+def base_motion(log: Log, robot: Robot) -> BaseMotion:
+    """How the base moves in a preprocessed log; of a bolted base, how it is mounted.
+
+    An IMU is taken where the log has one: what it reads is what the dynamics depend on, without differentiation. The
+    orientation is kept beside it, for wrenches along world axes.
+
+    Raises:
+        LogError: neither the base's motion nor an IMU's readings, or an IMU that is not on the base.
+        UnknownNameError: an IMU frame that the robot does not have.
+    """
+    quat = None if log.base_quat_xyzw is None else torch.from_numpy(log.base_quat_xyzw)
+    if robot.fixed_base:
+        return BaseMotion(quat)
+    if log.imu_frame:
+        return _from_imu(log, robot, quat)
+    missing = [name for name in _POSE_FIELDS if getattr(log, name) is None]
+    if missing or quat is None:
+        accepted = _ACCEPTED.get(missing[0], f"{missing[0]}, or a log passed through preprocess()")
+        raise LogError(log.source, missing[0], "missing, though the base floats", accepted)
+    _, omega, alpha, acceleration = (torch.from_numpy(getattr(log, name)) for name in _POSE_FIELDS)
+    force = acceleration - acceleration.new_tensor(GRAVITY_WORLD)
+    return BaseMotion(quat, (rotation_matrix(quat).mT @ force[..., None])[..., 0], omega, alpha)
+
+
+def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
+    """The base's motion from that of a frame that is rigidly on it: rigid-body kinematics with the lever arm."""
+    body, T_base_imu = robot.link(log.imu_frame, "imu_frame", log.source)
+    if body != 0:
+        found = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
+        raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(robot.bodies[0].links[:8])}")
+    for name in _IMU_FIELDS:
+        if getattr(log, name) is None:
+            raise LogError(log.source, name, "missing", f"{name}, or a log passed through preprocess()")
+    turn, arm = Rotation.from_matrix(T_base_imu[:3, :3]), T_base_imu[:3, 3]
+    force, omega, alpha = (turn.apply(getattr(log, name)) for name in _IMU_FIELDS)
+    at_origin: Array = force - np.cross(alpha, arm) - np.cross(omega, np.cross(omega, arm))
+    return BaseMotion(quat, *map(torch.from_numpy, (at_origin, omega, alpha)))

@@ -1,0 +1,112 @@
+"""Problems with unknowns beside the bodies' parameters: these are eliminated, so that estimators never see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchid.parameters import Array
+from torchid.problem.extras import Extra
+from torchid.problem.linear import LinearProblem
+from torchid.problem.rows import RowBuilder
+from torchid.problem.streaming import Part, linear_problem, merged, posed
+from torchid.problem.threads import one_thread
+from torchid.robot import Robot
+
+_DEPENDENT = 1e-10  # a singular value of the unknowns' unit columns below this share of the largest is rounding
+_HIDDEN = 1e-6  # as in `LeastSquares`
+
+
+@dataclass(frozen=True)
+class Elimination:
+    """Unknowns psi of one log, or of all, in terms of what is left: `psi = inverse @ (z - C @ left)`.
+
+    Attributes:
+        log: their source, "" for those of all logs.
+        extras: M unknowns.
+        inverse: (M, r), of least norm; the noise of the r rows is white, of unit variance, and in no other row.
+        C: (r, 12 L + S), columns of the bodies' parameters and, for those of one log, of the S unknowns of all logs.
+        z: (r,).
+        alone: (M,), standard deviation of each unknown if all else were known, infinite where no row has it.
+        hidden: (M, M) projector to combinations that no row has.
+    """
+
+    log: str
+    extras: tuple[Extra, ...]
+    inverse: Array
+    C: Array
+    z: Array
+    alone: Array
+    hidden: Array
+
+    @property
+    def determined(self) -> np.ndarray:
+        """Unknowns that the rows give if the bodies' parameters are known, (M,) bool."""
+        return np.asarray(np.isfinite(self.alone) & (np.linalg.norm(self.hidden, axis=1) < _HIDDEN))
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """What estimators see, and what has been eliminated from it: log by log, the unknowns of all logs last."""
+
+    problem: LinearProblem
+    eliminations: tuple[Elimination, ...]
+
+
+@one_thread()
+def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction: bool = True) -> Assembly:
+    """The problem that parts of logs pose together in the bodies' parameters.
+
+    Unknowns of a log, then those of all logs, are eliminated by orthogonal projection, which leaves the least-squares
+    solution, and the noise of the rows, as they are.
+    """
+    factors = {source: [part.factor for part in parts if part.source == source] for source in _sources(parts)}
+    if not builder.extras:
+        everything = merged((part.factor for part in parts), builder)
+        return Assembly(linear_problem(everything, builder, robot, friction), ())
+    count = builder.columns.count
+    per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
+    found, left = [], []
+    for source, own in factors.items():
+        R = merged(own, builder).triangle().numpy()
+        rest = np.delete(R, [count + number for number in per_log], axis=1)
+        if per_log:
+            extras = tuple(builder.extras[number] for number in per_log)
+            elimination, rest = _eliminate(source, extras, R[:, [count + number for number in per_log]], rest, builder)
+            found.append(elimination)
+        left.append(rest)
+    rows: Array = np.asarray(np.linalg.qr(np.concatenate(left), mode="r"))
+    if of_all:
+        extras = tuple(builder.extras[number] for number in of_all)
+        elimination, rows = _eliminate("", extras, rows[:, count:-1], np.delete(rows, np.s_[count:-1], axis=1), builder)
+        found.append(elimination)
+        rows = np.asarray(np.linalg.qr(rows, mode="r"))
+    everything = merged((part.factor for part in parts), builder)
+    spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in found)
+    rows_left = max(everything.rows - round(spent), 1)
+    problem = posed(rows, rows_left, everything.oversampling, builder, robot, friction)
+    return Assembly(problem, tuple(found))
+
+
+def _sources(parts: Sequence[Part]) -> list[str]:
+    return list(dict.fromkeys(part.source for part in parts))
+
+
+def _eliminate(
+    log: str, extras: tuple[Extra, ...], columns: Array, rest: Array, builder: RowBuilder
+) -> tuple[Elimination, Array]:
+    """The unknowns of some columns, (R, M), and the rows of the rest, (R, ...), right-hand side last, without them."""
+    norms = np.linalg.norm(columns, axis=0)
+    seen = norms > _DEPENDENT * max(norms.max(initial=0.0), np.finfo(float).tiny)
+    scale = np.where(seen, norms, 1.0)
+    U, values, Vt = np.linalg.svd(np.where(seen, columns / scale, 0.0), full_matrices=True)
+    rank = int((values > _DEPENDENT * max(values.max(initial=0.0), np.finfo(float).tiny)).sum())
+    top, V = U[:, :rank].T @ rest, Vt[:rank].T
+    count = builder.columns.count
+    C = np.hstack([top[:, :count] @ builder.columns.from_parameters(), top[:, count:-1]])
+    alone = np.where(seen, 1.0 / scale, np.inf)
+    hidden = np.eye(len(extras)) - V @ V.T
+    found = Elimination(log, extras, (V / values[:rank]) / scale[:, None], C, top[:, -1], alone, hidden)
+    return found, U[:, rank:].T @ rest

@@ -1,0 +1,107 @@
+"""Unknowns beside the bodies' parameters: offsets and scales of the sensors, and what actuators add."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from torchid.problem.measured import read_components
+from torchid.robot import Robot
+from torchid.sensing.contacts import Contact
+from torchid.sensing.sensors import SensorSet
+from torchid.wrenches import COMPONENTS
+
+CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
+"""Kinds of sensor channels, as `SensorNoise` has them."""
+
+ACTUATORS = ("armature", "torque_offset", "asymmetric_coulomb")
+"""What belongs to the joints rather than to the sensors."""
+
+_UNITS = dict(zip(CHANNELS, ("N m", "N", "N m", "N", "N m"), strict=True))
+_SIZES = dict(zip(CHANNELS, (5.0, 50.0, 5.0, 50.0, 5.0), strict=True))
+
+
+@dataclass(frozen=True)
+class ExtraTerms:
+    """Which unknowns there are, none by default.
+
+    A reading y of a sensor with an offset o and a scale s stands for the force s y - o. `offsets` and `scales` say for
+    some of `CHANNELS` whether they are constant over a "log" or over "all" logs.
+
+    Of every joint whose torque is measured: `armature` (reflected rotor inertia, times the joint's acceleration),
+    `torque_offset`, and `asymmetric_coulomb`, half the difference of Coulomb friction forwards and backwards.
+    `sign_width` [rad/s or m/s] replaces the sign of a velocity v in Coulomb friction by tanh(v / width).
+    """
+
+    offsets: Mapping[str, str] = field(default_factory=dict)
+    scales: Mapping[str, str] = field(default_factory=dict)
+    armature: bool = False
+    torque_offset: bool = False
+    asymmetric_coulomb: bool = False
+    sign_width: float | None = None
+
+
+@dataclass(frozen=True)
+class Extra:
+    """One unknown.
+
+    Attributes:
+        what: "offset", "scale" (less 1), "armature", "torque_offset" or "asymmetric_coulomb".
+        name: of the joint or the sensor's frame; `component`: of its wrench, "" of a joint torque.
+        unit: of the unknown.
+        size: of a plausible value, in this unit.
+        per_log: whether every log has its own.
+        dof: place in the robot's `dof_names`, or
+        contact: place among the contacts and component along the axes that the log has the wrench in.
+    """
+
+    what: str
+    name: str
+    component: str
+    unit: str
+    size: float
+    per_log: bool
+    dof: int | None = None
+    contact: tuple[int, int] | None = None
+
+    @property
+    def label(self) -> str:
+        """In words: "offset of l_sole fz"."""
+        channel = f"{self.name} {self.component}".strip()
+        return f"{self.what.replace('_', ' ').replace('coulomb', 'Coulomb friction')} of {channel}"
+
+
+def extras_of(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms) -> tuple[Extra, ...]:
+    """All unknowns of a robot with its sensors, those of sensors first.
+
+    Where a log has wrenches along world axes, an offset is constant along these, so that every axis has one as soon as
+    one component of the vector is measured.
+    """
+    found: list[Extra] = []
+    for what, scopes in (("offset", terms.offsets), ("scale", terms.scales)):
+        for channel, name, component, dof, contact in _channels(robot, contacts, sensors):
+            if channel in scopes:
+                unit, size = (_UNITS[channel], _SIZES[channel]) if what == "offset" else ("1", 0.1)
+                found.append(Extra(what, name, component, unit, size, scopes[channel] == "log", dof, contact))
+    measured = np.flatnonzero(sensors.torque[: robot.n]).tolist()
+    for what, unit, size in zip(ACTUATORS, ("kg m^2", "N m", "N m"), (0.1, 5.0, 1.0), strict=True):
+        if getattr(terms, what):
+            found += [Extra(what, robot.joint_names[dof], "", unit, size, False, dof) for dof in measured]
+    return tuple(found)
+
+
+def _channels(
+    robot: Robot, contacts: Sequence[Contact], sensors: SensorSet
+) -> Iterator[tuple[str, str, str, int | None, tuple[int, int] | None]]:
+    """Kind, name, component and place of every channel that is read."""
+    for dof in np.flatnonzero(sensors.torque).tolist():
+        name, _, component = (
+            robot.dof_names[dof].rpartition(".") if dof >= robot.n else (robot.joint_names[dof], "", "")
+        )
+        kind = "joint_torque" if dof < robot.n else "ft_force" if component.startswith("f") else "ft_moment"
+        yield kind, name, component, dof, None
+    for place, k in np.argwhere(read_components(contacts, sensors, in_world=True)).tolist():
+        kind = "contact_force" if k < 3 else "contact_moment"
+        yield kind, contacts[place].frame, COMPONENTS[k], None, (place, k)
