@@ -69,11 +69,32 @@ class TrainingConfig:
 
 
 @dataclass(config=STRICT, frozen=True)
+class RobustConfig:
+    """Rows that fit badly count less, in re-weighted passes.
+
+    `loss` of whitened residuals, `tuning` in robust standard deviations (None: 1.345 for huber, 4.685 for tukey),
+    `passes` at most.
+    """
+
+    loss: Literal["huber", "tukey"]
+    tuning: Positive | None = None
+    passes: Count = 50
+
+
+def _by_loss(value: object) -> object:
+    """A robust fit as a mapping, where it may be a loss alone."""
+    return {"loss": value} if isinstance(value, str) else value
+
+
+Robust = Annotated[RobustConfig, BeforeValidator(_by_loss)]
+
+
+@dataclass(config=STRICT, frozen=True)
 class EstimatorConfig:
     """How parameters are found.
 
     `ridge` pulls to the URDF, `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of
-    theirs; `margin` of the scaled pseudo-inertias.
+    theirs; `robust` takes outliers out of a batch fit; `margin` of the scaled pseudo-inertias.
 
     For `consistent`: `prior` that the ridge is in, `total_mass` [kg] if known, `method` and whether to `certify` with
     the other; `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry` makes left
@@ -87,6 +108,7 @@ class EstimatorConfig:
     rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
     friction: bool = True
     frozen: list[str] = dataclasses.field(default_factory=list)
+    robust: Robust | None = None
     margin: Annotated[Number, Field(ge=0.0, lt=1.0)] = 1e-4
     prior: Literal["euclidean", "pullback", "entropic"] = "euclidean"
     method: Literal["barrier", "certified"] = "barrier"
@@ -102,10 +124,11 @@ class EstimatorConfig:
 
 
 _ALL = ("name", "ridge", "rank_tolerance", "friction", "frozen")
+_BATCH = (*_ALL, "robust")
 _PHYSICAL = ("prior", "method", "certify", "total_mass", "com_inside", "com_shapes", "symmetry", "bounds")
 _KEYS = {
-    "least_squares": _ALL,
-    "consistent": (*_ALL, "margin", *_PHYSICAL),
+    "least_squares": _BATCH,
+    "consistent": (*_BATCH, "margin", *_PHYSICAL),
     "sgd": (*_ALL, "margin", "consistency", "penalties", "training"),
 }
 

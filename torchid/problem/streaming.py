@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 
 import numpy as np
+from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
@@ -20,6 +21,8 @@ from torchid.problem.threads import one_thread
 from torchid.problem.triangular import TriangularFactor
 from torchid.problem.workspace import Workspace
 from torchid.robot import Robot
+
+Weighing = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
 
 
 @dataclass
@@ -64,17 +67,22 @@ def compress_parts(
     chunk: int = CHUNK,
     threads: int | None = None,
     progress: Progress | None = None,
+    weigh: Weighing | None = None,
 ) -> list[Part]:
     """As `compress`, but with a factor for every contact state in every log, in the order of the logs.
 
-    Logs of one source count as one.
+    Logs of one source count as one. `weigh` may change rows before they are added: called with the samples they come
+    from, their columns and themselves.
     """
-    parts = _together(over_chunks(logs, builder, partial(_fold, builder, by_log=True), chunk, threads, progress))
+    fold = partial(_fold, builder, by_log=True, weigh=weigh)
+    parts = _together(over_chunks(logs, builder, fold, chunk, threads, progress))
     order = list(dict.fromkeys(samples.source for samples in logs))
     return sorted(parts, key=lambda part: order.index(part.source))
 
 
-def _fold(builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool) -> list[Part]:
+def _fold(
+    builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weigh: Weighing | None = None
+) -> list[Part]:
     """Parts of some chunks, all logs together unless `by_log`."""
     parts: dict[tuple[str, State], Part] = {}
     workspace = Workspace()
@@ -84,7 +92,8 @@ def _fold(builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: 
             parts[key] = Part(*key, TriangularFactor(builder.width), 0)
         parts[key].samples += len(samples)
         for support, rows in builder.rows(samples, state, workspace):
-            parts[key].factor.add(support, rows, samples.oversampling)
+            weighed = rows if weigh is None else weigh(samples, support, rows)
+            parts[key].factor.add(support, weighed, samples.oversampling)
     return list(parts.values())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 from rich.progress import Progress
 
-from torchid.analysis.calibration import estimate_extras
 from torchid.analysis.contributions import Contributions, contributions
 from torchid.config import ExperimentConfig
 from torchid.errors import NumericalWarning, SensorError
@@ -27,9 +26,11 @@ from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.run.calibration import Calibration, warn_of_confounded
 from torchid.run.estimation import assembled, batch_estimator, stated_conditions
 from torchid.run.experiment import Experiment, set_up
+from torchid.run.fit import Fit, fitted
 from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
 from torchid.run.results import Identification, candidates, write_run
+from torchid.run.robust import RobustSummary, loss_of, robust_fit
 from torchid.run.training import Training, check_training
 
 _IMPLAUSIBLE = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
@@ -75,30 +76,32 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
             states = state_reports(logs["train"], builder)
             check_base(states, config.sensors.on_base_lost)
             parts = _compressed(builder, logs["train"], bars)
-            assembly = assembled(parts, builder, experiment.robot, config.estimator, source)
-            problem = assembly.problem
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device, experiment.terms)
         with clock("solve"):
+            solve: Callable[[LinearProblem], Estimate]
             if isinstance(estimator, Training):
                 evaluate = partial(_identified_metrics, evaluation, logs)
-                estimate: Estimate = estimator.run(problem, builder, logs, evaluate, bars, resume)
+                solve = partial(estimator.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
             else:
-                estimate = estimator.solve(problem)
-            _check_sense(estimate, source)
-            tolerance = config.estimator.rank_tolerance
-            extras = estimate_extras(assembly, estimate, experiment.robot.body_names, tolerance)
-            warn_of_confounded(extras, source)
-        with clock("identifiability"):
-            alone = _by_state(experiment, builder, parts, source)
-            adds = _contributions(experiment, builder, parts, logs["train"], problem, bars)
+                solve = estimator.solve
+            fit = fitted(parts, experiment, builder, solve, source)
+            fit, robust = _robust(fit, experiment, builder, solve, logs["train"], bars, source)
             del parts
+            estimate, problem = fit.estimate, fit.assembly.problem
+            _check_sense(estimate, source)
+            warn_of_confounded(fit.extras, source)
+        with clock("identifiability"):
+            alone = _by_state(experiment, builder, fit.parts, source)
+            adds = _contributions(experiment, builder, fit.parts, logs["train"], problem, bars)
         with clock("evaluate"):
-            calibration = Calibration.of(experiment, estimate.phi, extras)
+            calibration = Calibration.of(experiment, estimate.phi, fit.extras)
             logs = {name: calibration.logs(same) for name, same in logs.items()}
             metrics = _metrics(evaluation, logs, calibration.parameters(evaluation), bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
         samples = sum(map(len, logs["train"]))
-        run = Identification(experiment, estimate, extras, states, alone, adds, metrics, broken, clock.seconds, samples)
+        run = Identification(
+            experiment, estimate, fit.extras, robust, states, alone, adds, metrics, broken, clock.seconds, samples
+        )
         bars.add_task("writing", total=None)
         shown = (logs["test"] or logs["train"])[0]
         write_run(run, evaluation, shown, calibration.parameters(evaluation), training)
@@ -118,6 +121,40 @@ def _read(experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
 def _compressed(builder: RowBuilder, train: Sequence[Samples], bars: Progress) -> list[Part]:
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
     return compress_parts(train, builder, progress=lambda n: bars.advance(streaming, n))
+
+
+def _robust(
+    fit: Fit,
+    experiment: Experiment,
+    builder: RowBuilder,
+    solve: Callable[[LinearProblem], Estimate],
+    train: Sequence[Samples],
+    bars: Progress,
+    source: object,
+) -> tuple[Fit, RobustSummary | None]:
+    """The fit with outliers weighed down, if that is asked for.
+
+    Warns:
+        NumericalWarning: the passes were too few.
+    """
+    settings = experiment.config.estimator.robust
+    if settings is None:
+        return fit, None
+    bar = bars.add_task("weighing outliers down", total=settings.passes * sum(map(len, train)))
+    better, found = robust_fit(
+        fit,
+        loss_of(settings.loss, settings.tuning),
+        settings.passes,
+        train,
+        builder,
+        lambda parts: fitted(parts, experiment, builder, solve, source),
+        lambda n: bars.advance(bar, n),
+    )
+    bars.update(bar, total=1, completed=1)
+    if not found.converged:
+        message = f"{source}: estimator.robust: not settled after {found.passes} passes; accepted: more passes"
+        warnings.warn(message, NumericalWarning, stacklevel=3)
+    return better, found
 
 
 def _by_state(

@@ -27,6 +27,7 @@ from torchid.report.urdf_export import identified_urdf
 from torchid.robot import Robot
 from torchid.run.experiment import Experiment
 from torchid.run.folder import new_folder, write_json
+from torchid.run.robust import RobustSummary
 from torchid.run.training import Training, body_eigenvalues
 
 _PLOTTED_SAMPLES = 3000
@@ -36,12 +37,14 @@ _PLOTTED_SAMPLES = 3000
 class Identification:
     """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
 
-    `extras`: unknowns beside the bodies' parameters. `adds`: what each training log, contact state and sensor adds.
+    `extras`: unknowns beside the bodies' parameters. `robust`: how outliers were weighed
+    down, if so. `adds`: what each training log, contact state and sensor adds.
     """
 
     experiment: Experiment
     estimate: Estimate
     extras: list[ExtraEstimate]
+    robust: RobustSummary | None
     states: list[StateReport]
     by_state: dict[str, Estimate]
     adds: Contributions
@@ -136,6 +139,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "total_mass": float(run.phi[:, 0].sum()),
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
+        "robust": None if run.robust is None else asdict(run.robust),
         "violations": run.violations_by_name(),
         "solution": _solution_document(estimate),
         "contact_states": run.state_entries(),

@@ -1,0 +1,27 @@
+"""Samples near the moments at which contacts come and go: impacts and slip are no rigid-body dynamics."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchid.logs.fields import BoolArray, FloatArray
+from torchid.logs.log import Log
+
+
+def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray:
+    """Which of some stamps lie within a margin of a change of contact.
+
+    Args:
+        log: as recorded; a change lies between two of its samples.
+        time: (K,) [s].
+        margin: [s] before the last sample of the old and after the first of the new contact state.
+    """
+    near = np.zeros(len(time), dtype=bool)
+    if log.contact_active is None:
+        return near
+    changes = np.flatnonzero((log.contact_active[1:] != log.contact_active[:-1]).any(axis=1))
+    first = np.searchsorted(time, log.time[changes] - margin)
+    last = np.searchsorted(time, log.time[changes + 1] + margin, side="right")
+    for start, stop in zip(first, last, strict=True):
+        near[start:stop] = True
+    return near

@@ -1,0 +1,56 @@
+"""A fit of compressed logs: the problem they pose, its solution, and the unknowns that were eliminated on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from torchid.analysis.calibration import ExtraEstimate, estimate_extras
+from torchid.estimators import Estimate
+from torchid.problem import LinearProblem, RowBuilder
+from torchid.problem.elimination import Assembly
+from torchid.problem.streaming import Part
+from torchid.run.estimation import assembled
+from torchid.run.experiment import Experiment
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Compressed logs, what they pose, and its solution."""
+
+    parts: list[Part]
+    assembly: Assembly
+    estimate: Estimate
+    extras: list[ExtraEstimate]
+
+    def columns(self, builder: RowBuilder, log: str) -> Tensor:
+        """Parameters in the builder's columns for the rows of a log, (width,)."""
+        values = {x.extra.label: x.value for x in self.extras if x.log in ("", log)}
+        extras = [values.get(extra.label, 0.0) for extra in builder.extras]
+        return builder.columns_of(np.append(self.estimate.phi, extras)[None])[0]
+
+
+def fitted(
+    parts: list[Part],
+    experiment: Experiment,
+    builder: RowBuilder,
+    solve: Callable[[LinearProblem], Estimate],
+    source: object = "experiment",
+) -> Fit:
+    """Fit the logs that have been compressed.
+
+    Args:
+        parts: of the logs.
+        experiment: robot and settings.
+        builder: of the rows.
+        solve: an estimator.
+        source: named in errors.
+    """
+    settings, robot = experiment.config.estimator, experiment.robot
+    assembly = assembled(parts, builder, robot, settings, source)
+    estimate = solve(assembly.problem)
+    extras = estimate_extras(assembly, estimate, robot.body_names, settings.rank_tolerance)
+    return Fit(parts, assembly, estimate, extras)
