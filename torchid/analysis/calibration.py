@@ -12,6 +12,7 @@ from torchid.estimators.result import Estimate
 from torchid.parameters import Array
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
+from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
 
 APART = 10.0
@@ -55,26 +56,76 @@ class ExtraEstimate:
 class _Known:
     """What the rows say of the free parameters, in units of their scale and of the rows' noise.
 
-    `root`, (P', rank): its outer product is their covariance; `hidden`, (P', ...): directions that no row sees.
+    `root`, (P', rank): its outer product is their covariance; `hidden`, (P', ...): directions that no row sees;
+    `values`: singular values that belong to the columns of both.
     """
 
     root: Array
     hidden: Array
+    values: Array
     scale: Array
     free: np.ndarray
 
     @classmethod
-    def of(cls, assembly: Assembly, rank_tolerance: float) -> _Known:
-        problem = assembly.problem
+    def of(cls, problem: LinearProblem, rank_tolerance: float) -> _Known:
         scale = problem.scale[problem.free]
         _, values, Vt = np.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=True)
         least = max(rank_tolerance, np.finfo(float).eps * max(problem.A.shape)) * values.max(initial=0.0)
         rank = int((values > least).sum())
-        return cls(Vt[:rank].T / values[:rank], Vt[rank:].T, scale, problem.free)
+        values = np.pad(values, (0, len(Vt) - len(values)))
+        values[rank:] = 0.0
+        return cls(Vt[:rank].T / values[:rank], Vt[rank:].T, values, scale, problem.free)
+
+    def blamed(self, sensitivity: Array, noise: float) -> Array:
+        """Variance along sensitivities (P',) that each parameter brings in, if none is off by more than its scale.
+
+        Without that bound the worst known would be named, however little it weighs.
+        """
+        rank = self.root.shape[1]
+        directions = np.hstack([self.root * self.values[:rank], self.hidden])
+        along = directions.T @ sensitivity / (1.0 + (self.values / noise) ** 2)
+        return np.asarray(sensitivity * (directions @ along))
 
     def reached(self, sensitivity: Array) -> Array:
         """Sensitivities to all parameters, (M, 12 L), as those to the scaled free ones, (M, P')."""
         return np.asarray(sensitivity[:, self.free] * self.scale)
+
+
+@dataclass(frozen=True)
+class TotalMass:
+    """How well the total mass is known [kg]: `standard_error`, infinite where the data do not determine it.
+
+    `told_apart`: whether they tell it from offsets and scales of sensors, as of `ExtraEstimate`.
+    """
+
+    standard_error: float
+    told_apart: bool
+
+
+def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1e-10) -> TotalMass:
+    """Of the estimated parameters."""
+    weights = np.zeros((len(estimate.phi) // parameters.PER_BODY, parameters.PER_BODY))
+    weights[:, parameters.MASS] = 1.0
+    error, if_known = (
+        standard_error_of(problem, estimate, weights.flatten(), rank_tolerance)
+        for problem in (assembly.problem, assembly.if_known)
+    )
+    return TotalMass(error, not np.isfinite(if_known) or error <= APART * if_known)
+
+
+@one_thread()
+def standard_error_of(
+    problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = 1e-10
+) -> float:
+    """Standard error of a combination `weights @ phi`, (12 L,), without the pull to nominal parameters.
+
+    Infinite where the data do not determine it; what is not free counts as known.
+    """
+    known = _Known.of(problem, rank_tolerance)
+    along = known.reached(weights[None])
+    if np.linalg.norm(along @ known.hidden) > _ROUNDING * np.linalg.norm(along):
+        return float("inf")
+    return float(np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ known.root))
 
 
 @one_thread()
@@ -89,7 +140,7 @@ def estimate_extras(
         body_names: the robot's.
         rank_tolerance: as in `LeastSquares`.
     """
-    known, names = _Known.of(assembly, rank_tolerance), _names(assembly.problem.free, body_names)
+    known, names = _Known.of(assembly.problem, rank_tolerance), _names(assembly.problem.free, body_names)
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     shared = next((found for found in assembly.eliminations if not found.log), None)
     of_all = None if shared is None else shared.inverse @ (shared.z - shared.C @ estimate.phi)
@@ -136,8 +187,7 @@ def _found(
         inflation = float(deviation[k] / found.alone[k])
         mixed: tuple[str, ...] = ()
         if inflation > APART:
-            along = known.hidden @ unseen[k] if lost[k] else known.root @ (known.root.T @ G[k])
-            mixed = _largest(along, names) if np.abs(along).max(initial=0.0) > 0.0 else ()
+            mixed = _largest(known.blamed(G[k], noise), names)
             others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.hidden[k]), _labels(found))
             mixed = (*mixed, *others)
         out.append(ExtraEstimate(extra, found.log, float(value[k]), noise * float(deviation[k]), inflation, mixed))

@@ -49,10 +49,14 @@ class Elimination:
 
 @dataclass(frozen=True)
 class Assembly:
-    """What estimators see, and what has been eliminated from it: log by log, the unknowns of all logs last."""
+    """What estimators see, and what has been eliminated from it: log by log, the unknowns of all logs last.
+
+    `if_known`: the problem there would be if all that has been eliminated were known to be 0.
+    """
 
     problem: LinearProblem
     eliminations: tuple[Elimination, ...]
+    if_known: LinearProblem
 
 
 @one_thread()
@@ -63,9 +67,10 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     solution, and the noise of the rows, as they are.
     """
     factors = {source: [part.factor for part in parts if part.source == source] for source in _sources(parts)}
+    everything = merged((part.factor for part in parts), builder)
     if not builder.extras:
-        everything = merged((part.factor for part in parts), builder)
-        return Assembly(linear_problem(everything, builder, robot, friction), ())
+        problem = linear_problem(everything, builder, robot, friction)
+        return Assembly(problem, (), problem)
     count = builder.columns.count
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
     found, left = [], []
@@ -83,11 +88,13 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
         elimination, rows = _eliminate("", extras, rows[:, count:-1], np.delete(rows, np.s_[count:-1], axis=1), builder)
         found.append(elimination)
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
-    everything = merged((part.factor for part in parts), builder)
     spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in found)
     rows_left = max(everything.rows - round(spent), 1)
     problem = posed(rows, rows_left, everything.oversampling, builder, robot, friction)
-    return Assembly(problem, tuple(found))
+    known = np.delete(everything.triangle().numpy(), np.s_[count:-1], axis=1)
+    known = np.asarray(np.linalg.qr(known, mode="r"))
+    if_known = posed(known, everything.rows, everything.oversampling, builder, robot, friction)
+    return Assembly(problem, tuple(found), if_known)
 
 
 def _sources(parts: Sequence[Part]) -> list[str]:

@@ -20,6 +20,8 @@ from torchid.problem.streaming import compress_parts
 from torchid.report.metrics import Evaluation
 from torchid.run.experiment import Experiment
 
+_NAMED = 6  # sensors or bodies that a warning names
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -91,13 +93,22 @@ def warn_of_confounded(found: Sequence[ExtraEstimate], source: object) -> None:
     for log in dict.fromkeys(x.log for x in found):
         mixed = [x for x in found if x.log == log and not x.told_apart]
         if mixed:
-            named = ", ".join(x.extra.label for x in mixed[:4]) + (
-                f" and {len(mixed) - 4} more" if len(mixed) > 4 else ""
-            )
-            others = list(dict.fromkeys(name for x in mixed for name in x.mixed_with))
-            message = f"{log or source}: {named}: cannot be told from {', '.join(others[:6])}; neither can be trusted"
-            advice = "add motion that unloads the sensor, know the mass, or zero the sensor before the log"
+            named = _grouped(x.extra.label for x in mixed)
+            others = _grouped(name for x in mixed for name in x.mixed_with if " of " not in name)
+            message = f"{log or source}: {named} cannot be told from {others or 'each other'}; do not trust either"
+            advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
             warnings.warn(f"{message}; {advice}", ConfoundedWarning, stacklevel=3)
+
+
+def _grouped(labels: Iterable[str]) -> str:
+    """Labels by their beginnings, the most frequent first: "pelvis m mcx, torso m"."""
+    groups: dict[str, dict[str, None]] = {}
+    for label in labels:
+        first, _, last = label.rpartition(" ")
+        groups.setdefault(first, {})[last] = None
+    order = sorted(groups, key=lambda first: -len(groups[first]))
+    more = f" and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
+    return ", ".join(" ".join([first, *groups[first]]) for first in order[:_NAMED]) + more
 
 
 def _values_of(extras: Sequence[Extra], named: Mapping[str, float]) -> Array:

@@ -27,7 +27,8 @@ def assembled(
         UnknownNameError: a frozen body that the robot does not have.
     """
     assembly = assemble(parts, builder, robot, settings.friction)
-    return replace(assembly, problem=with_frozen(assembly.problem, settings, robot, source))
+    problem, known = (with_frozen(x, settings, robot, source) for x in (assembly.problem, assembly.if_known))
+    return replace(assembly, problem=problem, if_known=known)
 
 
 def with_frozen(

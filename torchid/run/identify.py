@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 from rich.progress import Progress
 
+from torchid.analysis.calibration import total_mass
 from torchid.analysis.contributions import Contributions, contributions
 from torchid.config import ExperimentConfig
 from torchid.errors import NumericalWarning, SensorError
@@ -100,7 +101,18 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
         samples = sum(map(len, logs["train"]))
         run = Identification(
-            experiment, estimate, fit.extras, robust, states, alone, adds, metrics, broken, clock.seconds, samples
+            experiment,
+            estimate,
+            fit.extras,
+            robust,
+            states,
+            alone,
+            adds,
+            metrics,
+            broken,
+            clock.seconds,
+            samples,
+            total_mass(fit.assembly, estimate, config.estimator.rank_tolerance),
         )
         bars.add_task("writing", total=None)
         shown = (logs["test"] or logs["train"])[0]

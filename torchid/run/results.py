@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from torchid.analysis.calibration import ExtraEstimate
+from torchid.analysis.calibration import ExtraEstimate, TotalMass
 from torchid.analysis.contributions import Contributions
 from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
@@ -37,8 +37,8 @@ _PLOTTED_SAMPLES = 3000
 class Identification:
     """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
 
-    `extras`: unknowns beside the bodies' parameters. `robust`: how outliers were weighed
-    down, if so. `adds`: what each training log, contact state and sensor adds.
+    `extras`: unknowns beside the bodies' parameters. `robust`: how outliers were weighed down, if so. `mass`: how well
+    the total mass is known. `adds`: what each training log, contact state and sensor adds.
     """
 
     experiment: Experiment
@@ -52,6 +52,7 @@ class Identification:
     violations: list[Violation]
     seconds: dict[str, float]
     samples: int
+    mass: TotalMass
 
     def violations_by_name(self) -> list[dict[str, object]]:
         """Conditions that the identified parameters break, the body by its name."""
@@ -137,6 +138,8 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
         "total_mass": float(run.phi[:, 0].sum()),
+        "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
+        "total_mass_told_from_offsets": run.mass.told_apart,
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
         "robust": None if run.robust is None else asdict(run.robust),
