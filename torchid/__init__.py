@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torchid.analysis.base_parameters import BaseParameters, base_parameters
+    from torchid.analysis.calibration import estimate_extras
     from torchid.analysis.structure import structural_problem
     from torchid.errors import TorchidError, TorchidWarning
     from torchid.estimators import (
@@ -22,13 +23,33 @@ if TYPE_CHECKING:
         violations,
     )
     from torchid.logs import Log, preprocess, read_log, write_log
-    from torchid.problem import LinearProblem, MiniBatches, RowBuilder, TriangularFactor, bind, compress, linear_problem
+    from torchid.problem import (
+        ExtraTerms,
+        LinearProblem,
+        MiniBatches,
+        RowBuilder,
+        TriangularFactor,
+        assemble,
+        bind,
+        compress,
+        compress_parts,
+        linear_problem,
+    )
     from torchid.regressor import FrameJacobian, Motion, Regressor, motion_from_state
     from torchid.robot import Robot, load_robot
-    from torchid.sensing import Contact, Projection, SensorNoise, SensorSet, chosen_sensors, named_sensors
+    from torchid.sensing import (
+        Contact,
+        Projection,
+        SensorNoise,
+        SensorSet,
+        chosen_sensors,
+        named_sensors,
+        with_ft_sensors,
+    )
 
 _HOMES = {
     "torchid.analysis.base_parameters": ("BaseParameters", "base_parameters"),
+    "torchid.analysis.calibration": ("estimate_extras",),
     "torchid.analysis.structure": ("structural_problem",),
     "torchid.errors": ("TorchidError", "TorchidWarning"),
     "torchid.estimators": (
@@ -44,17 +65,28 @@ _HOMES = {
     ),
     "torchid.logs": ("Log", "preprocess", "read_log", "write_log"),
     "torchid.problem": (
+        "ExtraTerms",
         "LinearProblem",
         "MiniBatches",
         "RowBuilder",
         "TriangularFactor",
+        "assemble",
         "bind",
         "compress",
+        "compress_parts",
         "linear_problem",
     ),
     "torchid.regressor": ("FrameJacobian", "Motion", "Regressor", "motion_from_state"),
     "torchid.robot": ("Robot", "load_robot"),
-    "torchid.sensing": ("Contact", "Projection", "SensorNoise", "SensorSet", "chosen_sensors", "named_sensors"),
+    "torchid.sensing": (
+        "Contact",
+        "Projection",
+        "SensorNoise",
+        "SensorSet",
+        "chosen_sensors",
+        "named_sensors",
+        "with_ft_sensors",
+    ),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
@@ -64,6 +96,7 @@ __all__ = [
     "Consistent",
     "Contact",
     "Estimate",
+    "ExtraTerms",
     "FrameJacobian",
     "LeastSquares",
     "LinearProblem",
@@ -82,10 +115,13 @@ __all__ = [
     "TorchidWarning",
     "Trainer",
     "TriangularFactor",
+    "assemble",
     "base_parameters",
     "bind",
     "chosen_sensors",
     "compress",
+    "compress_parts",
+    "estimate_extras",
     "linear_problem",
     "load_robot",
     "motion_from_state",
@@ -95,6 +131,7 @@ __all__ = [
     "read_log",
     "structural_problem",
     "violations",
+    "with_ft_sensors",
     "write_log",
 ]
 

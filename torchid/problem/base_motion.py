@@ -90,6 +90,8 @@ def base_motion(log: Log, robot: Robot) -> BaseMotion:
 def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
     """The base's motion from that of a frame that is rigidly on it: rigid-body kinematics with the lever arm."""
     body, T_base_imu = robot.link(log.imu_frame, "imu_frame", log.source)
+    while (joint := robot.bodies[body].joint) is not None and joint.kind == "fixed":  # a sensor's weld does not move
+        body, T_base_imu = joint.parent, joint.T_parent_joint @ joint.T_joint_link @ T_base_imu
     if body != 0:
         found = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
         raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(robot.bodies[0].links[:8])}")

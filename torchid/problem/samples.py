@@ -128,6 +128,9 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
     position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
     base = base_motion(log, robot)
     chosen, active = _contacts(log, robot, contacts)
+    if log.contact_wrench_world is not None and contacts and base.quat_xyzw is None and not robot.fixed_base:
+        accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
+        raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
     wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
     samples = Samples(
         log.source,

@@ -194,7 +194,7 @@ def _contributions(
 ) -> Contributions:
     """What each log, contact state and sensor adds."""
     leaving_out = bars.add_task("leaving out each in turn", total=None)
-    tolerance, names = experiment.config.estimator.rank_tolerance, experiment.robot.joint_names
+    tolerance, names = experiment.config.estimator.rank_tolerance, experiment.robot.dof_names
     found = contributions(parts, train, builder, problem, names, tolerance, lambda n: bars.advance(leaving_out, n))
     bars.update(leaving_out, total=1, completed=1)
     return found
