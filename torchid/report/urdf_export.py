@@ -29,7 +29,7 @@ def identified_urdf(robot: Robot, phi: Array) -> bytes:
     joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
     _warn(robot, phi)
     for body, values in zip(robot.bodies, phi, strict=True):
-        if body.joint is not None:
+        if body.joint is not None and body.joint.kind != "fixed":
             _set_friction(joints[body.joint.name], values)
         if not body.massless or values[parameters.INERTIAL].any():
             for name in body.links:

@@ -17,6 +17,7 @@ from torchid.parameters import PER_BODY, Array
 from torchid.problem import Samples
 from torchid.problem.predict import force_series
 from torchid.problem.states import StateReport
+from torchid.report.extra_figure import extra_figure
 from torchid.report.figures import ForceSeries, contribution_figure, error_figure, force_figure, parameter_figure
 from torchid.report.identifiability_figure import identifiability_figure
 from torchid.report.metrics import SETS, Evaluation, Metrics
@@ -98,6 +99,8 @@ def write_run(
         "identifiability": identifiability_figure(robot.body_names, run.estimate),
         "contributions": contribution_figure(_bits(run.adds)),
     }
+    if run.extras:
+        figures["extras"] = extra_figure(run.extras)
     with new_folder(config.output, config.overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
