@@ -179,8 +179,8 @@ REFUSED = {
         {"compare": {"none": {"contact_wrenches": {FEET[0]: []}}}}, "analysis.compare.none", "no sensor",
     ),
     "a set to compare without a name": ({"compare": {"": "full"}}, "analysis.compare", "accepted: a name"),
-    "a set to compare with a limb-mounted sensor": (
-        {"compare": {"limb": {"ft_sensors": ["hip"]}}}, "analysis.compare.limb.ft_sensors", "not supported yet",
+    "a set to compare with a sensor at no fixed joint": (
+        {"compare": {"limb": {"ft_sensors": ["hip"]}}}, "analysis.compare", "without logs to predict accuracy from",
     ),
 }  # fmt: skip
 

@@ -11,7 +11,7 @@ import yaml
 from refusals import assert_unknown_key, assert_wrong_value
 
 from torchid.config import ExperimentConfig, dump_config, load_config
-from torchid.config.experiment import EstimatorConfig
+from torchid.config.experiment import EstimatorConfig, PreprocessingConfig
 from torchid.errors import ConfigError, TorchidWarning
 from torchid.estimators import Sgd
 from torchid.run.training import descent_settings
@@ -23,16 +23,20 @@ ALL: dict[str, Any] = {
     "robot": {"urdf": "models/robot.urdf", "base_link": "pelvis", "fixed_base": True},
     "contacts": [{"frame": "l_sole", "type": "flat"}, {"frame": "r_sole", "type": "line", "line_axis": "x"}],
     "logs": {"train": ["a.npz", "/logs/b.h5"], "test": ["../c.csv"]},
-    "preprocessing": {"cutoff_hz": 20, "sample_rate_hz": 200.0},
+    "preprocessing": {"cutoff_hz": 20, "sample_rate_hz": 200.0, "contact_margin_s": 0.05},
     "sensors": {
         "joint_torques": ["hip", "knee"],
         "contact_wrenches": {"l_sole": ["fx", "mz"], "r_sole": []},
+        "ft_sensors": ["l_ankle"],
         "noise": {
             **{"joint_torque": 0.1, "contact_force": 3.0, "contact_moment": 0.3},
-            **{"base_force": 1.5, "base_moment": 0.25},
+            **{"base_force": 1.5, "base_moment": 0.25, "ft_force": 1.0, "ft_moment": 0.1},
         },
+        "offsets": {"joint_torque": "all", "contact_force": "log"},
+        "scales": {"ft_force": "log"},
         "on_base_lost": "warn",
     },
+    "actuators": {"armature": True, "torque_offset": False, "asymmetric_coulomb": True, "sign_width": 0.01},
     "estimator": {"name": "least_squares", "ridge": 1e-5, "rank_tolerance": 1e-7, "friction": False},
     "analysis": {
         "scenarios": {"stand": [["l_sole", "r_sole"]], "step": [["l_sole"], ["r_sole"], []]},
@@ -110,16 +114,17 @@ def test_the_least_experiment_has_four_keys_and_the_documented_defaults(file: Pa
 def test_every_key_of_the_file_arrives(file: Path) -> None:
     config = dataclasses.asdict(load(file, ALL))
     assert config["sensors"].pop("set") is None
-    assert config["sensors"].pop("ft_sensors") == []
     (compared,) = config["analysis"]["compare"].values()
     assert compared.pop("set") is None
     assert compared.pop("ft_sensors") == []
-    for name in ("contacts", "preprocessing", "sensors", "estimator", "analysis", "device", "overwrite"):
+    for name in ("contacts", "preprocessing", "sensors", "actuators", "estimator", "analysis", "device", "overwrite"):
         expected = ALL[name]
         if name == "contacts":
             expected = [{"line_axis": "y"} | contact for contact in expected]
         if name == "estimator":
             expected = dataclasses.asdict(EstimatorConfig()) | expected
+        if name == "preprocessing":
+            expected = dataclasses.asdict(PreprocessingConfig()) | expected
         assert config[name] == expected
     assert config["robot"]["base_link"] == "pelvis"
     assert config["robot"]["fixed_base"] is True
@@ -220,7 +225,6 @@ def test_noise_joins_a_named_set_and_a_named_set_keeps_the_noise(file: Path) -> 
         ({"noise": {"joint_torque": 1.0}}, "no sensor"),
         ({"set": "full", "joint_torques": ["hip"]}, "set: full together with sensors by name"),
         ({"set": "joints", "contact_wrenches": {"sole": ["fx"]}}, "set: joints together with sensors by name"),
-        ({"set": "full", "ft_sensors": ["wrist"]}, "sensors.ft_sensors: limb-mounted sensors, which are not supported"),
     ],
 )
 def test_sensors_that_contradict_themselves_are_refused(file: Path, sensors: Any, found: str) -> None:

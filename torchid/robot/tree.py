@@ -13,7 +13,10 @@ from yourdfpy.urdf import Joint, Link
 
 from torchid.errors import TorchidWarning, UnknownNameError, UrdfError
 from torchid.parameters import Array
-from torchid.robot.urdf import MOVING_TYPES
+from torchid.robot.urdf import MAX_NUMBER, MOVING_TYPES
+
+
+FT_FIELD = "force/torque sensor at a fixed joint"
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ def build_tree(
     welds = [joint.name for joint in joints if joint.type not in MOVING_TYPES]
     for name in ft_joints:
         if name not in welds:
-            raise UnknownNameError(path, "force/torque sensor at a fixed joint", name, welds)
+            raise UnknownNameError(path, FT_FIELD, name, welds)
     mimics = _resolve_mimics(path, joints)
     neighbours: dict[str, list[tuple[Joint, bool]]] = {name: [] for name in names}
     for joint in joints:  # a parent's own children come first, in the URDF's order
@@ -145,11 +148,19 @@ def _resolve_mimics(path: Path, joints: list[Joint]) -> dict[str, Mimic]:
                     path, f"joint '{joint.name}', <mimic>", "a chain that closes on itself", "a free master"
                 )
             seen.add(master.name)
+        _check_ratio(path, joint.name, multiplier, offset)
         if master.type not in MOVING_TYPES:
             found = f"its mimic master '{master.name}' is fixed, so it is held still too"
             warnings.warn(f"{path}: joint '{joint.name}': {found}", TorchidWarning, stacklevel=4)
         resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
     return resolved
+
+
+def _check_ratio(path: Path, joint: str, multiplier: float, offset: float) -> None:
+    """Each ratio of a chain is bounded, their product not yet."""
+    if not max(abs(multiplier), abs(offset)) <= MAX_NUMBER:
+        found = f"multiplier {multiplier:g} and offset {offset:g} along its chain"
+        raise UrdfError(path, f"joint '{joint}', <mimic>", found, f"at most {MAX_NUMBER:g}")
 
 
 def _is_locked(joint: Joint, mimics: dict[str, Mimic]) -> bool:
