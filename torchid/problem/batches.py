@@ -74,6 +74,8 @@ class MiniBatches:
         """
         if batch_size < 1:
             raise ValueError(f"batch_size: found {batch_size}; accepted: at least 1")
+        if builder.extras:
+            raise ValueError("builder: found extra terms; accepted: one without")
         self.builder, self.batch_size, self.seed = builder, batch_size, seed
         self.columns = torch.from_numpy(builder.columns.from_parameters()).to(builder.device)
         self.samples = sum(map(len, logs))
