@@ -46,11 +46,11 @@ UR5 = ROBOTS / "ur_description/urdf/ur5_robot.urdf"
 DRONE = ROBOTS / "hector_description/robots/quadrotor_base.urdf"
 
 
-def load(urdf: Path, base_link: str | None = None, fixed_base: bool = False) -> Robot:
+def load(urdf: Path, base_link: str | None = None, fixed_base: bool = False, ft_joints: Sequence[str] = ()) -> Robot:
     """A robot whose known warnings (see test_robot_urdf.py) are not the matter of the test."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
-        return load_robot(urdf, base_link, fixed_base)
+        return load_robot(urdf, base_link, fixed_base, ft_joints)
 
 
 def joint_map(urdf: Path, joint_names: Sequence[str]) -> dict[str, tuple[Array, float]]:
@@ -69,6 +69,15 @@ def joint_map(urdf: Path, joint_names: Sequence[str]) -> dict[str, tuple[Array, 
     return {name: follow(name) for name in joints}
 
 
+def with_free_welds(urdf: Path, welds: Sequence[str]) -> str:
+    """The URDF as text, with some fixed joints free to move in all six ways."""
+    root = ElementTree.parse(urdf).getroot()
+    for element in root.findall("joint"):
+        if element.get("name") in welds:
+            element.set("type", "floating")
+    return ElementTree.tostring(root, encoding="unicode")
+
+
 def transform(rotation: Array, position: Array) -> Array:
     """A pose, (4, 4)."""
     T = np.eye(4)
@@ -81,27 +90,35 @@ class Oracle:
 
     Pinocchio knows every moving joint as independent; `expand` (its nv, our nv) ties the mimic joints to their masters,
     and forces follow by virtual work. `friction` (moving joints, 2), zero at first, is in Pinocchio's joint order.
+    Welds with a force/torque sensor are free joints that stay at rest; their forces, in the child's frame, come last.
     """
 
-    def __init__(self, urdf: Path, joint_names: Sequence[str], fixed_base: bool = False) -> None:
+    def __init__(
+        self, urdf: Path, joint_names: Sequence[str], fixed_base: bool = False, ft_names: Sequence[str] = ()
+    ) -> None:
         root = () if fixed_base else (pin.JointModelFreeFlyer(),)
-        self.model = pin.buildModelFromUrdf(str(urdf), *root)
+        self.model = pin.buildModelFromXML(with_free_welds(urdf, ft_names), *root)
         self.data = self.model.createData()
         self.base = 0 if fixed_base else 6
         self.joint_names = tuple(joint_names)
-        self.moving = [str(name) for name in self.model.names][1 if fixed_base else 2 :]
+        self.ft_names = tuple(ft_names)
+        self.moving = [str(name) for name in self.model.names if name not in ft_names][1 if fixed_base else 2 :]
         by_name = joint_map(urdf, joint_names)
         self.ratios = np.array([by_name[name][0] for name in self.moving]).reshape(len(self.moving), len(joint_names))
         self.offsets = np.array([by_name[name][1] for name in self.moving])
         self.friction = np.zeros((len(self.moving), 2))
-        self.expand = np.zeros((self.model.nv, self.base + len(self.joint_names)))
+        nv = self.base + len(self.joint_names)
+        self.expand = np.zeros((self.model.nv, nv + 6 * len(self.ft_names)))
         self.expand[: self.base, : self.base] = np.eye(self.base)
-        self.expand[[self._joint(name).idx_v for name in self.moving], self.base :] = self.ratios
+        self.expand[[self._joint(name).idx_v for name in self.moving], self.base : nv] = self.ratios
+        for name, column in zip(self.ft_names, range(nv, self.expand.shape[1], 6), strict=True):
+            place = self._joint(name).idx_v
+            self.expand[place : place + 6, column : column + 6] = np.eye(6)
 
     @classmethod
     def of(cls, robot: Robot) -> Oracle:
         """Of the URDF a robot was read from, with the robot's joint order."""
-        return cls(robot.path, robot.joint_names, robot.fixed_base)
+        return cls(robot.path, robot.joint_names, robot.fixed_base, robot.ft_names)
 
     def _joint(self, name: str) -> Any:
         return self.model.joints[self.model.getJointId(name)]
@@ -117,15 +134,16 @@ class Oracle:
         return full
 
     def _state(self, q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
-        return self.coordinates(q), self.expand @ v, self.expand @ a
+        moving = self.expand[:, : len(v)]
+        return self.coordinates(q), moving @ v, moving @ a
 
     def frictionless_forces(self, q: Array, v: Array, a: Array) -> Array:
-        """Inverse dynamics, (B, nv), of states (B, ...)."""
+        """Inverse dynamics, (B, nv + 6 F), of states (B, ...)."""
         rows = [pin.rnea(self.model, self.data, *self._state(*state)) for state in zip(q, v, a, strict=True)]
         return np.array(rows) @ self.expand
 
     def mass_matrix(self, q: Array) -> Array:
-        """Joint-space inertia, (nv, nv), at one sample's coordinates."""
+        """Joint-space inertia, (nv + 6 F, nv + 6 F), at one sample's coordinates."""
         return self.expand.T @ pin.crba(self.model, self.data, self.coordinates(q)) @ self.expand
 
     def friction_torques(self, v: Array) -> Array:
@@ -134,13 +152,13 @@ class Oracle:
         return (self.friction[:, 0] * np.sign(velocity) + self.friction[:, 1] * velocity) @ self.ratios
 
     def forces(self, q: Array, v: Array, a: Array) -> Array:
-        """Inverse dynamics with friction, (B, nv), of states (B, ...)."""
+        """Inverse dynamics with friction, (B, nv + 6 F), of states (B, ...)."""
         needed = self.frictionless_forces(q, v, a)
-        needed[:, self.base :] += self.friction_torques(v)
+        needed[:, self.base : v.shape[1]] += self.friction_torques(v)
         return needed
 
     def regressor(self, robot: Robot, q: Array, v: Array, a: Array) -> Array:
-        """Columns (B, nv, L, 10) of the ten inertial numbers by the robot's bodies, in this project's order."""
+        """Columns (B, nv + 6 F, L, 10) of the ten inertial numbers by the robot's bodies, in this project's order."""
         out = np.zeros((len(q), self.expand.shape[1], len(robot.bodies), 10))
         places = self._places(robot)
         for sample, state in enumerate(zip(q, v, a, strict=True)):
@@ -166,7 +184,7 @@ class Oracle:
         return phi
 
     def jacobian(self, q: Array, frame: str) -> Array:
-        """Frame Jacobians in the frame's own axes, (B, 6, nv)."""
+        """Frame Jacobians in the frame's own axes, (B, 6, nv + 6 F)."""
         index = self.model.getFrameId(frame, pin.FrameType.BODY)
         state = [self.coordinates(sample) for sample in q]
         rows = [pin.computeFrameJacobian(self.model, self.data, full, index, pin.LOCAL) for full in state]
@@ -232,20 +250,21 @@ def _close_the_dynamics(
     oracle: Oracle, q: Array, v: Array, a: Array, contacts: Sequence[tuple[str, int]], active: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Accelerations (B, nv), torques (B, n) and wrenches (B, C, 6) that obey the dynamics, with random internal forces.
+    """Accelerations (B, nv), torques (B, n + 6 F) and wrenches (B, C, 6) that obey the dynamics, with random forces.
 
     Contacts carry of the base wrench what they can; the base accelerates by the rest, as in flight. A bolted base
     carries what it must, so that its contacts push at random.
     """
     base, a = oracle.base, a.copy()
-    J = np.zeros((len(q), len(contacts), 6, a.shape[1]))
+    J = np.zeros((len(q), len(contacts), 6, oracle.expand.shape[1]))
     for k, (frame, _) in enumerate(contacts):
         J[:, k] = oracle.jacobian(q, frame)
     wrench = 100.0 * rng.normal(size=(len(q), len(contacts), 6))  # noise wherever nothing can push
-    through_contacts, needed = np.zeros_like(a), oracle.forces(q, v, a)
+    needed = oracle.forces(q, v, a)
+    through_contacts = np.zeros_like(needed)
     for i in range(len(q)):
         rows = [(k, component) for k, (_, size) in enumerate(contacts) if active[i, k] for component in range(size)]
-        J_C = np.array([J[i, k, component] for k, component in rows]).reshape(-1, a.shape[1])
+        J_C = np.array([J[i, k, component] for k, component in rows]).reshape(-1, needed.shape[1])
         force = 20.0 * rng.normal(size=len(rows))
         if base:
             inverse = np.linalg.pinv(J_C[:, :6].T, rcond=0.01)
@@ -280,7 +299,7 @@ def make_log(
     q, v, a = random_states(rng, len(oracle.joint_names), samples, fixed_base=not oracle.base)
     active = np.array([states[i % len(states)] for i in range(samples)], dtype=bool).reshape(samples, len(contacts))
     a, torque, wrench = _close_the_dynamics(oracle, q, v, a, contacts, active, rng)
-    extra = 7 if oracle.base else 0
+    extra, n = 7 if oracle.base else 0, len(oracle.joint_names)
     base: dict[str, Any] = {}
     if oracle.base:
         rotation = Rotation.from_quat(q[:, 3:7])
@@ -297,9 +316,11 @@ def make_log(
         joint_position=q[:, extra:],
         joint_velocity=v[:, oracle.base :],
         joint_acceleration=a[:, oracle.base :],
-        joint_torque=torque,
+        joint_torque=torque[:, :n],
         contact_names=tuple(name for name, _ in contacts),
         contact_active=active,
         contact_wrench_local=wrench,
+        ft_names=oracle.ft_names,
+        ft_wrench=torque[:, n:].reshape(samples, -1, 6) if oracle.ft_names else None,
         **base,
     )

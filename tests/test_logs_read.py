@@ -16,17 +16,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchid.errors import InputError, LogError, TorchidWarning, UnknownNameError
+from torchid.errors import InputError, LogError, UnknownNameError
 from torchid.logs import Log, read_log, write_log
 from torchid.logs import container as container_module
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 N = 6
 SUFFIXES = (".npz", ".h5", ".hdf5")
+WRITTEN = (*SUFFIXES, ".csv", ".parquet")
 
 
 def file_fields() -> dict[str, Any]:
-    """A valid file of 6 samples, 2 joints and 2 contacts, every quantity different."""
+    """A valid file of 6 samples, 2 joints, 2 contacts, a limb's sensor and an IMU, every quantity different."""
     rng = np.random.default_rng(5)
     quat = Rotation.from_rotvec(np.outer(np.arange(N), [0.3, -0.2, 0.5])).as_quat()
     return {
@@ -45,6 +46,12 @@ def file_fields() -> dict[str, Any]:
         "contact_names": np.array(["l_sole", "r_sole"]),
         "contact_active": rng.random((N, 2)) > 0.5,
         "contact_wrench_local": np.where(np.arange(6) > 2, np.nan, rng.standard_normal((N, 2, 6))),
+        "ft_names": np.array(["l_ankle_ft"]),
+        "ft_wrench": np.where(np.arange(N)[:, None, None] == 1, np.nan, rng.standard_normal((N, 1, 6))),
+        "imu_frame": np.array("chest_imu"),
+        "imu_specific_force": rng.standard_normal((N, 3)),
+        "imu_angular_velocity": rng.standard_normal((N, 3)),
+        "imu_angular_acceleration": rng.standard_normal((N, 3)),
     }
 
 
@@ -87,26 +94,29 @@ def assert_same(one: Log, other: Log) -> None:
     """Both logs hold the same fields and values."""
     assert one.arrays().keys() == other.arrays().keys()
     for name, array in one.arrays().items():
-        # renormalising a unit quaternion may change its last bit
-        np.testing.assert_allclose(array, other.arrays()[name], rtol=4e-16, atol=0, err_msg=name)
-    assert (one.joint_names, one.contact_names) == (other.joint_names, other.contact_names)
+        np.testing.assert_array_equal(array, other.arrays()[name], err_msg=name)
+        np.testing.assert_array_equal(np.signbit(array), np.signbit(other.arrays()[name]), err_msg=name)
+    assert (one.names, one.imu_frame) == (other.names, other.imu_frame)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN)
 def test_a_written_log_reads_back_the_same(tmp_path: Path, suffix: str) -> None:
-    log = read_log(save(tmp_path / f"raw{suffix}", file_fields()))
+    raw = save(tmp_path / f"raw{suffix if suffix in SUFFIXES else '.npz'}", file_fields())
+    log = read_log(raw)
     write_log(log, tmp_path / f"again{suffix}")
     again = read_log(tmp_path / f"again{suffix}")
     assert_same(log, again)
     assert again.source == str(tmp_path / f"again{suffix}")
     assert len(again) == N
     for name, value in file_fields().items():
-        if name not in ("joint_names", "contact_names", "base_quat_xyzw"):
+        if name not in (*again.names, "imu_frame", "base_quat_xyzw"):
             np.testing.assert_array_equal(getattr(again, name), value)
-    assert sorted(os.listdir(tmp_path)) == sorted([f"raw{suffix}", f"again{suffix}"])
+    assert again.ft_names == ("l_ankle_ft",)
+    assert again.imu_frame == "chest_imu"
+    assert sorted(os.listdir(tmp_path)) == sorted([raw.name, f"again{suffix}"])
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN)
 def test_a_log_of_joint_positions_alone_reads_with_everything_else_absent(tmp_path: Path, suffix: str) -> None:
     log = Log("x", np.array([3.0]), ("größe",), np.array([[0.1]]))
     write_log(log, tmp_path / f"x{suffix}")
@@ -115,10 +125,11 @@ def test_a_log_of_joint_positions_alone_reads_with_everything_else_absent(tmp_pa
     assert set(again.arrays()) == {"time", "joint_position"}
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", WRITTEN)
 def test_a_robot_without_joints_has_a_log(tmp_path: Path, suffix: str) -> None:
     fields = {"time": np.arange(3), "joint_names": np.array([]), "joint_position": np.zeros((3, 0))}
-    assert read_log(save(tmp_path / f"x{suffix}", fields)).joint_names == ()
+    if suffix in SUFFIXES:
+        assert read_log(save(tmp_path / f"x{suffix}", fields)).joint_names == ()
     write_log(Log("x", np.arange(3.0), (), np.zeros((3, 0))), tmp_path / f"y{suffix}")
     assert read_log(tmp_path / f"y{suffix}").joint_position.shape == (3, 0)
 
@@ -193,6 +204,7 @@ BAD_FIELDS: list[tuple[dict[str, Any], str, str]] = [
     (edited("time", 4, np.nan), "time", "nan at sample 4"),
     (edited("time", 5, np.inf), "time", "inf at sample 5"),
     (edited("base_quat_xyzw", 3, 0.0), "base_quat_xyzw", "norm 0 at sample 3"),
+    (edited("base_quat_xyzw", 3, 1e300), "base_quat_xyzw", "norm inf at sample 3"),
     (edited("base_quat_xyzw", 3, np.nan), "base_quat_xyzw", "nan at sample 3"),
     ({"base_quat_xyzw": 1.002 * file_fields()["base_quat_xyzw"]}, "base_quat_xyzw", "norm 1.002 at sample 0"),
     (edited("joint_position", (2, 1), np.nan), "joint_position", "nan at sample 2, knee"),
@@ -210,6 +222,19 @@ BAD_FIELDS: list[tuple[dict[str, Any], str, str]] = [
     (edited("contact_active", (5, 0), 0.5), "contact_active", "0.5 at sample 5, l_sole"),
     (edited("contact_active", (5, 0), np.nan), "contact_active", "nan at sample 5"),
     ({"contact_active": np.full((N, 2), b"yes")}, "contact_active", "values of type"),
+    ({"ft_wrench": np.zeros((N, 6))}, "ft_wrench", "shape (6, 6); accepted: shape (N, F, 6) = (6, 1, 6)"),
+    ({"ft_wrench": np.zeros((N, 2, 6))}, "ft_wrench", "shape (6, 2, 6)"),
+    (edited("ft_wrench", (2, 0, 4), np.inf), "ft_wrench", "inf at sample 2, l_ankle_ft my"),
+    ({"ft_names": None}, "ft_wrench", "without ft_names"),
+    ({"ft_names": np.array(["a", "a"])}, "ft_names", "'a' again at 1"),
+    ({"imu_specific_force": np.zeros((N, 2))}, "imu_specific_force", "shape (6, 2); accepted: shape (N, 3) = (6, 3)"),
+    (edited("imu_angular_velocity", (3, 1), np.nan), "imu_angular_velocity", "nan at sample 3, component 1"),
+    ({"imu_frame": None}, "imu_specific_force", "without imu_frame"),
+    ({"imu_specific_force": None}, "imu_", "without imu_specific_force"),
+    ({"imu_angular_velocity": None}, "imu_", "without imu_angular_velocity"),
+    ({"imu_frame": np.array(["a", "b"])}, "imu_frame", "2 values; accepted: one name"),
+    ({"imu_frame": np.array("")}, "imu_frame", "empty name"),
+    ({"imu_frame": np.array(3)}, "imu_frame", "int64"),
 ]
 
 
@@ -237,21 +262,21 @@ def test_a_log_without_samples_is_refused(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])
-def test_sensors_not_supported_yet_are_ignored_with_a_warning(tmp_path: Path, suffix: str) -> None:
-    fields = changed(ft_names=np.array(["wrist"]), imu_specific_force=np.zeros((N, 3)))
-    with pytest.warns(TorchidWarning, match=r"ft_names.*ignored") as caught:
-        log = read_log(save(tmp_path / f"x{suffix}", fields))
-    assert len(caught) == 1
-    assert Path(caught[0].filename) == Path(__file__)
-    assert len(log) == N
+def test_an_imu_stands_in_for_a_base_that_was_not_tracked(tmp_path: Path, suffix: str) -> None:
+    no_base = {name: None for name in file_fields() if name.startswith("base_")}
+    log = read_log(save(tmp_path / f"x{suffix}", changed(**no_base, imu_angular_acceleration=None)))
+    assert log.base_quat_xyzw is None
+    assert log.imu_angular_acceleration is None
+    np.testing.assert_array_equal(log.imu_specific_force, file_fields()["imu_specific_force"])
 
 
 def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
     assert "no such file" in message_of(tmp_path / "absent.npz")
     (tmp_path / "folder.npz").mkdir()
     assert "a folder" in message_of(tmp_path / "folder.npz")
-    (tmp_path / "log.csv").write_text("time\n0\n")
-    assert "extension '.csv'; accepted: .npz, .h5, .hdf5" in message_of(tmp_path / "log.csv")
+    (tmp_path / "log.mat").write_text("time\n0\n")
+    accepted = ".npz, .h5, .hdf5, .csv, .parquet, .bag, .mcap, .db3"
+    assert f"extension '.mat'; accepted: {accepted}" in message_of(tmp_path / "log.mat")
     for suffix in SUFFIXES:
         (tmp_path / f"text{suffix}").write_text("not a log")
         assert "cannot be read" in message_of(tmp_path / f"text{suffix}")

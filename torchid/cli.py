@@ -13,10 +13,12 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
+from math import isfinite
 from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning
+from torchid.interrupts import interrupt_held_back as _interrupt_held_back
 
 if TYPE_CHECKING:
     from torchid.run.analysis_results import Scenario
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _ANALYZE = "say what sensors and motion determine, and plan the smallest sensor set"
+_CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
+_CHECK = "say whether logs are fit to be fitted, and what is wrong with them where"
 _SIMULATE = "let a robot move in simulation and write the logs of its sensors (needs the extra [sim])"
 
 
@@ -33,18 +37,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return guarded("torchid", lambda: options.command(options), options.debug)
 
 
-def guarded(program: str, command: Callable[[], None], debug: bool = False) -> int:
+def guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
     """Run a command so that whatever stops it is told in one line.
 
     Returns:
-        The exit status: 0 on success, 2 on bad input, 1 on anything else.
+        The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("always", TorchidWarning)
         warnings.showwarning = partial(_show_warning, program)
         try:
             with _termination_interrupts():
-                command()
+                return command() or 0
         except (InputError, BaseLostError) as error:
             print(f"{program}: {error}", file=sys.stderr)
             return 2
@@ -57,7 +61,6 @@ def guarded(program: str, command: Callable[[], None], debug: bool = False) -> i
             what = " ".join(str(error).split())
             print(f"{program}: {type(error).__name__}: {what} (--debug shows where)", file=sys.stderr)
             return 1
-    return 0
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -95,7 +98,23 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("file", help="simulation file (YAML)")
     simulate.add_argument("overrides", nargs="*", help="key.subkey=value, for example sensors.bias.enabled=true")
     simulate.set_defaults(command=_simulate)
-    for command in (identify, evaluate, analyze, simulate):
+    check = commands.add_parser("check", help=_CHECK, description=_CHECK)
+    check.add_argument("file", help="experiment file (YAML), whose logs are checked against its robot, or a log")
+    check.add_argument("overrides", nargs="*", help="key.subkey=value, with an experiment file")
+    check.add_argument("--urdf", metavar="FILE", help="robot of a log; without it, what needs a robot is not checked")
+    check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
+    check.add_argument("--fixed-base", action="store_true", help="that robot's base does not move")
+    check.add_argument("--topics", metavar="FILE", help="experiment file whose logs.topics says what a bag holds")
+    check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
+    check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
+    check.set_defaults(command=_check)
+    convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
+    convert.add_argument("source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, or a bag of ROS messages")
+    convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
+    convert.add_argument("--topics", metavar="FILE", help="experiment file whose logs.topics says what a bag holds")
+    convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
+    convert.set_defaults(command=_convert)
+    for command in (identify, evaluate, analyze, check, convert, simulate):
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
     return parser
 
@@ -113,26 +132,11 @@ def _termination_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-@contextmanager
-def _interrupt_held_back() -> Iterator[None]:
-    """Let Ctrl-C act when the block is done: it loads modules, and some of them swallow what happens meanwhile."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    caught: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: caught.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if caught:
-        raise KeyboardInterrupt
-
-
 def _identify(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
         from torchid.config import load_config
         from torchid.estimators import BoundEstimate, ConsistentEstimate, Estimate, SgdEstimate
+        from torchid.report.extra_table import extra_table
         from torchid.report.tables import (
             contribution_table,
             error_tables,
@@ -153,6 +157,8 @@ def _identify(options: argparse.Namespace) -> None:
         verdict_table(robot.body_names, estimate.verdict),
         verdict_counts_table(run.by_state, estimate),
     )
+    if run.extras:
+        print_tables(extra_table(run.extras))
     if run.violations:
         print_tables(violation_table(run.violations_by_name()))
         if type(estimate) is Estimate:
@@ -169,7 +175,13 @@ def _identify(options: argparse.Namespace) -> None:
         print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
     if isinstance(estimate, SgdEstimate):
         print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
-    print(f"total mass    {mass:.3f} kg (URDF: {robot.nominal[:, 0].sum():.3f} kg)")
+    known = f"± {run.mass.standard_error:.2g} kg"
+    if not (isfinite(run.mass.standard_error) and run.mass.told_apart):
+        known = "kg, which the data do not " + ("tell from offsets" if not run.mass.told_apart else "determine")
+    print(f"total mass    {mass:.3f} {known} (URDF: {robot.nominal[:, 0].sum():.3f} kg)")
+    if run.robust is not None:
+        found = run.robust
+        print(f"robust        {found.loss}, {100 * found.mean_weight:.3g} % of the weight kept, {found.passes} passes")
     if robot.massless:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
     timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
@@ -226,6 +238,35 @@ def _print_scenario(scenario: Scenario) -> None:
         f"structure     {base.rank} combinations of {int(base.free.sum())} parameters; base_parameters.txt names them"
     )
     print()
+
+
+def _check(options: argparse.Namespace) -> int:
+    with _interrupt_held_back():
+        from torchid.report.hygiene_tables import heading, hygiene_table, not_checked
+        from torchid.report.tables import print_tables
+        from torchid.run.check import check_files, check_outputs, write_outputs
+
+    check_outputs(options.json, options.figure)
+    robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
+    checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
+    write_outputs(checked, options.json, options.figure)
+    for one in checked:
+        print(heading(one))
+        if one.findings:
+            print_tables(hygiene_table(one.findings))
+        if missing := not_checked(one):
+            print(fill(f"not checked   {missing}", 100, subsequent_indent=" " * 14))
+        print(fill(f"verdict       {one.verdict}", 100, subsequent_indent=" " * 14))
+        print()
+    return 0 if all(one.usable for one in checked) else 1
+
+
+def _convert(options: argparse.Namespace) -> None:
+    with _interrupt_held_back():
+        from torchid.run.convert import convert
+
+    log = convert(options.source, options.target, options.topics, options.overwrite)
+    print(f"written to    {options.target}: {len(log)} samples, {', '.join(log.arrays())}")
 
 
 def _simulate(options: argparse.Namespace) -> None:

@@ -77,14 +77,16 @@ class _Known:
         return cls(Vt[:rank].T / values[:rank], Vt[rank:].T, values, scale, problem.free)
 
     def blamed(self, sensitivity: Array, noise: float) -> Array:
-        """Variance along sensitivities (P',) that each parameter brings in, if none is off by more than its scale.
+        """Share of the variance along sensitivities (P',) that each parameter brings in, of the largest such share.
 
-        Without that bound the worst known would be named, however little it weighs.
+        None is taken to be off by more than its scale: else the worst known would be named, however little it weighs.
         """
+        noise = max(noise, _ROUNDING**2)  # of exact data, where the least known is to blame
         rank = self.root.shape[1]
         directions = np.hstack([self.root * self.values[:rank], self.hidden])
         along = directions.T @ sensitivity / (1.0 + (self.values / noise) ** 2)
-        return np.asarray(sensitivity * (directions @ along))
+        shares = sensitivity * (directions @ along)
+        return np.asarray(shares / max(np.abs(shares).max(initial=0.0), np.finfo(float).tiny))
 
     def reached(self, sensitivity: Array) -> Array:
         """Sensitivities to all parameters, (M, 12 L), as those to the scaled free ones, (M, P')."""
@@ -177,7 +179,8 @@ def _found(
     unseen = G @ known.hidden
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
     lost = np.linalg.norm(unseen, axis=1) > _ROUNDING * size
-    variance = sum((x**2).sum(1) for x in (*own, G @ known.root))
+    through_parameters = ((G @ known.root) ** 2).sum(1)
+    variance = sum((x**2).sum(1) for x in own) + through_parameters
     undetermined = lost | ~found.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > _ROUNDING)
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
@@ -187,10 +190,12 @@ def _found(
         inflation = float(deviation[k] / found.alone[k])
         mixed: tuple[str, ...] = ()
         if inflation > APART:
-            mixed = _largest(known.blamed(G[k], noise), names)
+            blamed = lost[k] or 2.0 * through_parameters[k] > variance[k]
+            mixed = _largest(known.blamed(G[k], noise), names) if blamed else ()
             others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.hidden[k]), _labels(found))
             mixed = (*mixed, *others)
-        out.append(ExtraEstimate(extra, found.log, float(value[k]), noise * float(deviation[k]), inflation, mixed))
+        error = noise * float(deviation[k]) if np.isfinite(deviation[k]) else np.inf
+        out.append(ExtraEstimate(extra, found.log, float(value[k]), error, inflation, mixed))
     return out
 
 

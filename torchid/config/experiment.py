@@ -15,8 +15,10 @@ from torchid.config.analysis import AnalysisConfig
 from torchid.config.estimator import EstimatorConfig, check_keys
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import Sensors, SensorsConfig, check_choice, spelled_out
-from torchid.config.types import STRICT, Device, Positive
+from torchid.config.types import STRICT, Device, NotNegative, Positive
 from torchid.errors import ConfigError, TorchidWarning
+from torchid.logs.kinds import bag_files
+from torchid.logs.ros.topics import Topics, check_topics
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -38,23 +40,46 @@ class ContactConfig:
 
 
 @dataclass(config=STRICT, frozen=True)
+class ActuatorsConfig:
+    """What actuators add, of every joint whose torque is measured.
+
+    `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs forwards
+    and backwards; `sign_width` [rad/s or m/s]: Coulomb friction goes with tanh(velocity / width) instead of the sign.
+    """
+
+    armature: bool = False
+    torque_offset: bool = False
+    asymmetric_coulomb: bool = False
+    sign_width: Positive | None = None
+
+
+@dataclass(config=STRICT, frozen=True)
 class LogsConfig:
     """Logs to fit on, logs that tell a descent when to stop, and logs the fit never sees.
 
-    `*` and `?` in a name stand for all files that match.
+    `*` and `?` in a name stand for all files that match. `topics` says what the topics of bags hold.
     """
 
     train: Annotated[list[Path], Field(min_length=1)]
     test: list[Path] = dataclasses.field(default_factory=list)
     validation: list[Path] = dataclasses.field(default_factory=list)
+    topics: Topics | None = None
 
 
 @dataclass(config=STRICT, frozen=True)
 class PreprocessingConfig:
-    """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are."""
+    """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
+
+    `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
+    `exclude_condemned`: leave out the samples that `torchid check` condemns.
+    `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
+    """
 
     cutoff_hz: Positive | None = None
     sample_rate_hz: Positive | None = None
+    contact_margin_s: NotNegative | None = None
+    exclude_condemned: bool = False
+    memory_gb: Positive = 2.0
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
@@ -62,9 +87,11 @@ class _Common:
     """What identification and analysis of a robot share."""
 
     robot: RobotConfig
+    sensors: Sensors = dataclasses.field(default_factory=SensorsConfig)
     output: Path
     contacts: list[ContactConfig] = dataclasses.field(default_factory=list)
     preprocessing: PreprocessingConfig = dataclasses.field(default_factory=PreprocessingConfig)
+    actuators: ActuatorsConfig = dataclasses.field(default_factory=ActuatorsConfig)
     estimator: EstimatorConfig = dataclasses.field(default_factory=EstimatorConfig)
     analysis: AnalysisConfig = dataclasses.field(default_factory=AnalysisConfig)
     device: Device = "cpu"
@@ -84,7 +111,6 @@ class AnalyzeConfig(_Common):
     """The same file, for questions that need neither logs nor sensors; without sensors by name, `noise` alone."""
 
     logs: LogsConfig | None = None
-    sensors: Sensors = dataclasses.field(default_factory=SensorsConfig)
 
 
 def _with_sensors_spelled_out(settings: Settings, overriding: Settings) -> Settings:
@@ -93,11 +119,10 @@ def _with_sensors_spelled_out(settings: Settings, overriding: Settings) -> Setti
         return settings
     sensors = settings["sensors"]
     if isinstance(overriding.get("sensors"), str) and isinstance(sensors, dict):
-        sensors = {key: x for key, x in sensors.items() if key in ("noise", "on_base_lost")}
+        sensors = {key: x for key, x in sensors.items() if key in ("noise", "offsets", "scales", "on_base_lost")}
     return settings | {"sensors": spelled_out(sensors)}
 
 
-_REFUSED = ("limb-mounted sensors, which are not supported yet", "an empty list")
 _EXPERIMENT = FileKind(
     settings=ExperimentConfig,
     name="experiment",
@@ -105,7 +130,6 @@ _EXPERIMENT = FileKind(
     list_example="contacts=[{frame: l_sole, type: flat}]",
     paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*", "output"),
     prepare=_with_sensors_spelled_out,
-    refusals={"sensors.ft_sensors": _REFUSED, "analysis.compare.*.ft_sensors": _REFUSED},
 )
 _ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": "robot, contacts, output"}))
 
@@ -128,6 +152,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     config = load(_EXPERIMENT, path, overrides)
     check_choice(path, "sensors", config.sensors)
     check_keys(config.estimator, path)
+    _check_extras(path, config)
     return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
 
 
@@ -146,6 +171,19 @@ def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeCon
     return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
 
 
+def _check_extras(path: Path, config: _Common) -> None:
+    """Refuse one unknown under two names, and unknowns that a descent does not know."""
+    actuators, sensors = config.actuators, config.sensors
+    if actuators.torque_offset and "joint_torque" in sensors.offsets:
+        found = "set together with sensors.offsets.joint_torque, which is the same"
+        raise ConfigError(path, "actuators.torque_offset", found, "one of the two")
+    unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items()}
+    unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
+    for field, wanted in unknowns.items():
+        if wanted and config.estimator.name == "sgd":
+            raise ConfigError(path, field, "set, which sgd has not", "estimator.name: least_squares or consistent")
+
+
 def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
     """The logs with patterns resolved, after checks of what they are used for."""
     _check_held_out(path, config.estimator, logs)
@@ -158,7 +196,9 @@ def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
     both = sorted({*found["train"]} & {*found["validation"]})
     if both:
         raise ConfigError(path, "logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
-    return LogsConfig(**found)
+    if logs.topics is not None:
+        check_topics(path, logs.topics)
+    return LogsConfig(**found, topics=logs.topics)
 
 
 def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
@@ -173,7 +213,8 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
         if path.exists() or not {"*", "?"} & set(path.name):
             out.append(path)
             continue
-        found = sorted(file for file in path.parent.glob(path.name.replace("[", "[[]")) if file.is_file())
+        matching = path.parent.glob(path.name.replace("[", "[[]"))
+        found = sorted(file for file in matching if file.is_file() or bag_files(file))
         if not found:
             raise ConfigError(source, field, f"no file matches {path}", "a log, or a pattern of several")
         out += found

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -15,7 +17,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
+from torchid.config.scan import MAX_BYTES, MAX_DEPTH, check_yaml
 from torchid.errors import ConfigError, UnknownNameError
+from torchid.text import is_plain, shown
+
+_NO_YAML = (OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, AssertionError)
+_LONGEST = 300  # characters of another package's message that a message of ours repeats
+_LONGEST_NAME, _LONGEST_PATH = 255, 4095  # bytes, of file systems
 
 T = TypeVar("T")
 Settings = dict[str, Any]
@@ -63,14 +71,15 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
         UnknownNameError: a key that does not exist; the message names the nearest that do.
     """
-    settings = _absolute(_read(kind, path), kind.paths, path.resolve().parent)
-    given = _absolute(_parsed(overrides), kind.paths, Path.cwd())
+    settings = _absolute(path, _read(kind, path), kind.paths, path.resolve().parent)
+    given = _absolute("command line", _parsed(overrides), kind.paths, Path.cwd())
     layers = [kind.prepare(settings, given), kind.prepare(given, {})]
     try:
         merged = _container(OmegaConf.merge(*layers))
     except (OmegaConfBaseException, TypeError) as error:
         accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
-        raise ConfigError("command line", " ".join(overrides), "does not fit the file", accepted) from error
+        field = shown(" ".join(overrides))
+        raise ConfigError("command line", field, "does not fit the file", accepted) from error
     try:
         return TypeAdapter(kind.settings).validate_python(merged)
     except ValidationError as error:
@@ -84,46 +93,75 @@ def dump(settings: object) -> str:
 
 def _read(kind: FileKind[T], path: Path) -> Settings:
     try:
-        loaded = _container(OmegaConf.load(path))
+        text = _text(path)
+        check_yaml(text)
+        loaded = _container(OmegaConf.create(text))
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
-    except (OmegaConfBaseException, yaml.YAMLError, ValueError) as error:
-        raise ConfigError(path, "YAML", f"not readable: {error}", "a YAML mapping") from error
+    except _NO_YAML as error:
+        raise ConfigError(path, "YAML", f"not readable: {shown(str(error), _LONGEST)}", "a YAML mapping") from error
     if not isinstance(loaded, dict):
         raise ConfigError(path, "YAML", f"a {type(loaded).__name__}", f"a mapping with {kind.keys}")
     return loaded
 
 
+def _text(path: Path) -> str:
+    """What a file holds, or so much of it that it is too much."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EISDIR, "a folder" if path.is_dir() else "no file")  # a pipe could keep us waiting
+    with path.open("rb") as stream:
+        return stream.read(MAX_BYTES + 1).decode()
+
+
 def _parsed(overrides: Sequence[str]) -> Settings:
     for text in overrides:
-        if "=" not in text:
-            raise ConfigError("command line", text, "not an override", "key.subkey=value")
-    try:
-        return _container(OmegaConf.from_dotlist(list(overrides)))
-    except (OmegaConfBaseException, yaml.YAMLError) as error:
-        raise ConfigError("command line", " ".join(overrides), str(error), "key.subkey=value, in YAML") from error
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError("command line", shown(text), "not an override", "key.subkey=value")
+        try:
+            check_yaml(key)
+            check_yaml(value)
+            if key.count(".") + key.count("[") > MAX_DEPTH:
+                raise ValueError(f"nested more than {MAX_DEPTH} deep")
+            OmegaConf.from_dotlist([text])
+        except _NO_YAML as error:
+            found = shown(str(error), _LONGEST)
+            raise ConfigError("command line", shown(text), found, "key.subkey=value, in YAML") from error
+    return _container(OmegaConf.from_dotlist(list(overrides)))
 
 
 def _container(config: Any) -> Any:
     return OmegaConf.to_container(config, resolve=True)
 
 
-def _absolute(settings: Settings, places: Sequence[str], folder: Path) -> Settings:
+def _absolute(source: object, settings: Settings, places: Sequence[str], folder: Path) -> Settings:
     for place in places:
-        settings = _absolute_at(settings, place.split("."), folder)
+        try:
+            settings = _absolute_at(settings, place.split("."), folder)
+        except (RuntimeError, ValueError) as error:
+            raise ConfigError(source, place.removesuffix(".*"), str(error), "a path") from error
     return settings
 
 
 def _absolute_at(value: Any, place: Sequence[str], folder: Path) -> Any:
     """The value with the path at a place made absolute; what is no path where one belongs is left to the checks."""
     if not place:
-        return os.path.normpath(folder / Path(value).expanduser()) if isinstance(value, str) else value
+        return _absolute_path(value, folder) if isinstance(value, str) else value
     key, *rest = place
     if key == "*":
         return [_absolute_at(item, rest, folder) for item in value] if isinstance(value, list) else value
     if isinstance(value, Mapping) and key in value:
         return {**value, key: _absolute_at(value[key], rest, folder)}
     return value
+
+
+def _absolute_path(value: str, folder: Path) -> str:
+    """Raises ValueError or RuntimeError (the home folder of nobody) where the value names no file."""
+    path = os.path.normpath(folder / Path(value).expanduser())
+    longest = max(len(os.fsencode(name)) for name in Path(path).parts)
+    if not value.strip() or not is_plain(value) or longest > _LONGEST_NAME or len(os.fsencode(path)) > _LONGEST_PATH:
+        raise ValueError(f"'{shown(value)}', no name of a file")
+    return path
 
 
 def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> ConfigError | UnknownNameError:
@@ -145,7 +183,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
         empty = "an empty mapping" if isinstance(first["input"], Mapping) else "an empty list"
         return ConfigError(path, field, empty, "at least one item")
     found = first["input"]
-    shown = "a mapping" if isinstance(found, Mapping) else "a list" if isinstance(found, list) else repr(found)
+    shown = "a mapping" if isinstance(found, Mapping) else "a list" if isinstance(found, list) else _repr(found)
     if first["type"] == "dataclass_type":
         accepted = f"a mapping with {', '.join(_keys_at(kind.settings, place))}"
     else:
@@ -160,6 +198,13 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
         described = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
         accepted = plain.get(first["type"], described)
     return ConfigError(path, field, f"found {shown}", accepted)
+
+
+def _repr(value: object) -> str:
+    try:
+        return shown(repr(value))
+    except ValueError:  # Python spells no number of more than 4300 digits
+        return f"a number of more than {sys.get_int_max_str_digits()} digits"
 
 
 def _keys_at(settings: Any, place: Sequence[str]) -> list[str]:

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError
 from torchid.logs.fields import SHAPES, BoolArray, FloatArray, Shape
+from torchid.wrenches import COMPONENTS
 
 #: How far a quaternion's norm may be from 1 before it is refused rather than renormalised.
 QUATERNION_TOLERANCE = 1e-3
-COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
+#: How far the norm of a quaternion that was normalised may be from 1.
+ROUNDING = 4.0 * np.finfo(np.float64).eps
 
 
 def check_shape(source: str, name: str, array: NDArray[Any], letters: Shape, sizes: Mapping[str, int]) -> None:
@@ -75,12 +77,14 @@ def check_time(source: str, time: FloatArray) -> None:
 def unit_quaternion(source: str, name: str, quat: FloatArray) -> FloatArray:
     """The quaternions (N, 4) with a norm of exactly one, LogError at the first whose norm is not one."""
     check_finite(source, name, quat)
-    norm = np.linalg.norm(quat, axis=1)
+    with np.errstate(over="ignore"):  # to a norm that is refused
+        norm = np.linalg.norm(quat, axis=1)
     bad = ~(np.abs(norm - 1.0) <= QUATERNION_TOLERANCE)
     if bad.any():
         i = int(np.argmax(bad))
         found = f"norm {norm[i]:.6g} at sample {i}"
         raise LogError(source, name, found, f"unit quaternions, to {QUATERNION_TOLERANCE:g}")
+    norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # what was normalised before stays as it is, to the last bit
     return np.asarray(quat / norm[:, None], dtype=np.float64)
 
 

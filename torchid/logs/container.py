@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import lzma
-import os
+import secrets
 import struct
 import zipfile
 import zlib
@@ -16,6 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
+from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
+from torchid.logs.limits import check_growth
+from torchid.logs.npz import Npz, open_archive
+from torchid.logs.spill import Sliced
 
 SUFFIXES = (".npz", ".h5", ".hdf5")
 
@@ -23,9 +26,12 @@ SUFFIXES = (".npz", ".h5", ".hdf5")
 #: a joint. A compressed file of a few kilobytes can declare far more than any memory holds.
 MAX_BYTES = 16 * 2**30
 
+#: Characters of another package's message that a message of ours repeats.
+_LONGEST_TEXT = 200
+
 _UNREADABLE = (
-    OSError, EOFError, ValueError, TypeError, KeyError, RuntimeError, MemoryError,
-    struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
+    OSError, EOFError, ValueError, TypeError, KeyError, RuntimeError, MemoryError, OverflowError,
+    struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
 
 
@@ -38,49 +44,25 @@ class Container(Protocol):
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`; text is an array of str or of UTF-8 bytes."""
 
-
-class _Npz:
-    def __init__(self, archive: zipfile.ZipFile) -> None:
-        self._archive = archive
-
-    def sizes(self) -> dict[str, int]:
-        entries = self._archive.infolist()
-        sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in entries}
-        if len(sizes) != len(entries):
-            raise ValueError("a name occurs twice")
-        return sizes
-
-    def load(self, name: str) -> NDArray[Any]:
-        with self._archive.open(f"{name}.npy") as stream:
-            array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
-        return array
-
-
-class _Hdf5:
-    def __init__(self, file: Any, h5py: Any) -> None:
-        self._file, self._h5py = file, h5py
-
-    def sizes(self) -> dict[str, int]:
-        return {name: int(getattr(self._file.get(name), "nbytes", 0)) for name in self._file}
-
-    def load(self, name: str) -> NDArray[Any]:
-        item = self._file[name]
-        if not isinstance(item, self._h5py.Dataset) or item.shape is None:
-            raise TypeError("not a dataset with values")
-        array = np.asarray(item[()])
-        # bytes rather than h5py's own decoding, which takes fixed-width text for ASCII
-        return array if self._h5py.check_string_dtype(item.dtype) is None else array.astype(np.bytes_)
+    def sliced(self, name: str, folder: Path) -> Sliced:
+        """The array `name`, not read before it is sliced; what has to be unpacked goes to a file in `folder`."""
 
 
 @contextlib.contextmanager
-def translated(source: str, field: str, accepted: str) -> Iterator[None]:
-    """Turn whatever the readers raise on a damaged file into one LogError."""
+def translated(source: str, field: str, accepted: str, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Turn whatever the readers raise on a damaged file into one LogError; `also`: what else they raise."""
+    failures: tuple[type[Exception], ...] = (*_UNREADABLE, *also)
     try:
         yield
     except LogError:
         raise
-    except _UNREADABLE as error:
-        raise LogError(source, field, f"cannot be read ({type(error).__name__}: {error})", accepted) from error
+    except failures as error:
+        text = _shown(str(error)[:_LONGEST_TEXT])  # some readers quote the file
+        raise LogError(source, field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
+
+
+def _shown(text: str) -> str:
+    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def _suffix(path: Path) -> str:
@@ -90,18 +72,14 @@ def _suffix(path: Path) -> str:
     return suffix
 
 
-def _h5py(path: Path) -> Any:
-    """The module h5py, or a LogError: only those who use HDF5 need it."""
-    try:
-        import h5py
-    except ImportError as error:
-        raise LogError(path, "file", "HDF5, but h5py is not installed", "a .npz file, or an installed h5py") from error
-    return h5py
-
-
 @contextlib.contextmanager
-def open_container(path: Path) -> Iterator[Container]:
-    """Open a .npz, .h5 or .hdf5 file; LogError where it is absent, of another kind, damaged or declares too much."""
+def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
+    """Open a .npz, .h5 or .hdf5 file; LogError where it is absent, of another kind, damaged or declares too much.
+
+    Args:
+        path: the file.
+        whole: whether its arrays are to be read whole, and are refused if no memory holds them.
+    """
     suffix = _suffix(path)
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
@@ -111,27 +89,27 @@ def open_container(path: Path) -> Iterator[Container]:
         with translated(str(path), "file", kind):
             container: Container
             if suffix == ".npz":
-                container = _Npz(stack.enter_context(zipfile.ZipFile(path)))
+                container = Npz(stack.enter_context(open_archive(path)))
             else:
-                h5py = _h5py(path)
-                container = _Hdf5(stack.enter_context(h5py.File(path, "r")), h5py)
+                h5py = import_h5py(path)
+                container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py)
             total = sum(container.sizes().values())
-        if total > MAX_BYTES:
+        if whole and total > MAX_BYTES:
             raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_BYTES} bytes in all")
+        check_growth(path, total)
         yield container
 
 
-def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays to a .npz, .h5 or .hdf5 file under a temporary name, then rename: no half-written file is left."""
-    suffix = _suffix(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+@contextlib.contextmanager
+def appearing_whole(path: Path) -> Iterator[Path]:
+    """A temporary name that becomes `path` when the block ends without an error: no half-written file is left.
+
+    Raises:
+        LogError: the file cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        if suffix == ".npz":
-            with temporary.open("xb") as stream:
-                named: dict[str, Any] = dict(arrays)
-                np.savez(stream, **named)
-        else:
-            _save_hdf5(_h5py(path), temporary, arrays)
+        yield temporary
         temporary.replace(path)
     except OSError as error:
         raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error
@@ -140,10 +118,13 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             temporary.unlink()
 
 
-def _save_hdf5(h5py: Any, path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    with h5py.File(path, "x") as file:
-        for name, array in arrays.items():
-            if array.dtype.kind == "U":
-                file.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype())
-            else:
-                file.create_dataset(name, data=array)
+def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays to a .npz, .h5 or .hdf5 file, which appears complete or not at all."""
+    suffix = _suffix(path)
+    with appearing_whole(path) as temporary:
+        if suffix == ".npz":
+            with temporary.open("xb") as stream:
+                named: dict[str, Any] = dict(arrays)
+                np.savez(stream, **named)
+        else:
+            save_hdf5(import_h5py(path), temporary, arrays)

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.errors import LogError, UnknownNameError
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Shape = tuple[str | int, ...]
@@ -66,6 +68,15 @@ NEEDED: dict[str, tuple[str, ...]] = {
 
 #: Pairs that say the same thing twice: a file gives at most one of each.
 EXCLUSIVE = (*VARIANTS.items(), WRENCHES)
+
+
+class UnknownFieldError(LogError, UnknownNameError):
+    """A field of a log file that the log format does not know; the message lists the nearest that it knows."""
+
+
+def shape_of(name: str) -> Shape:
+    """Shape of a field of a file, a `Log`'s own or one in its place."""
+    return SHAPES[VARIANTS.get(name, name)]
 
 
 def is_quaternion(name: str) -> bool:

@@ -81,8 +81,10 @@ def plan(
             found = f"{sample_rate_hz:g}, which leaves one sample"
             accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
             raise InputError(source, "preprocessing.sample_rate_hz", found, accepted)
-    reach = 0.0 if cutoff_hz is None else REACH_PERIODS / cutoff_hz
-    return Timeline(native, grid, kept, output, low_pass, reach)
+    if low_pass is None or cutoff_hz is None:
+        return Timeline(native, grid, kept, output, None, 0.0, float(time[0]))
+    passed = low_pass.noise_share * 0.5 / float(np.median(np.diff(grid)))
+    return Timeline(native, grid, kept, output, low_pass, REACH_PERIODS / cutoff_hz, float(time[0]), passed)
 
 
 def _median_step(source: str, native: FloatArray) -> float:
@@ -99,7 +101,7 @@ def _median_step(source: str, native: FloatArray) -> float:
             f"{source}: time: a step of {steps[shortest]:.6g} s after sample {shortest}, the median being {step:.6g} s:"
             " interpolation multiplies the noise there"
         )
-        warnings.warn(message, TorchidWarning, stacklevel=4)
+        warnings.warn(message, TorchidWarning, stacklevel=5)
     return step
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from torchid.errors import InputError
 from torchid.logs.checks import check_finite
 from torchid.logs.fields import NAN_ALLOWED, FloatArray, labels_of
 from torchid.logs.log import Log
-from torchid.logs.measured import carry_measured
+from torchid.logs.measured import Coverage, carry_measured, check_coverage, coverage_of
 from torchid.logs.plan import plan
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, sign_continuous
 from torchid.logs.timeline import Timeline
@@ -62,12 +63,41 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     Warns:
         TorchidWarning: a torque or wrench channel is NaN in some samples, or time stamps nearly coincide.
     """
-    differentiates = _differentiates(log)
-    if cutoff_hz is None and sample_rate_hz is None and not differentiates:
+    timeline = timeline_of(log.source, log.time, differentiates(log), cutoff_hz, sample_rate_hz)
+    if timeline is None:
         return log
-    timeline = plan(log.source, log.time, cutoff_hz, sample_rate_hz, differentiates)
+    coverage = {name: coverage_of(log, name) for name in gapless_fields(log, timeline)}
+    for name, found in coverage.items():
+        check_coverage(log, name, found)
+    return on_timeline(log, timeline, coverage)
+
+
+def timeline_of(
+    source: str, time: FloatArray, differentiates: bool, cutoff_hz: float | None, sample_rate_hz: float | None
+) -> Timeline | None:
+    """How samples move in `preprocess`; None where nothing has to be done. Raises and warns as `plan`."""
+    if cutoff_hz is None and sample_rate_hz is None and not differentiates:
+        return None
+    return plan(source, time, cutoff_hz, sample_rate_hz, differentiates)
+
+
+def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
+    """Fields whose channels are to be without a gap, for they are filtered or resampled."""
+    if timeline.low_pass is None and timeline.output is None:
+        return []
+    return [name for name in NAN_ALLOWED if getattr(log, name) is not None]
+
+
+def on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> Log:
+    """What `preprocess` makes of a log, or of a part of one.
+
+    Args:
+        log: the log.
+        timeline: stamps of it and of the result.
+        coverage: by field, of those that have to be gapless.
+    """
     fields: dict[str, Any] = {
-        "time": log.time[timeline.kept] if timeline.keeps_stamps else log.time[0] + timeline.at,
+        "time": log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.at,
     }
     for chain in CHAINS:
         fields |= _chain(log, chain, timeline)
@@ -75,20 +105,18 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
         fields |= _orientation(log, sign_continuous(log.base_quat_xyzw), timeline)
     for name in NAN_ALLOWED:
         if getattr(log, name) is not None:
-            fields[name] = carry_measured(log, name, timeline)
+            fields[name] = carry_measured(log, name, timeline, coverage.get(name))
     if log.contact_active is not None:
         fields["contact_active"] = timeline.active(log.contact_active)
         if timeline.low_pass is not None or timeline.output is not None:
             share = log.contact_active if log.contact_share is None else log.contact_share
             fields["contact_share"] = timeline.evaluate(timeline.smooth(share.astype(np.float64)), (0,))[0]
-    if timeline.low_pass is not None:
-        half_rate = 0.5 / float(np.median(np.diff(timeline.grid)))
-        passed = timeline.low_pass.noise_share * half_rate
-        fields["noise_bandwidth_hz"] = min(passed, log.noise_bandwidth_hz or np.inf)
+    if timeline.bandwidth_hz is not None:
+        fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
     return dataclasses.replace(log, **fields)
 
 
-def _differentiates(log: Log) -> bool:
+def differentiates(log: Log) -> bool:
     """Whether any velocity or acceleration that can be derived is missing."""
     if log.base_quat_xyzw is not None and any(getattr(log, name) is None for name in ANGULAR):
         return True

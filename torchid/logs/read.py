@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, UnknownNameError
+from torchid.errors import LogError
 from torchid.logs.checks import (
     as_flags,
     as_frame,
@@ -31,37 +31,69 @@ from torchid.logs.fields import (
     SHAPES,
     VARIANTS,
     FloatArray,
+    UnknownFieldError,
     is_quaternion,
     labels_of,
+    shape_of,
 )
+from torchid.logs.kinds import Kind, kind_to_read
 from torchid.logs.log import Log
 from torchid.logs.quaternion import rotate, rotate_back, sign_continuous
+from torchid.logs.ros.read import read_bag
+from torchid.logs.ros.topics import Topics
+from torchid.logs.table import read_table
 
 
-class UnknownFieldError(LogError, UnknownNameError):
-    """A field of a log file that the log format does not know; the message lists the nearest that it knows."""
-
-
-def read_log(path: str | os.PathLike[str]) -> Log:
-    """Read a log from a .npz (never pickled), .h5 or .hdf5 file.
+def read_log(
+    path: str | os.PathLike[str], topics: Topics | None = None, progress: Callable[[float], None] | None = None
+) -> Log:
+    """Read a log: arrays (.npz, never pickled, .h5, .hdf5), a table (.csv, .parquet) or a bag of ROS messages.
 
     Quaternions come back in the order xyzw, renormalised and without sign flips; linear velocity and acceleration of
     the base in the world frame, angular ones in the base frame. An acceleration's components are only rotated: it is
     the derivative of the world velocity whichever frame it is expressed in.
 
+    Args:
+        path: the file; of a ROS 2 bag also its folder.
+        topics: of a bag (.bag, .mcap, .db3), which holds what; nothing else needs them.
+        progress: called with the share of a bag that has been read.
+
     Raises:
         LogError: one line that names the file, the field, what was found and what is accepted.
+
+    Warns:
+        TorchidWarning: of a bag, that messages carry no time or come twice, or that a channel is NaN in some of them.
     """
-    source = os.fspath(path)
-    with open_container(Path(path)) as container:
+    source, kind = os.fspath(path), kind_to_read(Path(path))
+    if kind is Kind.ARRAYS:
+        raw = _arrays(source)
+    else:
+        raw = read_table(Path(path)) if kind is Kind.TABLE else read_bag(Path(path), topics, progress)
+        check_fields_given(source, raw)
+    return checked_log(source, raw)
+
+
+def checked_log(source: str, raw: dict[str, NDArray[Any]]) -> Log:
+    """The log of the fields of a file, in canonical frames and orders, LogError where one is not what it should be."""
+    return _canonical(source, _checked(source, raw))
+
+
+def check_fields_given(source: str, names: Collection[str]) -> None:
+    """Raise LogError unless the names of a file's fields are known and go together."""
+    _check_names(source, names)
+    _check_combination(source, names)
+
+
+def _arrays(source: str) -> dict[str, NDArray[Any]]:
+    """The arrays of a .npz or HDF5 file, none of them before all names are known to be right."""
+    with open_container(Path(source)) as container:
         names = list(container.sizes())
-        _check_names(source, names)
-        _check_combination(source, names)
+        check_fields_given(source, names)
         raw: dict[str, NDArray[Any]] = {}
         for name in names:
             with translated(source, name, "a plain array of numbers, truth values or text"):
                 raw[name] = container.load(name)
-    return _canonical(source, _checked(source, raw))
+    return raw
 
 
 def _check_names(source: str, names: Collection[str]) -> None:
@@ -103,7 +135,7 @@ def _checked(source: str, raw: dict[str, NDArray[Any]]) -> dict[str, Any]:
     for name, array in raw.items():
         if name in fields:
             continue
-        check_shape(source, name, array, SHAPES[VARIANTS.get(name, name)], sizes)
+        check_shape(source, name, array, shape_of(name), sizes)
         labels = labels_of(name, names)
         if name == "contact_active":
             fields[name] = as_flags(source, name, array, labels)

@@ -6,6 +6,7 @@ import numpy as np
 
 from torchid.logs.fields import BoolArray, FloatArray
 from torchid.logs.log import Log
+from torchid.logs.timeline import JITTER
 
 
 def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray:
@@ -20,6 +21,8 @@ def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray
     if log.contact_active is None:
         return near
     changes = np.flatnonzero((log.contact_active[1:] != log.contact_active[:-1]).any(axis=1))
+    if len(changes):
+        margin += JITTER * float(np.median(np.diff(log.time)))  # a stamp at the margin is within, however it rounds
     first = np.searchsorted(time, log.time[changes] - margin)
     last = np.searchsorted(time, log.time[changes + 1] + margin, side="right")
     for start, stop in zip(first, last, strict=True):

@@ -25,12 +25,13 @@ def by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slic
     """Chunks of samples that share a contact state: the state and an index into the samples."""
     active = samples.active.cpu().numpy()
     packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
-    keys, first, which = np.unique(packed.view(f"V{packed.shape[1]}")[:, 0], return_index=True, return_inverse=True)
-    for number, example in enumerate(first):
-        if len(keys) == 1:
+    keys = packed.view(f"V{packed.shape[1]}")[:, 0]
+    found, first = np.unique(keys, return_index=True)
+    for key, example in zip(found, first, strict=True):
+        if len(found) == 1:
             pieces: Iterable[slice | torch.Tensor] = (slice(i, i + chunk) for i in range(0, len(active), chunk))
         else:
-            pieces = torch.from_numpy(np.flatnonzero(which == number)).split(chunk)
+            pieces = torch.from_numpy(np.flatnonzero(keys == key)).split(chunk)
         for piece in pieces:
             yield tuple(active[example].tolist()), piece
 
@@ -39,8 +40,9 @@ def spread_by_state(logs: Sequence[Samples], count: int) -> Iterator[tuple[Sampl
     """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
     found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
     for samples in logs:
+        every = torch.arange(len(samples))
         for state, index in by_state(samples):
-            found.setdefault(state, []).append((samples, torch.arange(len(samples))[index]))
+            found.setdefault(state, []).append((samples, every[index]))
     for state, pieces in found.items():
         total = sum(len(index) for _, index in pieces)
         for samples, index in pieces:

@@ -79,13 +79,16 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
         rest = np.delete(R, [count + number for number in per_log], axis=1)
         if per_log:
             extras = tuple(builder.extras[number] for number in per_log)
-            elimination, rest = _eliminate(source, extras, R[:, [count + number for number in per_log]], rest, builder)
+            columns = R[:, [count + number for number in per_log]]
+            elimination, rest = _eliminate(source, extras, columns, rest, builder, np.linalg.norm(columns, axis=0))
             found.append(elimination)
         left.append(rest)
     rows: Array = np.asarray(np.linalg.qr(np.concatenate(left), mode="r"))
     if of_all:
         extras = tuple(builder.extras[number] for number in of_all)
-        elimination, rows = _eliminate("", extras, rows[:, count:-1], np.delete(rows, np.s_[count:-1], axis=1), builder)
+        sizes = np.linalg.norm(everything.triangle().numpy()[:, [count + number for number in of_all]], axis=0)
+        rest = np.delete(rows, np.s_[count:-1], axis=1)
+        elimination, rows = _eliminate("", extras, rows[:, count:-1], rest, builder, sizes)
         found.append(elimination)
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in found)
@@ -102,18 +105,22 @@ def _sources(parts: Sequence[Part]) -> list[str]:
 
 
 def _eliminate(
-    log: str, extras: tuple[Extra, ...], columns: Array, rest: Array, builder: RowBuilder
+    log: str, extras: tuple[Extra, ...], columns: Array, rest: Array, builder: RowBuilder, sizes: Array
 ) -> tuple[Elimination, Array]:
-    """The unknowns of some columns, (R, M), and the rows of the rest, (R, ...), right-hand side last, without them."""
-    norms = np.linalg.norm(columns, axis=0)
-    seen = norms > _DEPENDENT * max(norms.max(initial=0.0), np.finfo(float).tiny)
-    scale = np.where(seen, norms, 1.0)
+    """The unknowns of some columns, (R, M), and the rows of the rest, (R, ...), right-hand side last, without them.
+
+    `sizes`: (M,), norms of the columns before anything was eliminated.
+    """
+    seen = sizes > _DEPENDENT * sizes.max(initial=0.0)
+    scale = np.where(seen, sizes, 1.0)
     U, values, Vt = np.linalg.svd(np.where(seen, columns / scale, 0.0), full_matrices=True)
-    rank = int((values > _DEPENDENT * max(values.max(initial=0.0), np.finfo(float).tiny)).sum())
+    rank = int((values > _DEPENDENT).sum())
     top, V = U[:, :rank].T @ rest, Vt[:rank].T
     count = builder.columns.count
     C = np.hstack([top[:, :count] @ builder.columns.from_parameters(), top[:, count:-1]])
     alone = np.where(seen, 1.0 / scale, np.inf)
     hidden = np.eye(len(extras)) - V @ V.T
     found = Elimination(log, extras, (V / values[:rank]) / scale[:, None], C, top[:, -1], alone, hidden)
-    return found, U[:, rank:].T @ rest
+    left = U[:, rank:].T @ rest
+    left[:, np.linalg.norm(left, axis=0) < _DEPENDENT * np.linalg.norm(rest, axis=0)] = 0.0  # nothing but rounding
+    return found, left

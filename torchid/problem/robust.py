@@ -31,7 +31,7 @@ class RobustLoss:
     def weight(self, u: Tensor) -> Tensor:
         """rho'(u) / u."""
         if self.kind == "huber":
-            return (self.tuning / u.abs().clamp_min(self.tuning)).clamp_max(1.0)
+            return torch.where(u.abs() <= self.tuning, 1.0, self.tuning / u.abs())
         return (1.0 - (u / self.tuning).square()).clamp_min(0.0).square()
 
     def slope(self, u: Tensor) -> Tensor:

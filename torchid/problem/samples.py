@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
+from torchid.logs.fields import FloatArray
 from torchid.problem.base_motion import BaseMotion, base_motion
 from torchid.problem.measured import read_components
 from torchid.regressor.motion import GRAVITY_WORLD, Motion, rotation_matrix
@@ -143,7 +144,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
         None if wrench is None else torch.from_numpy(_columns(wrench, chosen)),
         log.contact_wrench_world is not None,
         torch.from_numpy(active),
-        _oversampling(log),
+        oversampling(log.time, log.noise_bandwidth_hz),
         None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
     )
     if required is not None:
@@ -151,12 +152,12 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
     return samples
 
 
-def _oversampling(log: Log) -> float:
-    """Half the sample rate over the bandwidth that a filter has left of the noise, at least 1."""
-    if log.noise_bandwidth_hz is None or len(log) < 2:
+def oversampling(time: FloatArray, noise_bandwidth_hz: float | None) -> float:
+    """Half the sample rate of stamps (N,) [s] over the bandwidth that a filter has left of the noise, at least 1."""
+    if noise_bandwidth_hz is None or len(time) < 2:
         return 1.0
-    rate = 1.0 / float(np.median(np.diff(log.time)))
-    return max(1.0, 0.5 * rate / log.noise_bandwidth_hz)
+    rate = 1.0 / float(np.median(np.diff(time)))
+    return max(1.0, 0.5 * rate / noise_bandwidth_hz)
 
 
 def _joints(log: Log, name: str, order: list[int]) -> Tensor:

@@ -44,11 +44,12 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
     rows: dict[State, int] = {}
     checked: dict[State, int] = {}
     for samples in logs:
+        every = torch.arange(len(samples))
         for state, index in by_state(samples):
-            piece = samples[index]
-            counts[state] = counts.get(state, 0) + len(piece)
+            counts[state] = counts.get(state, 0) + len(every[index])
             checked[state] = checked.get(state, 0) + 1
             if checked[state] <= _CHUNKS_CHECKED:
+                piece = samples[index]
                 spread = piece[torch.linspace(0, len(piece) - 1, min(len(piece), _CHECKED)).long()].to(builder.device)
                 for _, V in builder.bases(spread, state):
                     rows[state] = max(rows.get(state, 0), V.shape[2] + len(builder.plan(state).lone_joints))

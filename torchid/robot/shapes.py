@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,12 +18,16 @@ from yourdfpy.urdf import Inertial
 
 from torchid.errors import TorchidWarning, UrdfError
 from torchid.parameters import Array
+from torchid.robot.mesh_files import MeshError, mesh_content
 from torchid.robot.robot import Robot
-from torchid.robot.urdf import parse_xml, read_urdf
+from torchid.robot.urdf import MAX_NUMBER, parse_xml, read_urdf
+from torchid.text import shown
 
 ShapeKind = Literal["collision", "visual"]
 SHAPE_TAGS = ("box", "sphere", "cylinder", "capsule", "mesh")
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+_STL_HEAD, _FACE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_MOST_SHAPES = 300  # of a link: each gives axes to try on all others
 _THINNEST = 1e-3  # of the longest edge: a plate or a flat mesh keeps an interior
 
 
@@ -54,10 +59,6 @@ class _Shape:
         return _Shape(self.points @ R.T + T[:3, 3], R @ self.spread, R @ self.axes)
 
 
-class _MeshError(Exception):
-    """A mesh file that is missing or that trimesh cannot read."""
-
-
 def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[int] | None = None) -> dict[int, Extent]:
     """Extents of bodies, by index, each around all shapes of all links that the body is made of.
 
@@ -68,7 +69,7 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
     around a cylinder, 1 around a sphere.
 
     Args:
-        robot: any; meshes are looked for as yourdfpy does, relative to the URDF and to the folders above it.
+        robot: any; meshes are looked for in its URDF's package and, by `package://`, in those beside it.
         prefer: "collision" or "visual".
         bodies: indices; all that have mass if None.
 
@@ -93,7 +94,7 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
                 shapes += [shape.moved(T_body_link) for shape in of_link]
                 if not of_link and inertials[name] is not None and inertials[name].mass > 0.0:
                     unseen.append(_inertia_box(inertials[name]).moved(T_body_link))
-        except _MeshError as error:
+        except MeshError as error:
             unreadable.append(body.name)
             reasons.append(str(error))
             continue
@@ -120,6 +121,8 @@ def _link_shapes(path: Path, link: etree._Element, prefer: ShapeKind) -> list[_S
         elements = link.findall(tag)
         if elements:
             field = f"link '{link.get('name')}', <{tag}>"
+            if len(elements) > _MOST_SHAPES:
+                raise UrdfError(path, field, f"{len(elements)} of them", f"at most {_MOST_SHAPES}")
             return [_shape(path, field, element) for element in elements]
     return []
 
@@ -163,37 +166,38 @@ def _numbers(path: Path, field: str, element: etree._Element, name: str, count: 
     if name == "scale" and values.shape == (1,):
         values = np.repeat(values, 3)
     signed = name in ("xyz", "rpy", "scale")
-    if values.shape != (count,) or not np.isfinite(values).all() or not (signed or (values >= 0.0).all()):
-        found = f"'{text}'" if text else "none"
+    fits = values.shape == (count,) and np.isfinite(values).all() and np.abs(values).max() <= MAX_NUMBER
+    if not fits or not (signed or (values >= 0.0).all()):
+        found = f"'{shown(text)}'" if text else "none"
         accepted = f"{count} decimal number{'s' if count > 1 else ''}{'' if signed else ' of at least 0'}"
         raise UrdfError(path, f"{field} {name}>", found, accepted)
     return values
 
 
 def _vertices(urdf: Path, filename: str) -> Array:
-    """Vertices (N, 3) [m] of a mesh, in the unit that the file states, if it does."""
-    path = _mesh_file(urdf, filename)
-    if path is None:
-        raise _MeshError(f"{filename}: no such file")
+    """Vertices (N, 3) [m] of a mesh, in the unit that the file states, if it does; other files it names are not read."""
+    kind, content = mesh_content(urdf, filename)
+    if kind == "stl" and len(content) == _STL_HEAD + _FACE.itemsize * int.from_bytes(content[80:_STL_HEAD], "little"):
+        return _checked(filename, np.frombuffer(content, _FACE, offset=_STL_HEAD)["corners"].reshape(-1, 3))
     try:
-        mesh = trimesh.load(path, force="mesh", process=False, skip_materials=True)
-    except Exception as error:  # noqa: B902 - readers of a dozen formats raise what they like
-        raise _MeshError(f"{filename}: {type(error).__name__}: {error}") from error
-    points = np.asarray(getattr(mesh, "vertices", ()), dtype=np.float64)
-    if not len(points) or not np.isfinite(points).all():
-        raise _MeshError(f"{filename}: no vertices")
-    return points * (trimesh.units.unit_conversion(mesh.units, "meters") if mesh.units else 1.0)
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load(io.BytesIO(content), kind, force="mesh", process=False, skip_materials=True)
+    except Exception as error:  # noqa: B902 - readers of several formats raise what they like
+        raise MeshError(f"{shown(filename)}: {type(error).__name__}: {shown(str(error))}") from error
+    units = getattr(mesh, "units", None)
+    return _checked(filename, getattr(mesh, "vertices", ())) * (
+        trimesh.units.unit_conversion(units, "meters") if units else 1.0
+    )
 
 
-def _mesh_file(urdf: Path, filename: str) -> Path | None:
-    """The file that a URDF's author meant, looked for from the URDF's folder upwards, with and without the package."""
-    name = filename.split("://", 1)[-1]
-    names = [name.split("/", 1)[-1], name] if filename.startswith("package://") else [name]
-    for folder in urdf.absolute().parents:
-        for candidate in names:
-            if (folder / candidate).is_file():
-                return folder / candidate
-    return None
+def _checked(filename: str, vertices: object) -> Array:
+    with np.errstate(invalid="ignore"):  # of NaN of a kind that float64 has not
+        points = np.asarray(vertices, dtype=np.float64)
+    if not len(points) or points.shape[1:] != (3,) or not np.isfinite(points).all():
+        raise MeshError(f"{shown(filename)}: no vertices")
+    if np.abs(points).max() > MAX_NUMBER:
+        raise MeshError(f"{shown(filename)}: vertices farther than {MAX_NUMBER:g}")
+    return points
 
 
 def _inertia_box(inertial: Inertial) -> _Shape:
@@ -207,7 +211,9 @@ def _inertia_box(inertial: Inertial) -> _Shape:
 
 def _extent(shapes: list[_Shape]) -> Extent | None:
     """Of one body's shapes, None if they are a point."""
-    boxes = [_box(shapes, axes) for axes in (np.eye(3), *(shape.axes for shape in shapes))]
+    points, spreads = np.concatenate([shape.points for shape in shapes]), np.stack([shape.spread for shape in shapes])
+    of_point = np.repeat(np.arange(len(shapes)), [len(shape.points) for shape in shapes])
+    boxes = [_box(points, spreads, of_point, axes) for axes in (np.eye(3), *(shape.axes for shape in shapes))]
     volumes = [float(np.prod(half)) for _, _, half in boxes]
     best = next(i for i, volume in enumerate(volumes) if volume <= min(volumes) * (1.0 + 1e-9))  # the link's if as good
     centre, axes, half = boxes[best]
@@ -219,11 +225,17 @@ def _extent(shapes: list[_Shape]) -> Extent | None:
     return Extent(centre, axes, half, min(factor, np.sqrt(3.0)) * half)
 
 
-def _box(shapes: list[_Shape], axes: Array) -> tuple[Array, Array, Array]:
-    """Centre (3,) and half edges (3,) of the box along given axes, which come back between them."""
-    wide = [np.linalg.norm(shape.spread.T @ axes, axis=0) for shape in shapes]
-    top = np.max([(shape.points @ axes).max(axis=0) + w for shape, w in zip(shapes, wide, strict=True)], axis=0)
-    bottom = np.min([(shape.points @ axes).min(axis=0) - w for shape, w in zip(shapes, wide, strict=True)], axis=0)
+def _box(points: Array, spreads: Array, of_point: np.ndarray, axes: Array) -> tuple[Array, Array, Array]:
+    """Centre (3,) and half edges (3,) of the box along given axes, which come back between them.
+
+    Args:
+        points: (N, 3), of all shapes.
+        spreads: (S, 3, 3), of each shape.
+        of_point: (N,), the shape of each point.
+        axes: (3, 3), columns.
+    """
+    along, wide = points @ axes, np.linalg.norm(np.swapaxes(spreads, 1, 2) @ axes, axis=1)[of_point]
+    top, bottom = (along + wide).max(axis=0), (along - wide).min(axis=0)
     return axes @ (top + bottom) / 2.0, axes, (top - bottom) / 2.0
 
 

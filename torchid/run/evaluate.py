@@ -64,10 +64,12 @@ def evaluate(
             if not any(x is not None for x in identified.rms.values()):
                 message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
                 warnings.warn(message, TorchidWarning, stacklevel=2)
-        document = {
+        document: dict[str, dict[str, object]] = {
             name: {"identified": after.as_dict(), "nominal": before.as_dict()}
             for name, (before, after) in metrics.items()
         }
+        for path, count in experiment.excluded.items():
+            document[Path(path).stem]["excluded_samples"] = count
         with new_folder(output, overwrite=True) as new:
             (new / "config.yaml").write_text((folder / "config.yaml").read_text())
             write_json(new / "metrics.json", document)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -12,7 +13,13 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
+
 from torchid.errors import ConfigError
+from torchid.interrupts import interrupt_held_back
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,7 @@ class FolderKind:
         return sorted(name for name in names if not any(fnmatch(name, pattern) for pattern in own))
 
 
-_FIGURES = ("forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png")
+_FIGURES = ("forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png", "extras.png")
 _RESULTS = ("parameters.json", "metrics.json", "identified.urdf", *_FIGURES)
 EVENTS = "events.out.tfevents*"
 RUN = FolderKind("a run", "config.yaml", (*_RESULTS, "hparams", "evaluation", EVENTS))
@@ -44,6 +51,8 @@ ANALYSIS = FolderKind(
 STUDY = FolderKind("a study", "results.json", ("tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard"))
 
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer
+_TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # by another run
+_TRIES = 100
 
 
 def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN) -> None:
@@ -55,11 +64,14 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN) -> None:
     try:
         names = [path.name for path in output.iterdir()] if output.is_dir() else []
         above = next(path for path in output.absolute().parents if path.exists())
-        taken = output.exists() and not output.is_dir()
+        taken = output.is_symlink() or (output.exists() and not output.is_dir())
     except (OSError, ValueError) as error:
         raise ConfigError(output, "output", f"no name for a folder ({error})", "a path to a new folder") from error
     if taken:
-        raise ConfigError(output, "output", "a file of this name exists", "a folder that does not exist yet")
+        found = "a link" if output.is_symlink() else "a file of this name exists"
+        raise ConfigError(output, "output", found, "a folder that does not exist yet")
+    if output.name in ("", ".."):
+        raise ConfigError(output, "output", "no name for a folder", "a path to a new folder")
     if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)) or len(os.fsencode(output.name)) > _LONGEST_NAME:
         raise ConfigError(output, "output", f"no folder can be made there, in {above}", "a place that can be written")
     if names and not overwrite:
@@ -78,29 +90,106 @@ def write_json(path: Path, document: object) -> None:
 
 @contextmanager
 def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) -> Iterator[Path]:
-    """A temporary folder beside `output` that takes its place when the block ends without an error."""
+    """A temporary folder beside `output` that takes its place when the block ends without an error.
+
+    Of several at a time the first takes the place, or, with `overwrite`, the last.
+
+    Raises:
+        ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
+    """
     check_free(output, overwrite, kind)
     made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
-    output.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-    temporary.chmod(0o755)
+    temporary: Path | None = None
     try:
+        with interrupt_held_back():
+            temporary = _temporary(output)
         yield temporary
-        if output.exists():
-            retired = Path(tempfile.mkdtemp(prefix=f".{output.name}-old-", dir=output.parent))
-            output.rename(retired / "run")
-            try:
-                temporary.rename(output)
-            except BaseException:
-                (retired / "run").rename(output)
-                raise
-            finally:
-                shutil.rmtree(retired, ignore_errors=True)
-        else:
-            temporary.rename(output)
+        with interrupt_held_back(f"interrupted when {output} was complete"):
+            _put(temporary, output, overwrite, kind)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if not output.exists():
-            with suppress(OSError):  # another run has put something there meanwhile
-                for folder in made:
-                    folder.rmdir()
+        with interrupt_held_back():
+            if temporary is not None:
+                shutil.rmtree(temporary, ignore_errors=True)
+            if not output.exists():
+                with suppress(OSError):  # another run has put something there meanwhile
+                    for folder in made:
+                        folder.rmdir()
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder, which keeps its name no longer than it is whole."""
+    if not folder.exists():
+        return
+    with interrupt_held_back():
+        retired = _temporary(folder)
+        try:
+            folder.rename(retired / "old")
+        finally:
+            shutil.rmtree(retired, ignore_errors=True)
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Keep other processes from claiming an existing folder; the system lets go of it when this one ends, if killed.
+
+    Raises:
+        ConfigError: another process has claimed it.
+    """
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(handle)
+        raise ConfigError(folder, "output", "another run is at work there", "another output, or patience") from error
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def _temporary(output: Path) -> Path:
+    """A new folder beside `output` whose name nobody takes for a run's."""
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
+    except OSError as error:
+        found = f"no folder can be made there ({error.strerror})"
+        raise ConfigError(output, "output", found, "a place that can be written") from error
+    temporary.chmod(0o755)
+    return temporary
+
+
+def _put(temporary: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
+    """Rename the temporary folder; what stood there, perhaps another run that ended meanwhile, is replaced whole."""
+    retired: list[Path] = []
+    try:
+        for _ in range(_TRIES):
+            if _renamed(temporary, output):
+                return
+            check_free(output, overwrite, kind)
+            with suppress(FileNotFoundError):  # taken away by another that replaces it
+                retired.append(_temporary(output))
+                output.rename(retired[-1] / "run")
+        raise ConfigError(output, "output", "other runs take the place again and again", "another output")
+    except BaseException:
+        for aside in reversed(retired):
+            with suppress(OSError):
+                (aside / "run").rename(output)
+        raise
+    finally:
+        for aside in retired:
+            shutil.rmtree(aside, ignore_errors=True)
+
+
+def _renamed(folder: Path, name: Path) -> bool:
+    """Whether the name was free, or that of an empty folder."""
+    try:
+        folder.rename(name)
+    except OSError as error:
+        if error.errno in _TAKEN:
+            return False
+        raise
+    return True

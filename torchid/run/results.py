@@ -138,6 +138,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "parameters": int(estimate.phi.size),
         "condition_number": estimate.condition_number if estimate.rank else None,
         "samples": run.samples,
+        "excluded_samples": run.experiment.excluded,
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
         "total_mass": float(run.phi[:, 0].sum()),

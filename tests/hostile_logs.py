@@ -1,0 +1,443 @@
+"""Log files that nobody should trust, .npz and .h5: hand-made ones, and valid ones with bytes cut off or changed."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+Cases = Iterator[tuple[str, Path]]
+N = 40
+
+
+def fields(samples: int = N) -> dict[str, Any]:
+    """A valid log, in the names of the file format."""
+    rng = np.random.default_rng(5)
+    quat = np.tile([1.0, 0.0, 0.0, 0.0], (samples, 1))
+    return {
+        "time": 0.01 * np.arange(samples),
+        "joint_names": np.array(["hip", "knee"]),
+        "joint_position": rng.standard_normal((samples, 2)),
+        "joint_velocity": rng.standard_normal((samples, 2)),
+        "joint_acceleration": rng.standard_normal((samples, 2)),
+        "joint_torque": rng.standard_normal((samples, 2)),
+        "base_quat_wxyz": quat,
+        "base_position_world": rng.standard_normal((samples, 3)),
+        "contact_names": np.array(["l_sole", "r_sole"]),
+        "contact_active": rng.random((samples, 2)) > 0.5,
+        "contact_wrench_local": rng.standard_normal((samples, 2, 6)),
+    }
+
+
+def write(path: Path, values: dict[str, Any]) -> Path:
+    """A log file of raw arrays, valid or not."""
+    if path.suffix == ".npz":
+        np.savez(path, **values)
+        return path
+    with h5py.File(path, "w") as file:
+        for name, value in values.items():
+            array = np.asarray(value)
+            file[name] = np.char.encode(array) if array.dtype.kind == "U" else array
+    return path
+
+
+def damaged(folder: Path, suffix: str, count: int, seed: int) -> Cases:
+    """A valid file cut off at any place, with bits flipped, with runs of bytes replaced, moved or repeated."""
+    rng = np.random.default_rng(seed)
+    path = folder / f"damaged{suffix}"
+    whole, compressed = write(path, fields()).read_bytes(), _compressed(path).read_bytes()
+    for number in range(count):
+        kind, content = mutated(whole if number % 3 else compressed, rng)
+        path.write_bytes(content)
+        yield f"{kind} {number}", path
+
+
+def mutated(content: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
+    """A random mutation, and its name."""
+    data, size = bytearray(content), len(content)
+    kind = ("cut", "flipped", "replaced", "repeated", "removed", "numbers")[rng.integers(6)]
+    a, b = sorted(int(x) for x in rng.integers(0, size, 2))
+    if kind == "cut":
+        return kind, bytes(data[:b])
+    if kind == "flipped":
+        for place in rng.integers(0, size, rng.integers(1, 9)):
+            data[place] ^= 1 << int(rng.integers(8))
+    elif kind == "replaced":
+        b = min(b, a + 64)
+        data[a:b] = rng.integers(0, 256, b - a, dtype=np.uint8).tobytes()
+    elif kind == "repeated":
+        data[b:b] = data[a : min(b, a + 4096)]
+    elif kind == "removed":
+        del data[a : min(b, a + int(rng.integers(1, 512)))]
+    else:  # where a length or an offset may stand
+        value = (0, 1, 0x7FFFFFFF, 0xFFFFFFFF, 2**63 - 1, 2**64 - 1, 2**40)[rng.integers(7)]
+        width = int(rng.choice([2, 4, 8]))
+        data[a : a + width] = (value & (256**width - 1)).to_bytes(width, "little")
+    return kind, bytes(data)
+
+
+def _compressed(path: Path) -> Path:
+    if path.suffix == ".npz":
+        np.savez_compressed(path, **fields())
+        return path
+    with h5py.File(path, "w") as file:
+        for name, value in fields().items():
+            array = np.asarray(value)
+            array = np.char.encode(array) if array.dtype.kind == "U" else array
+            file.create_dataset(name, data=array, chunks=True, compression="gzip", shuffle=True, fletcher32=True)
+    return path
+
+
+def values(folder: Path, suffix: str) -> Cases:
+    """NaN, infinity, and numbers beyond all sense in every field; 0 and 1 sample; wrong shapes and types."""
+    for samples in (0, 1):
+        yield _named(folder, f"{samples} samples", suffix, fields(samples))
+    for name, array in fields().items():
+        for value in (np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324):
+            changed = array.astype(np.float64) if array.dtype.kind != "U" else np.full(array.shape, value)
+            changed[(-1,) * changed.ndim] = value
+            yield _named(folder, f"{value} in {name}", suffix, fields() | {name: changed})
+            if array.dtype.kind == "f":
+                yield _named(folder, f"{name} all {value}", suffix, fields() | {name: np.full(array.shape, value)})
+        for kind in _TYPES:
+            yield _named(folder, f"{name} of type {kind}", suffix, fields() | {name: np.zeros(array.shape, kind)})
+        for shape in ((), (0,), (N, 0), (0, 2), (1,) * 9, (2, N), (N, 2, 6, 1), (10**4,)):
+            yield _named(folder, f"{name} of shape {shape}", suffix, fields() | {name: np.zeros(shape)})
+
+
+_TYPES = ("c16", "?", "i1", "u8", "f2", ">f8", "S3", "V7", [("a", "f8"), ("b", "S3")])
+
+
+def _named(folder: Path, name: str, suffix: str, content: dict[str, Any]) -> tuple[str, Path]:
+    return name, write(folder / f"values{suffix}", content)
+
+
+# ------------------------------------------------------------------------------------------------------------- archives
+
+
+def header(shape: str, descr: str = "'<f8'", order: str = "False", version: int = 1) -> bytes:
+    """The beginning of a .npy file that says what it is asked to."""
+    text = f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}".encode() + b"\n"
+    return b"\x93NUMPY" + bytes([version, 0]) + struct.pack("<H" if version == 1 else "<I", len(text)) + text
+
+
+def archives(folder: Path) -> Cases:
+    """Archives made by hand."""
+    for name, content in _ENTRIES.items():
+        path = folder / "archive.npz"
+        yield name, _with_entry(path, "time.npy", content, zipfile.ZIP_DEFLATED)
+    for name, entry in _ENTRY_NAMES.items():
+        yield name, _with_entry(folder / "archive.npz", entry, header("(2,)") + bytes(16), zipfile.ZIP_STORED)
+    for name, make in _ARCHIVES.items():
+        path = folder / "archive.npz"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            make(path)
+        yield name, path
+
+
+def _with_entry(path: Path, entry: str, content: bytes, method: int) -> Path:
+    """A log with one entry more, or one in place of another."""
+    write(path, {name: x for name, x in fields().items() if f"{name}.npy" != entry})
+    with zipfile.ZipFile(path, "a", method) as archive:
+        archive.writestr(entry, content)
+    return path
+
+
+def _npy(array: np.ndarray, pickled: bool = False) -> bytes:
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, array, allow_pickle=pickled)
+    return stream.getvalue()
+
+
+class Evil:
+    """Runs a command when it is unpickled."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return exec, ("open('pwned', 'w')",)
+
+
+_DEEP = "(" * 10_000 + ")" * 10_000
+_ENTRIES: dict[str, bytes] = {
+    "a pickled object": _npy(np.array([Evil()], dtype=object), True),
+    "a bare pickle": b"\x80\x04\x95" + bytes(40),
+    "10^15 numbers declared": header("(1000000000000000,)") + bytes(64),
+    "10^9 numbers declared": header("(1000000000,)") + bytes(64),
+    "2^63 numbers declared": header("(9223372036854775807,)"),
+    "more than 64 bits declared": header("(99999999999999999999999999,)"),
+    "a negative size": header("(-1,)") + bytes(64),
+    "sizes that overflow": header("(4294967296, 4294967296, 4294967296)"),
+    "sizes with a zero": header("(0, 9223372036854775807)"),
+    "a size that is true": header("(True,)") + bytes(8),
+    "a size that is a float": header("(2.0,)") + bytes(16),
+    "a size that is text": header("'2'") + bytes(16),
+    "sizes in a list": header("[2]") + bytes(16),
+    "100 axes": header("(" + "1, " * 100 + ")") + bytes(8),
+    "Fortran order": header("(2,)", order="True") + bytes(16),
+    "order by a number": header("(2,)", order="7") + bytes(16),
+    "an object type": header("(1,)", "'|O'") + bytes(8),
+    "a void type": header("(2,)", "'|V8'") + bytes(16),
+    "a void of no size": header("(1000000000000,)", "'|V0'"),
+    "text of no size": header("(1000000000000,)", "'<U0'"),
+    "text of 2^31 characters": header("(1,)", "'<U2147483647'"),
+    "a time type": header("(2,)", "'<M8[ns]'") + bytes(16),
+    "a structured type": header("(2,)", "[('a', '<f8'), ('b', '|S3')]") + bytes(22),
+    "a nested type": header("(2,)", "[('a', [('b', '<f8', (1000000, 1000000))])]") + bytes(16),
+    "a type with titles": header("(2,)", "[(('t', 'a'), '<f8')]") + bytes(16),
+    "a type that is code": header("(2,)", "__import__('os').system('touch pwned')") + bytes(16),
+    "a type that nothing knows": header("(2,)", "'<q9'") + bytes(16),
+    "a type of 10^6 fields": header("(1,)", repr([(f"f{i}", "<f8") for i in range(50_000)]), version=2),
+    "a header of brackets": header(_DEEP, version=2) + bytes(16),
+    "a header without end": b"\x93NUMPY\x01\x00\xff\xff{'descr'",
+    "a header of 4 GiB": b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'",
+    "a header that is no mapping": b"\x93NUMPY\x01\x00\x02\x00[]",
+    "a version that does not exist": b"\x93NUMPY\x09\x00\x02\x00{}",
+    "a header with NUL": header("(2,)\0") + bytes(16),
+    "a header that is not UTF-8": header("(2,)").replace(b"descr", b"d\xff\xfer"),
+    "nothing": b"",
+    "an archive in the archive": b"PK\x03\x04" + bytes(100),
+    "data missing": header("(40,)") + bytes(100),
+    "data left over": header("(40,)") + bytes(320) + bytes(10**6),
+}
+_ENTRY_NAMES = {
+    "an absolute entry": "/etc/time.npy",
+    "an entry that climbs": "../../time.npy",
+    "an entry in a folder": "a/time.npy",
+    "an entry with a backslash": "..\\time.npy",
+    "an entry with a drive": "C:time.npy",
+    "an entry without a suffix": "time",
+    "an entry of another suffix": "joint_torque.pkl",
+    "an entry with NUL": "ti\0me.npy",
+    "an entry with a line break": "time\nroot.npy",
+    "an entry with an escape": "\x1b[2Jtime.npy",
+    "an entry of 60000 letters": "t" * 60_000 + ".npy",
+    "an entry without a name": ".npy",
+    "an entry of another script": "tïme☃.npy",
+    "a folder": "time/",
+}
+
+
+def _twice(path: Path) -> None:
+    write(path, fields())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("time.npy", archive.read("time.npy"))
+
+
+def _also_without_suffix(path: Path) -> None:
+    write(path, fields())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("time", archive.read("time.npy"))
+
+
+def _bomb(mebibytes: int, declared: int | None = None) -> Callable[[Path], None]:
+    """Zeros without end, of a declared size that may be a lie."""
+
+    def make(path: Path) -> None:
+        write(path, {name: x for name, x in fields().items() if name != "joint_torque"})
+        press = zlib.compressobj(9, wbits=-15)
+        start = header(f"({mebibytes * 2**16}, 2)")
+        first = press.compress(start) + press.flush(zlib.Z_FULL_FLUSH)
+        again = press.compress(bytes(2**20)) + press.flush(zlib.Z_FULL_FLUSH)
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr("joint_torque.npy", first + again * mebibytes + press.flush())
+            entry = archive.getinfo("joint_torque.npy")
+            entry.compress_type, entry.file_size = zipfile.ZIP_DEFLATED, declared or mebibytes * 2**20 + len(start)
+
+    return make
+
+
+def _many(count: int) -> Callable[[Path], None]:
+    def make(path: Path) -> None:
+        with zipfile.ZipFile(path, "w") as archive:
+            for number in range(count):
+                archive.writestr(f"{number}.npy", b"")
+
+    return make
+
+
+def _method(method: int) -> Callable[[Path], None]:
+    return lambda path: void(_with_entry(path, "time.npy", _npy(fields()["time"]), method))
+
+
+def void(_: object) -> None:
+    """Nothing, of anything."""
+
+
+def _flagged(offset: int, value: int) -> Callable[[Path], None]:
+    """A field of every central directory entry set."""
+
+    def make(path: Path) -> None:
+        data = bytearray(write(path, fields()).read_bytes())
+        place = data.find(b"PK\x01\x02")
+        while place >= 0:
+            data[place + offset] = value
+            place = data.find(b"PK\x01\x02", place + 4)
+        path.write_bytes(data)
+
+    return make
+
+
+def _overlapping(path: Path) -> None:
+    """All entries point to the data of the first."""
+    data = bytearray(write(path, fields()).read_bytes())
+    place = data.find(b"PK\x01\x02")
+    while place >= 0:
+        data[place + 42 : place + 46] = bytes(4)
+        place = data.find(b"PK\x01\x02", place + 4)
+    path.write_bytes(data)
+
+
+def _comment(path: Path) -> None:
+    write(path, fields())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.comment = b"PK\x05\x06" * 10_000
+
+
+_ARCHIVES: dict[str, Callable[[Path], None]] = {
+    "a name twice": _twice,
+    "a name with and without suffix": _also_without_suffix,
+    "a bomb of 250 MiB": _bomb(250),
+    "a bomb of 2 GiB": _bomb(2048),
+    "a bomb that declares 1 byte": _bomb(1024, 1),
+    "a bomb that declares what fits": _bomb(1024, 640 + 128),
+    "a bomb that declares 2^62": _bomb(1, 2**62),
+    "201 entries": _many(201),
+    "20000 entries": _many(20_000),
+    "LZMA": _method(zipfile.ZIP_LZMA),
+    "bzip2": _method(zipfile.ZIP_BZIP2),
+    "an unknown method": _flagged(10, 97),
+    "encrypted entries": _flagged(8, 1),
+    "a version from the future": _flagged(6, 99),
+    "overlapping entries": _overlapping,
+    "a comment of end marks": _comment,
+    "an empty archive": lambda path: zipfile.ZipFile(path, "w").close(),
+    "an empty file": lambda path: void(path.write_bytes(b"")),
+    "a text": lambda path: void(path.write_text("time\n0\n")),
+    "zeros": lambda path: void(path.write_bytes(bytes(10**6))),
+    "end marks": lambda path: void(path.write_bytes(b"PK\x05\x06" * 10**5)),
+}
+
+
+# ----------------------------------------------------------------------------------------------------------------- HDF5
+
+
+def hdf5(folder: Path) -> Cases:
+    """HDF5 files made by hand."""
+    other = write(folder / "other.h5", fields())
+    for name, make in _HDF5.items():
+        path = write(folder / "log.h5", {key: x for key, x in fields().items() if key != "joint_torque"})
+        with h5py.File(path, "a") as file:
+            make(file, other)
+        yield name, path
+    for name, content in {"an empty file": b"", "a text": b"time\n0\n", "a signature": b"\x89HDF\r\n\x1a\n"}.items():
+        (folder / "log.h5").write_bytes(content)
+        yield name, folder / "log.h5"
+
+
+def _dataset(shape: tuple[int, ...], dtype: Any = "f8", **options: Any) -> Callable[[h5py.File, Path], None]:
+    return lambda file, _: void(file.create_dataset("joint_torque", shape, dtype, **options))
+
+
+def _item(item: Any) -> Callable[[h5py.File, Path], None]:
+    return lambda file, _: file.__setitem__("joint_torque", item)
+
+
+def _external_link(file: h5py.File, other: Path) -> None:
+    file["joint_torque"] = h5py.ExternalLink(str(other), "/joint_torque")
+
+
+def _virtual(file: h5py.File, other: Path) -> None:
+    layout = h5py.VirtualLayout((N, 2), "f8")
+    layout[...] = h5py.VirtualSource(str(other), "joint_torque", (N, 2))
+    file.create_virtual_dataset("joint_torque", layout)
+
+
+def _raw(file: h5py.File, other: Path) -> None:
+    file.create_dataset("joint_torque", (N, 2), "f8", external=[(str(other), 0, 16 * N)])
+
+
+def _cycle(file: h5py.File, _: Path) -> None:
+    group = file.create_group("joint_torque")
+    group["again"] = group
+    group["up"] = file["/"]
+
+
+def _pressed(file: h5py.File, _: Path) -> None:
+    """A chunk of 512 MiB in half a megabyte, of which few numbers are said to be used."""
+    press = zlib.compressobj(9)
+    first = press.compress(bytes(2**20)) + press.flush(zlib.Z_FULL_FLUSH)
+    again = press.compress(bytes(2**20)) + press.flush(zlib.Z_FULL_FLUSH)
+    made = file.create_dataset(
+        "joint_torque", (N, 2), "f8", chunks=(2**25, 2), maxshape=(None, 2), compression="gzip", compression_opts=9
+    )
+    made.id.write_direct_chunk((0, 0), first + again * 511 + press.flush())
+
+
+def _long_names(file: h5py.File, _: Path) -> None:
+    del file["joint_names"]
+    file["joint_names"] = ["a"] * 20_000 + ["b" * 10**6]
+
+
+def _many_links(file: h5py.File, _: Path) -> None:
+    for number in range(20_000):
+        file[f"link{number}"] = h5py.SoftLink("/time")
+
+
+def _chain_of_links(file: h5py.File, _: Path) -> None:
+    for number in range(2000):
+        file[f"link{number}"] = h5py.SoftLink(f"/link{number + 1}")
+
+
+_COMPOUND = np.dtype([("a", "f8"), ("b", "S3")])
+_HDF5: dict[str, Callable[[h5py.File, Path], None]] = {
+    "a link into another file": _external_link,
+    "a dataset of another file": _virtual,
+    "raw numbers in another file": _raw,
+    "a link to nowhere": _item(h5py.SoftLink("/nowhere")),
+    "a link to itself": _item(h5py.SoftLink("/joint_torque")),
+    "a link to another field": _item(h5py.SoftLink("/joint_position")),
+    "a link to the root": _item(h5py.SoftLink("/")),
+    "a link to a password": _item(h5py.ExternalLink("/etc/passwd", "/x")),
+    "a cycle of groups": _cycle,
+    "10^12 numbers of fill": _dataset((10**12,), chunks=(1024,), fillvalue=1.0),
+    "10^9 numbers of fill": _dataset((5 * 10**8, 2), chunks=(2**16, 2), fillvalue=1.0),
+    "2^62 numbers": _dataset((2**62,), "i1", chunks=(1024,)),
+    "sizes that overflow": _dataset((2**40, 2**40), chunks=(1, 1024)),
+    "late contiguous numbers": _dataset((2**33, 2)),
+    "a chunk of 512 MiB": _pressed,
+    "no axes": _dataset(()),
+    "32 axes": _dataset((1,) * 32),
+    "no numbers": _dataset((0, 2)),
+    "an empty space": _item(h5py.Empty("f8")),
+    "references": _dataset((N, 2), h5py.ref_dtype),
+    "region references": _dataset((N, 2), h5py.regionref_dtype),
+    "ragged rows": _dataset((N, 2), h5py.vlen_dtype(np.float64)),
+    "ragged text": _dataset((N, 2), h5py.string_dtype()),
+    "10^8 texts of fill": _dataset((10**8,), h5py.string_dtype(), chunks=(1024,)),
+    "names of a million letters": _long_names,
+    "an enumeration": _dataset((N, 2), h5py.enum_dtype({"a": 1}, "i4")),
+    "pairs": _dataset((N, 2), _COMPOUND),
+    "arrays in arrays": _dataset((N, 2), np.dtype(("f8", (3,)))),
+    "opaque bytes": _dataset((N, 2), np.dtype("V9")),
+    "times": _dataset((N, 2), h5py.opaque_dtype("M8[ns]")),
+    "half precision": _dataset((N, 2), "f2"),
+    "big-endian": _dataset((N, 2), ">f8"),
+    "extended precision": _dataset((N, 2), np.longdouble),
+    "complex": _dataset((N, 2), "c16"),
+    "a named type": lambda file, _: file.__setitem__("joint_torque", np.dtype("f8")),
+    "a name with a slash": lambda file, _: void(file.create_dataset("a/b/time", data=[1.0])),
+    "a name with a line break": lambda file, _: void(file.create_dataset("time\nroot", data=[1.0])),
+    "a name with an escape": lambda file, _: void(file.create_dataset("\x1b[2Jtime", data=[1.0])),
+    "a name that is no text": lambda file, _: void(file.create_dataset(b"time\xff\xfe", data=[1.0])),
+    "a name of 60000 letters": lambda file, _: void(file.create_dataset("t" * 60_000, data=[1.0])),
+    "20000 links": _many_links,
+    "links in a chain": _chain_of_links,
+}

@@ -1,0 +1,214 @@
+"""Experiment files and overrides that nobody should trust."""
+
+from __future__ import annotations
+
+import base64
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from hostile_logs import Cases, mutated
+
+BASE: dict[str, Any] = {
+    "robot": {"urdf": "robot.urdf", "base_link": "base", "fixed_base": False},
+    "contacts": [{"frame": "l_sole", "type": "flat", "line_axis": "y"}, {"frame": "r_sole", "type": "point"}],
+    "logs": {"train": ["a.npz", "b.npz"], "test": ["c.npz"], "validation": []},
+    "preprocessing": {"cutoff_hz": 8.0, "sample_rate_hz": 200},
+    "sensors": {
+        "joint_torques": ["hip"],
+        "contact_wrenches": {"l_sole": ["fx", "fz"]},
+        "noise": {"joint_torque": 0.1, "contact_force": 0.5},
+        "on_base_lost": "error",
+    },
+    "estimator": {
+        "name": "sgd",
+        "ridge": 0.001,
+        "frozen": ["base"],
+        "bounds": None,
+        "symmetry": None,
+        "consistency": "penalties",
+        "penalties": {"mass": 1.0},
+        "training": {"epochs": 3, "optimizer": {"name": "Adam", "lr": 0.05}, "schedule": None, "seed": 1},
+    },
+    "analysis": {"scenarios": {"stand": [["l_sole"]]}, "costs": {"hip": 2.0}, "compare": {"x": "full"}},
+    "output": "runs/x",
+    "device": "cpu",
+    "overwrite": False,
+}
+
+#: Values of every kind that YAML can spell, as it spells them.
+VALUES = (
+    *("null", "true", "~", "''", "' '", "0", "-1", "1.5", ".nan", ".inf", "-.inf", "1e400", "1e308", "-1e308", "1_000"),
+    *("0x" + "f" * 4000, "0b" + "1" * 4900, "1" + "0" * 4000, "9" * 4900, "1:" * 100 + "1", "0o17", "１２", "1e-400"),
+    *("[]", "{}", "[[]]", "[null]", "[1, a, {}]", "{1: 2}", "{null: 1}", "{true: 1}", "{1.5: 1}", "{[a]: 1}", "{? {a: b} : 1}"),
+    *("{'': 1}", "{a.b: 1}", "{'a[0]': 1}", "{'': {'': {'': ''}}}", "2020-01-01", "2020-01-01T00:00:00Z", "'???'", "???"),
+    *("'/etc/passwd'", "'/dev/zero'", "'/dev/random'", "'~nobody_here/x'", "'~root/x'", "'~'", "'..'", "'.'", "'/'", "'a/../../b'"),
+    *("'https://example.com/x'", "'file:///etc/passwd'", "'$HOME'", "'$(touch pwned)'", "'`touch pwned`'", "'%s%n'", "'{0}'"),
+    *("'${oc.env:HOME}'", "'${output}'", "'${robot}'", "'${nothing}'", "'${'", "'\\${x}'", "'${oc.decode:${oc.env:HOME}}'"),
+    *(r'"a\nb"', r'"a\0b"', r'"\e[2Jx"', r'"\u202Ex"', r'"\uD800"', r'"\U0010FFFF"', r'"\x85"', r'"\N\L\P"', "'" + "a" * 300 + "'"),
+    *("'" + "a/" * 2400 + "'", "'" + "x" * 4999 + "'", "'[red]x[/red]'", "'*'", "'?'", "'[a-'", "'**'", "'*/*'", "' a '", "'-x'"),
+    *("!!binary AAAA", "!!set {a, b}", "!!omap [a: 1]", "!!pairs [a: 1]", "!!timestamp 2020-01-01", "!!float x", "!!int 1.5"),
+    *("!!python/object/apply:os.system ['touch pwned']", "!!python/name:os.system", "!!python/object/new:os.system [a]"),
+    *("!!python/module:os", "!!python/tuple [1]", "!local x", "!<tag:yaml.org,2002:python/object/apply:os.getcwd> []", "!! x"),
+    *("&a [*a]", "&a {b: *a}", "*nothing", "&a 1", "{<<: {a: 1}}", "{<<: [1]}", "{<<: x}", "|\n  a\n  b", ">\n  a\n  b", "[", "{", "'", '"'),
+)  # fmt: skip
+
+
+def documents(folder: Path) -> Cases:
+    """Whole files made by hand."""
+    for name, content in DOCUMENTS.items():
+        path = folder / "experiment.yaml"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        yield name, path
+
+
+def wrong_values(folder: Path, count: int, seed: int) -> Cases:
+    """Something unfit in a random place of a valid file, as often as asked."""
+    rng, places = np.random.default_rng(seed), list(_places(BASE))
+    for number in range(count):
+        place, value = places[rng.integers(len(places))], VALUES[number % len(VALUES)]
+        path = folder / "experiment.yaml"
+        path.write_text(_with(place, value))
+        yield f"{'.'.join(map(str, place))}: {value[:40]}", path
+
+
+def damaged(folder: Path, count: int, seed: int) -> Cases:
+    """A valid file cut off, with bits flipped, or with bytes replaced."""
+    rng, whole = np.random.default_rng(seed), yaml.safe_dump(BASE, sort_keys=False).encode()
+    for number in range(count):
+        kind, content = mutated(whole, rng)
+        path = folder / "experiment.yaml"
+        path.write_bytes(content)
+        yield f"{kind} {number}", path
+
+
+def overrides(count: int, seed: int) -> Iterator[tuple[str, list[str]]]:
+    """What may stand after the file on the command line."""
+    yield from ((text[:40], [text]) for text in OVERRIDES)
+    rng, places = np.random.default_rng(seed), list(_places(BASE))
+    for number in range(count):
+        place, value = places[rng.integers(len(places))], VALUES[number % len(VALUES)]
+        key = ".".join(map(str, place)) if rng.random() < 0.7 else "".join(f"[{part}]" for part in place)
+        yield f"{key}={value[:40]}", [f"{key}={value}"]
+
+
+def _places(value: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    if place:
+        yield place
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in items:
+        yield from _places(item, (*place, key))
+
+
+def _with(place: tuple[str | int, ...], value: str) -> str:
+    """The valid file with a text in one place."""
+    settings = copy.deepcopy(BASE)
+    at: Any = settings
+    for key in place[:-1]:
+        at = at[key]
+    at[place[-1]] = "HERE"
+    return yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=10**6).replace("HERE", value)
+
+
+def _laughs(one: str, of: str, levels: int = 30, times: int = 10) -> str:
+    """Aliases of aliases."""
+    lines = [f"a0: &a0 {one}"]
+    lines += [f"a{k + 1}: &a{k + 1} {of.format(', '.join([f'*a{k}'] * times))}" for k in range(levels)]
+    return "\n".join(lines)
+
+
+_PLAIN = yaml.safe_dump(BASE, sort_keys=False)
+_ECHO = "\n".join(["x0: aaaaaaaaaa", *(f"x{k + 1}: '{'${x' + str(k) + '}'}{'${x' + str(k) + '}'}'" for k in range(60))])
+DOCUMENTS: dict[str, str | bytes] = {
+    "nothing": "",
+    "blanks": " \n\n",
+    "a comment": "# a",
+    "null": "null",
+    "a number": "1",
+    "a text": "text",
+    "a list": "[a, b]",
+    "a text of a megabyte": "a" * 10**6,
+    "a text of ten megabytes": "a" * 10**7,
+    "NUL": b"output: a\0b\n",
+    "zeros": bytes(10**6),
+    "not UTF-8": b"output: \xff\xfe\n",
+    "Latin-1": "output: größe".encode("latin-1"),
+    "UTF-16": _PLAIN.encode("utf-16"),
+    "UTF-32": _PLAIN.encode("utf-32"),
+    "a byte order mark": b"\xef\xbb\xbf" + _PLAIN.encode(),
+    "a cut letter": _PLAIN.encode() + b"# \xc3",
+    "an executable": b"\x7fELF" + bytes(range(256)) * 10,
+    "tabs": _PLAIN.replace("  ", "\t"),
+    "two documents": f"{_PLAIN}---\n{_PLAIN}",
+    "a hundred documents": "---\na: 1\n" * 100,
+    "an end and more": f"{_PLAIN}...\nmore",
+    "a directive": f"%YAML 9.9\n---\n{_PLAIN}",
+    "a directive for tags": f"%TAG ! tag:yaml.org,2002:python/object/apply:\n---\n{_PLAIN}x: !os.system [a]\n",
+    "a key twice": f"{_PLAIN}output: b\n",
+    "a key deep down twice": "robot: {urdf: a, urdf: b}",
+    "keys that are numbers": "1: 2\n3: 4\n",
+    "keys that are null": "null: 1\n~: 2\n",
+    "keys that are lists": "[a, b]: 1\n",
+    "keys that are mappings": "{a: b}: 1\n",
+    "a key of 100000 letters": "a" * 100_000 + ": 1\n",
+    "a key with a line break": '"a\\nb": 1\n',
+    "a key with an escape": '"\\e[2J": 1\n',
+    "a key with markup": "'[red]': 1\n",
+    "an unknown key of nothing": "'': 1\n",
+    "100000 keys": "\n".join(f"k{k}: 1" for k in range(100_000)),
+    "4000 keys": "\n".join(f"k{k}: 1" for k in range(4_000)),
+    "2400 keys of 90 letters": "\n".join(f"{'ab' * 40}{k}: 1" for k in range(2_400)),
+    "4900 numbers": _PLAIN + "x: [" + "1, " * 4900 + "]",
+    "100000 open brackets": "a: " + "[" * 100_000,
+    "100000 brackets": "a: " + "[" * 100_000 + "]" * 100_000,
+    "100000 open braces": "a: " + "{" * 100_000,
+    "100000 braces": "a: " + "{a: " * 100_000 + "}" * 100_000,
+    "100000 dashes": "a:\n" + "- " * 100_000,
+    "100000 question marks": "? " * 100_000,
+    "100000 colons": "a" + ": a" * 100_000,
+    "100000 quotes": "'" * 99_999,
+    "100000 anchors": "a: " + "&a " * 100_000,
+    "100000 tags": "a: " + "!a " * 100_000,
+    "100000 stars": "*" * 100_000,
+    "100000 bars": "|" * 100_000,
+    "a staircase": "\n".join(f"{' ' * k}a:" for k in range(1400)),
+    "40 deep": "a: " + "[" * 40 + "]" * 40,
+    "lists that laugh": _laughs("x", "[{}]"),
+    "mappings that laugh": _laughs("{x: 1}", "{{y: [{}]}}"),
+    "merges that laugh": _laughs("{x: 1}", "{{<<: [{}]}}", 100, 2),
+    "texts that echo": _ECHO,
+    "an echo of itself": "output: '${output}'\n",
+    "an echo in a circle": "output: '${device}'\ndevice: '${output}'\n",
+    "an echo of the world": _PLAIN.replace("runs/x", "${oc.env:HOME}"),
+    "an echo that is open": "output: " + "'" + "${" * 1000 + "'",
+    "an echo in brackets": "output: '" + "${a" * 500 + "}" * 500 + "'",
+    "a list in itself": "a: &a [*a]",
+    "a mapping in itself": "a: &a {b: *a}",
+    "a key that is itself": "&a {*a : 1}",
+    "an alias of nothing": "a: *b",
+    "a tag that runs": "output: !!python/object/apply:os.system ['touch pwned']",
+    "a tag that runs, in a key": "!!python/object/apply:os.system ['touch pwned']: 1",
+    "a tag that runs, in a list": "[!!python/object/apply:subprocess.Popen [['touch', 'pwned']]]",
+    "a tag that makes": "robot: !!python/object:torchid.config.experiment.RobotConfig {urdf: a}",
+    "a tag of omegaconf's": "a: !!python/object/apply:pathlib.PosixPath [a, b]",
+    "binary": f"output: !!binary {base64.b64encode(bytes(3000)).decode()}",
+    "a word for a mapping": "robot: x\nlogs: y\nsensors: 3\noutput: z\n",
+    "a list for everything": "\n".join(f"{key}: [1]" for key in BASE),
+    "a mapping for everything": "\n".join(f"{key}: {{a: 1}}" for key in BASE),
+    "nothing for everything": "\n".join(f"{key}:" for key in BASE),
+}
+OVERRIDES = (
+    *("=", "==", "=1", "a", "", " ", ".=1", "..=1", "a.=1", ".a=1", "a..b=1", "[=1", "]=1", "[0]=1", "a[=1", "a]=1", "a[0=1"),
+    *("a[-1]=1", "a[99999999999]=1", "contacts[99999999999]=1", "contacts.99999999999=1", "contacts[-5]=1", "contacts[x].frame=1"),
+    *("logs.train[100000000]=a.npz", "logs.train.5=a", "output[0]=1", "output.a=1", "robot=1", "robot.urdf.x=1", "robot=null"),
+    *("a." * 50_000 + "a=1", "a" + "[a]" * 50_000 + "=1", "a" * 10**6 + "=1", "output=" + "a" * 10**6, "output=" + "[" * 10**5),
+    *("output=${oc.env:HOME}", "output=${output}", "${output}=1", "output=${a", "output=\\${a}", "a${b}=1", "output=$HOME"),
+    *("output=!!python/object/apply:os.system ['touch pwned']", "output=&a [*a]", "output=*a", "output=a: b: c", "output='a"),
+    *("output=\n", "output=a\nb", "out\nput=a", "output=\0", "\0=1", "output=\x1b[2J", "\x1b[2J=1", "output=\udcff", "\udcff=a"),
+    *("--output=a=b", "output=", "output= ", "output=~", "output=~nobody_here/x", "output=..", "output=/", "output=/dev/null", "output=."),
+    *("sensors=1", "sensors=[]", "sensors=", "sensors={}", "sensors.noise=1", "sensors.noise.joint_torque=x", "sensors.set.a=1"),
+    *("estimator={name: [1]}", "estimator.name=1", "estimator.training.optimizer=Adam", "estimator.bounds={a: {b: [1]}}"),
+)  # fmt: skip

@@ -1,0 +1,117 @@
+"""What other sensors than ideal ones would have recorded of a synthetic log: IMUs, world axes, offsets, scales."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from motions import value
+from scipy.spatial.transform import Rotation
+from synthetic import Array, Oracle
+
+from torchid.logs import Log
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+POSE = (
+    "base_quat_xyzw",
+    "base_linear_acceleration_world",
+    "base_angular_velocity_base",
+    "base_angular_acceleration_base",
+)
+
+
+def states_of(log: Log) -> tuple[Array, Array, Array]:
+    """Generalized coordinates of a floating base whose origin happens to be at rest where the world's is."""
+    quat, still = value(log.base_quat_xyzw), np.zeros((len(log), 3))
+    linear = Rotation.from_quat(quat).inv().apply(value(log.base_linear_acceleration_world))
+    q = np.hstack([still, quat, log.joint_position])
+    v = np.hstack([still, value(log.base_angular_velocity_base), value(log.joint_velocity)])
+    a = np.hstack([linear, value(log.base_angular_acceleration_base), value(log.joint_acceleration)])
+    return q, v, a
+
+
+def with_imu(oracle: Oracle, log: Log, frame: str, keep: Sequence[str] = ()) -> Log:
+    """The log with the readings of an IMU at a frame, by Pinocchio, in place of the base's pose and its derivatives.
+
+    Args:
+        oracle: the robot.
+        log: with the base's pose.
+        frame: a link.
+        keep: fields among `POSE` that stay.
+    """
+    index = oracle.model.getFrameId(frame, pin.FrameType.BODY)
+    force, omega, alpha = [], [], []
+    for state in zip(*states_of(log), strict=True):
+        pin.forwardKinematics(oracle.model, oracle.data, *oracle._state(*state))
+        pin.updateFramePlacements(oracle.model, oracle.data)
+        moving = (oracle.model, oracle.data, index, pin.LOCAL)
+        R = oracle.data.oMf[index].rotation
+        force.append(pin.getFrameClassicalAcceleration(*moving).linear - R.T @ GRAVITY)
+        omega.append(pin.getFrameVelocity(*moving).angular)
+        alpha.append(pin.getFrameAcceleration(*moving).angular)
+    gone = {name: None for name in POSE if name not in keep}
+    return replace(
+        log,
+        imu_frame=frame,
+        imu_specific_force=np.array(force),
+        imu_angular_velocity=np.array(omega),
+        imu_angular_acceleration=np.array(alpha),
+        **gone,  # type: ignore[arg-type]
+    )
+
+
+def in_world(oracle: Oracle, log: Log) -> Log:
+    """The log with its contact wrenches along world axes."""
+    q, local = states_of(log)[0], value(log.contact_wrench_local)
+    turned = np.empty_like(local)
+    for k, frame in enumerate(log.contact_names):
+        R = oracle.pose(q, frame)[0]
+        turned[:, k] = (local[:, k].reshape(-1, 2, 3) @ R.transpose(0, 2, 1)).reshape(-1, 6)
+    return replace(log, contact_wrench_local=None, contact_wrench_world=turned)
+
+
+@dataclass(frozen=True)
+class Miscalibration:
+    """Offsets and scales: a reading y stands for the force s y - o.
+
+    `torque`, `torque_scale`: (n,); `wrench`, `wrench_scale`: (C, 6), along the axes that the log has; `ft`, `ft_scale`:
+    (F, 6).
+    """
+
+    torque: Array
+    torque_scale: Array
+    wrench: Array
+    wrench_scale: Array
+    ft: Array
+    ft_scale: Array
+
+    @classmethod
+    def random(cls, log: Log, rng: np.random.Generator, scaled: Collection[str] = ()) -> Miscalibration:
+        """Offsets of up to 80 N and 8 N m everywhere, scales up to 10 % off of the channels that are `scaled`."""
+        size = np.array([80.0] * 3 + [8.0] * 3)
+        n, C, F = len(log.joint_names), len(log.contact_names), len(log.ft_names)
+
+        def scale(shape: tuple[int, ...], *channels: str) -> Array:
+            off = np.repeat([channel in scaled for channel in channels], shape[-1] // len(channels))
+            return 1.0 + 0.1 * off * rng.uniform(-1.0, 1.0, shape)
+
+        return cls(
+            8.0 * rng.uniform(-1.0, 1.0, n),
+            scale((n,), "joint_torque"),
+            size * rng.uniform(-1.0, 1.0, (C, 6)),
+            scale((C, 6), "contact_force", "contact_moment"),
+            size * rng.uniform(-1.0, 1.0, (F, 6)),
+            scale((F, 6), "ft_force", "ft_moment"),
+        )
+
+    def read(self, log: Log) -> Log:
+        """The log as such sensors record it; those of contacts read 0 while nothing touches."""
+        change: dict[str, Array] = {"joint_torque": (value(log.joint_torque) + self.torque) / self.torque_scale}
+        name = "contact_wrench_local" if log.contact_wrench_world is None else "contact_wrench_world"
+        if (wrench := getattr(log, name)) is not None:
+            change[name] = (wrench + self.wrench) / self.wrench_scale
+        if log.ft_wrench is not None:
+            change["ft_wrench"] = (log.ft_wrench + self.ft) / self.ft_scale
+        return replace(log, **change)  # type: ignore[arg-type]

@@ -1,0 +1,179 @@
+"""What messages mean: joints by name, frames of twists, signs of wrenches, contacts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bags import (
+    FLAG,
+    IMU,
+    JOINT_STATE,
+    ODOMETRY,
+    PLAIN_WRENCH,
+    STAMPS,
+    WRENCH,
+    Entry,
+    imu,
+    joint_state,
+    joints_at,
+    odometry,
+    read_messages,
+    refusal,
+    vector,
+    wrench,
+)
+from scipy.spatial.transform import Rotation
+
+from torchid.errors import TorchidWarning
+
+
+def test_joints_are_told_by_name_in_whatever_order_they_come(tmp_path: Path) -> None:
+    orders = ["abc", "cab", "bca", "abc"]
+    entries = [
+        ("/joint_states", s, JOINT_STATE, joint_state(s, order, position=[ord(x) + i for x in order]))
+        for i, (s, order) in enumerate(zip(map(int, STAMPS), orders, strict=True))
+    ]
+    log = read_messages(tmp_path / "x.bag", entries)
+    assert log.joint_names == ("a", "b", "c")
+    np.testing.assert_array_equal(log.joint_position, 97 + np.arange(3) + np.arange(4)[:, None])
+    assert log.joint_velocity is None
+    assert log.joint_torque is None
+
+
+def test_messages_of_other_joints_are_left_out_if_the_joints_are_listed(tmp_path: Path) -> None:
+    arms = [("/joint_states", s, JOINT_STATE, joint_state(s, "xba", position=[3, 2, 1])) for s in map(int, STAMPS)]
+    hand = [("/joint_states", s + 5, JOINT_STATE, joint_state(s + 5, "g", position=[9])) for s in map(int, STAMPS)]
+    log = read_messages(tmp_path / "x.mcap", arms + hand, joint_states={"topic": "/joint_states", "joints": ["a", "b"]})
+    assert log.joint_names == ("a", "b")
+    np.testing.assert_array_equal(log.joint_position, [[1.0, 2.0]] * 4)
+    message = refusal(tmp_path / "x.mcap", arms + hand)
+    assert (
+        "/joint_states: a message without x; accepted: all 3 joints in every message, or joint_states.joints" in message
+    )
+    assert "no messages" in refusal(tmp_path / "x.mcap", hand, joint_states={"topic": "/joint_states", "joints": ["a"]})
+
+
+BAD_STATES: list[tuple[list[dict[str, Any]], str]] = [
+    ([{"names": "aa", "position": [1, 2]}], "names a, a, ... that repeat"),
+    ([{"names": "ab", "position": [1]}], "[1] values of 2 names"),
+    ([{"names": "ab", "velocity": [1, 2]}], "a message with velocity"),
+    ([{"names": "ab"}], "a message with nothing"),
+    ([{"names": ""}], "a message with nothing"),
+    ([{"names": "a", "position": [1]}, {"names": "a", "position": [1], "effort": [1]}], "position and effort"),
+    ([{"names": "a", "position": [1]}, {"names": "ab", "position": [1, 2]}], "a message with 2 joints"),
+    ([{"names": ["a\x1b[2J"], "position": [1]}], "cannot be read (ValueError: a name of 5 characters: a\\x1b[2J"),
+]
+
+
+@pytest.mark.parametrize(("states", "found"), BAD_STATES)
+def test_joint_states_that_do_not_add_up_are_refused(tmp_path: Path, states: list[dict[str, Any]], found: str) -> None:
+    entries: list[Entry] = []
+    for s, state in zip(map(int, STAMPS), states, strict=False):
+        values = {k: x for k, x in state.items() if k != "names"}
+        entries.append(("/joint_states", s, JOINT_STATE, joint_state(s, state["names"], **values)))
+    assert found in refusal(tmp_path / "x.mcap", entries)
+
+
+def test_an_odometrys_twist_is_that_of_the_child_frame(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    world_base = Rotation.from_euler("zyx", [2.1, -0.7, 0.4])
+    linear, angular, position = rng.standard_normal((3, 3))
+    content = [odometry(s, position, world_base.as_quat(), linear, angular) for s in map(int, STAMPS)]
+    entries = joints_at(STAMPS) + [("/odom", int(s), ODOMETRY, x) for s, x in zip(STAMPS, content, strict=True)]
+    child = read_messages(tmp_path / "x.bag", entries, odometry="/odom")
+    world = read_messages(tmp_path / "y.bag", entries, odometry={"topic": "/odom", "twist": "world"})
+    pose = read_messages(tmp_path / "z.bag", entries, odometry={"topic": "/odom", "twist": "none"})
+    for log, linear_world, angular_base in (
+        (child, world_base.apply(linear), angular),
+        (world, linear, world_base.inv().apply(angular)),
+    ):
+        np.testing.assert_allclose(log.base_linear_velocity_world, [linear_world] * 4, atol=1e-14)
+        np.testing.assert_allclose(log.base_angular_velocity_base, [angular_base] * 4, atol=1e-14)
+        np.testing.assert_allclose(log.base_position_world, [position] * 4, atol=1e-14)
+        np.testing.assert_allclose(Rotation.from_quat(log.base_quat_xyzw).as_matrix(), [world_base.as_matrix()] * 4)
+    assert pose.base_linear_velocity_world is None
+    assert pose.base_angular_velocity_base is None
+    content[2]["child_frame_id"] = "wheel"
+    entries = joints_at(STAMPS) + [("/odom", int(s), ODOMETRY, x) for s, x in zip(STAMPS, content, strict=True)]
+    assert "/odom: child_frame_id 'base', then 'wheel'" in refusal(tmp_path / "x.bag", entries, odometry="/odom")
+
+
+def test_an_imu_at_rest_reads_g_upwards_in_its_own_frame(tmp_path: Path) -> None:
+    def entries(frame: str, **content: Any) -> list[Entry]:
+        said = [imu(s, [0.0, 9.81, 0.0], [0.1, 0.2, 0.3], frame) | content for s in map(int, STAMPS)]
+        return joints_at(STAMPS) + [("/imu", int(s), IMU, x) for s, x in zip(STAMPS, said, strict=True)]
+
+    log = read_messages(tmp_path / "x.bag", entries("/imu_link"), imu="/imu")
+    np.testing.assert_array_equal(log.imu_specific_force, [[0.0, 9.81, 0.0]] * 4)
+    np.testing.assert_array_equal(log.imu_angular_velocity, [[0.1, 0.2, 0.3]] * 4)
+    assert log.imu_frame == "imu_link"
+    assert read_messages(tmp_path / "x.mcap", entries("a"), imu={"topic": "/imu", "frame": "b"}).imu_frame == "b"
+    assert "/imu: no header.frame_id" in refusal(tmp_path / "x.mcap", entries(""), imu="/imu")
+    for part in ("linear_acceleration", "angular_velocity"):
+        unknown = entries("a", **{f"{part}_covariance": np.array([-1.0] + [0.0] * 8)})
+        assert f"/imu: no {part}" in refusal(tmp_path / "x.mcap", unknown, imu="/imu")
+
+
+def test_wrenches_are_the_environments_and_the_parents_action_unless_a_sign_says_otherwise(tmp_path: Path) -> None:
+    values = np.arange(1.0, 7.0)
+    entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, values, "sole")) for s in map(int, STAMPS)]
+    topics = {"contact_wrenches": {"sole": {"topic": "/w", "sign": -1}}, "ft_wrenches": {"ft": "/w"}}
+    log = read_messages(tmp_path / "x.bag", entries, **topics, contact_force_threshold=1.0)
+    assert log.contact_wrench_local is not None
+    assert log.ft_wrench is not None
+    np.testing.assert_array_equal(log.contact_wrench_local[:, 0], [-values] * 4)
+    np.testing.assert_array_equal(log.ft_wrench[:, 0], [values] * 4)
+
+
+def test_wrenches_in_a_frame_of_another_name_are_warned_of_unless_that_is_meant(tmp_path: Path) -> None:
+    entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, np.ones(6), "/sensor")) for s in map(int, STAMPS)]
+    with pytest.warns(TorchidWarning, match=r"/w: in frame '/sensor', taken to be in 'sole'; logs.topics.contact_wren"):
+        read_messages(tmp_path / "x.mcap", entries, contact_wrenches={"sole": "/w"}, contact_force_threshold=1.0)
+    meant = {"sole": {"topic": "/w", "frame": "sensor"}}
+    read_messages(tmp_path / "x.mcap", entries, contact_wrenches=meant, contact_force_threshold=1.0)
+    read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": "/w"})
+    with pytest.warns(TorchidWarning, match="taken to be in 'other'"):
+        read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": {"topic": "/w", "frame": "other"}})
+
+
+def test_wrenches_without_a_header_come_when_they_are_received(tmp_path: Path) -> None:
+    said = {"force": vector([1, 2, 3]), "torque": vector([4, 5, 6])}
+    entries = joints_at(STAMPS) + [("/w", int(s), PLAIN_WRENCH, said) for s in STAMPS]
+    with pytest.warns(TorchidWarning, match="/w: no stamps"):
+        log = read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": "/w"})
+    assert log.ft_wrench is not None
+    np.testing.assert_array_equal(log.ft_wrench[:, 0], [[1, 2, 3, 4, 5, 6]] * 4)
+
+
+def test_a_contact_touches_while_its_force_was_last_above_the_threshold(tmp_path: Path) -> None:
+    forces = {0.0: 0.0, 1.0: 31.0, 2.0: 29.0, 3.0: -50.0, 4.0: 0.0}
+    wrenches = [
+        ("/w", int(1e9 * s), WRENCH, wrench(int(1e9 * s), [0, 0.6 * f, 0.8 * f, 99, 99, 99], "foot"))
+        for s, f in forces.items()
+    ]
+    states = joints_at(1e9 * np.array([0.0, 0.5, 1.0, 1.9, 2.1, 3.0, 3.9]))
+    topics = {"contact_wrenches": {"foot": "/w"}, "contact_force_threshold": 30.0}
+    log = read_messages(tmp_path / "x.mcap", states + wrenches, **topics)
+    assert log.contact_active is not None
+    assert log.contact_active[:, 0].tolist() == [False, False, True, True, False, True, True]
+
+
+def test_contacts_without_a_wrench_say_themselves_when_they_touch(tmp_path: Path) -> None:
+    said = {50.0: False, 101.0: True, 102.5: False}
+    switches = [("/touch", int(1e9 * s), FLAG, {"data": x}) for s, x in said.items()]
+    wrenches = [("/w", s, WRENCH, wrench(s, np.full(6, 7.0), "c")) for s in map(int, STAMPS)]
+    active = {"a": "/touch", "b": True, "c": True}
+    topics = {"contact_wrenches": {"c": "/w"}, "contact_active": active}
+    with pytest.warns(TorchidWarning, match="/touch: no stamps"):
+        log = read_messages(tmp_path / "x.bag", joints_at(STAMPS) + switches + wrenches, **topics)
+    assert log.contact_names == ("c", "a", "b")
+    assert log.contact_active is not None
+    np.testing.assert_array_equal(log.contact_active.T, [[1, 1, 1, 1], [0, 1, 1, 0], [1, 1, 1, 1]])
+    assert log.contact_wrench_local is not None
+    assert np.isnan(log.contact_wrench_local[:, 1:]).all()
+    nan = [("/w", s, WRENCH, wrench(s, np.full(6, np.nan), "c")) for s in map(int, STAMPS)]
+    topics = {"contact_wrenches": {"c": "/w"}, "contact_force_threshold": 5.0}
+    assert "/w: a force of NaN in message 0" in refusal(tmp_path / "x.bag", joints_at(STAMPS) + nan, **topics)

@@ -1,0 +1,286 @@
+"""Logs as CSV and Parquet: one column per scalar, and every slip named by file and column."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from torchid.errors import LogError, UnknownNameError
+from torchid.logs import Log, read_log, write_log
+from torchid.logs import container as container_module
+from torchid.logs.columns import MAX_COLUMNS
+
+Columns = dict[str, Sequence[Any]]
+SUFFIXES = (".csv", ".parquet")
+both = pytest.mark.parametrize("suffix", SUFFIXES)
+
+
+def columns(**changes: Sequence[Any] | None) -> Columns:
+    """A valid table of three samples; `__` in a name stands for a dot, None leaves a column out."""
+    table: Columns = {
+        "time": [0.0, 0.1, 0.25],
+        "joint_position.knee": [1.0, 2.0, 3.0],
+        "joint_position.hip.left": [4.0, 5.0, 6.0],
+        "joint_torque.hip.left": [0.5, None, 0.75],
+        "joint_torque.knee": [7.0, 8.0, 9.0],
+        "contact_active.sole": [True, False, True],
+        **{f"contact_wrench_local.sole.{x}": [i, 2 * i, None] for i, x in enumerate(("fz", "fy", "fx"), start=1)},
+        **{f"contact_wrench_local.sole.{x}": [-1.0, -2.0, -3.0] for x in ("mx", "my", "mz")},
+        "imu_frame": ["imu.link"] * 3,
+        **{f"imu_specific_force.{x}": [9.0, 9.5, 9.8] for x in "zyx"},
+        **{f"imu_angular_velocity.{x}": [1, 2, 3] for x in "xyz"},
+    }
+    table |= {name.replace("__", "."): value for name, value in changes.items() if value is not None}
+    return {name: x for name, x in table.items() if changes.get(name.replace(".", "__"), x) is not None}
+
+
+def save(path: Path, table: Columns) -> Path:
+    """Write columns as they are, valid or not."""
+    if path.suffix == ".parquet":
+        pq.write_table(pa.table(dict(table)), path)
+        return path
+    cells = [["" if x is None else str(x) for x in values] for values in table.values()]
+    lines = [",".join(table), *(",".join(row) for row in zip(*cells, strict=True))]
+    path.write_text("".join(f"{line}\n" for line in lines))
+    return path
+
+
+def message_of(path: Path) -> str:
+    """The one line that reading `path` fails with."""
+    with pytest.raises(LogError) as caught:
+        read_log(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(f"{path}: ")
+    assert "accepted: " in message
+    assert len(message) < 600
+    return message
+
+
+@both
+def test_columns_in_any_order_make_up_the_fields(tmp_path: Path, suffix: str) -> None:
+    log = read_log(save(tmp_path / f"x{suffix}", dict(reversed(columns().items()))))
+    forward = read_log(save(tmp_path / f"y{suffix}", columns()))
+    assert log.joint_names == ("hip.left", "knee")
+    assert forward.joint_names == ("knee", "hip.left")
+    for one in (log, forward):
+        assert one.joint_torque is not None
+        assert one.contact_wrench_local is not None
+        hip = one.joint_names.index("hip.left")
+        np.testing.assert_array_equal(one.joint_position[:, hip], [4.0, 5.0, 6.0])
+        np.testing.assert_array_equal(one.joint_torque[:, hip], [0.5, np.nan, 0.75])
+        np.testing.assert_array_equal(one.joint_torque[:, 1 - hip], [7.0, 8.0, 9.0])
+        np.testing.assert_array_equal(one.contact_wrench_local[:, 0, :3], [[3, 2, 1], [6, 4, 2], [np.nan] * 3])
+        np.testing.assert_array_equal(one.contact_active, [[True], [False], [True]])
+        assert (one.contact_names, one.imu_frame) == (("sole",), "imu.link")
+
+
+@both
+def test_both_quaternion_orders_are_told_apart_by_their_columns(tmp_path: Path, suffix: str) -> None:
+    quat = {"w": [0.5] * 3, "x": [0.1] * 3, "y": [0.7] * 3, "z": [0.5] * 3}
+    for order in ("wxyz", "xyzw"):
+        table = columns(**{f"base_quat_{order}__{axis}": quat[axis] for axis in "zwxy"})
+        log = read_log(save(tmp_path / f"{order}{suffix}", table))
+        assert log.base_quat_xyzw is not None
+        np.testing.assert_allclose(log.base_quat_xyzw[1], [0.1, 0.7, 0.5, 0.5], atol=1e-15)
+
+
+@pytest.mark.parametrize("flags", [[1, 0, 1], ["true", "FALSE", "True"], ["1.0", "0", " 1.000e+00"]])
+def test_a_spreadsheet_may_write_flags_as_it_likes(tmp_path: Path, flags: list[Any]) -> None:
+    log = read_log(save(tmp_path / "x.csv", columns(contact_active__sole=flags)))
+    np.testing.assert_array_equal(log.contact_active, [[True], [False], [True]])
+
+
+def test_a_spreadsheets_marks_spaces_and_quotes_change_nothing(tmp_path: Path) -> None:
+    plain = save(tmp_path / "x.csv", columns())
+    lines = plain.read_text().splitlines()
+    quoted = [", ".join(f'"{cell}"' for cell in lines[0].split(",")).replace('", "', '","'), *lines[1:]]
+    (tmp_path / "y.csv").write_bytes(b"\xef\xbb\xbf" + "\r\n".join([*quoted, "", ""]).encode())
+    spaced = [lines[0].replace(",", " , "), *(line.replace(",", " , ") for line in lines[1:])]
+    (tmp_path / "z.csv").write_text("\n".join(spaced))
+    one = read_log(plain)
+    for name in ("y.csv", "z.csv"):
+        other = read_log(tmp_path / name)
+        assert one.names == other.names
+        for field, values in one.arrays().items():
+            np.testing.assert_array_equal(values, other.arrays()[field])
+
+
+BAD: list[tuple[dict[str, Any], str, str]] = [
+    ({"time": None}, "time", "missing"),
+    ({"joint_position__knee": None}, "column 'joint_torque.knee'", "first field of its kind does not name"),
+    ({"joint_torque__knee": None}, "column 'joint_torque.knee'", "missing, though there is 'joint_torque.hip.left'"),
+    ({"joint_positon__knee": [1.0] * 3}, "column 'joint_positon.knee'", "unknown name 'joint_positon'; accepted: joi"),
+    ({"joint_names": ["a"] * 3}, "column 'joint_names'", "unknown name"),
+    ({"joint_position": [1.0] * 3}, "column 'joint_position'", "accepted: joint_position.<joint>"),
+    ({"time__x": [1.0] * 3}, "column 'time.x'", "accepted: time"),
+    ({"joint_position__": [1.0] * 3}, "column 'joint_position.'", "accepted: joint_position.<joint>"),
+    ({"contact_wrench_local__sole__f": [1.0] * 3}, "sole.f'", "accepted: contact_wrench_local.<contact>.{fx, fy, fz"),
+    ({"contact_wrench_local__fx": [1.0] * 3}, "local.fx'", "accepted: contact_wrench_local.<contact>.{fx, fy, fz"),
+    ({"imu_specific_force__w": [1.0] * 3}, "column 'imu_specific_force.w'", "accepted: imu_specific_force.{x, y, z}"),
+    ({"base_quat_wxyz__w": [1.0] * 3}, "column 'base_quat_wxyz.x'", "accepted: every column of base_quat_wxyz.{w, x"),
+    ({"contact_wrench_local__sole__mz": None}, "column 'contact_wrench_local.sole.mz'", "missing"),
+    ({"contact_active__sole": None}, "contact_wrench_local", "given without contact_active"),
+    ({"imu_frame": None}, "imu_", "given without imu_frame"),
+    ({"joint_position__knee [deg]": [1.0] * 3}, "knee [deg]'", "a unit in its name; accepted: names without units"),
+    ({"base_position_world__x(mm)": [1.0] * 3}, "x(mm)'", "a unit in its name"),
+    ({"imu_frame": ["a", "a", "b"]}, "imu_frame", "'a' and 'b'; accepted: one name, the same in every row"),
+    ({"imu_frame": ["a", None, "a"]}, "imu_frame", "'a' and an empty cell"),
+    ({"time": [0.0, 0.1, 0.1]}, "time", "0.1 at sample 2, after 0.1 at sample 1"),
+    ({"time": [0.0, None, 0.1]}, "time", "nan at sample 1"),
+    ({"joint_position__knee": [1.0, None, 2.0]}, "joint_position", "nan at sample 1, knee"),
+    ({"contact_active__sole": [1, None, 0]}, "contact_active", "nan at sample 1, sole"),
+    ({"joint_torque__knee": [1.0, float("inf"), 2.0]}, "joint_torque", "inf at sample 1, knee"),
+    ({f"joint_position.{'k' * 1000}": [1.0] * 3}, "header", "a name of 1015 characters"),
+    ({"joint_position__kn\x1bee": [1.0] * 3}, "header", "a name of 20 characters: joint_position.kn\\x1bee"),
+]
+
+
+@both
+@pytest.mark.parametrize(("changes", "place", "found"), BAD)
+def test_every_unusable_column_is_named_in_one_line(
+    tmp_path: Path, suffix: str, changes: dict[str, Any], place: str, found: str
+) -> None:
+    message = message_of(save(tmp_path / f"bad{suffix}", columns(**changes)))
+    assert place in message
+    assert found in message
+
+
+def test_text_where_a_number_belongs_is_named_with_its_row(tmp_path: Path) -> None:
+    path = save(tmp_path / "x.csv", columns(joint_torque__knee=[1.0, "n/a", 2.0]))
+    assert "column 'joint_torque.knee': 'n/a' in row 3; accepted: numbers" in message_of(path)
+    path = save(tmp_path / "y.csv", columns(contact_active__sole=[1, "yes", 0]))
+    assert "column 'contact_active.sole': 'yes'; accepted: true and false" in message_of(path)
+    path = save(tmp_path / "z.parquet", columns(joint_torque__knee=["1", "2", "3"]))
+    assert "column 'joint_torque.knee': values of type string; accepted: real numbers" in message_of(path)
+    path = save(tmp_path / "z.parquet", columns(joint_torque__knee=[[1.0], [2.0], [3.0]]))
+    assert "values of type list" in message_of(path)
+    path = save(tmp_path / "z.parquet", columns(time=np.array([1, 2, 3], dtype="M8[ns]")))
+    assert "column 'time': values of type timestamp[ns]" in message_of(path)
+
+
+def test_other_separators_are_recognised(tmp_path: Path) -> None:
+    for separator in (";", "\t"):
+        text = save(tmp_path / "x.csv", columns()).read_text().replace(",", separator)
+        (tmp_path / "x.csv").write_text(text)
+        assert "header: 'time" in message_of(tmp_path / "x.csv")
+
+
+def test_rows_of_other_lengths_and_repeated_columns_are_refused(tmp_path: Path) -> None:
+    whole = save(tmp_path / "x.csv", columns()).read_text()
+    for text, found in (
+        (whole + "1,2\n", "Expected 19 columns, got 2"),
+        (whole.replace("imu_frame", "time"), "column 'time': given twice"),
+        (whole.replace("time", '"time', 1), "header: no line of names"),
+        (whole.replace("time", "t\xefme", 1).encode("latin-1"), "cannot be read (UnicodeDecodeError"),
+        (whole.replace("imu.link", "imu.l\xefnk", 1).encode("latin-1"), "invalid UTF8"),
+        ("\n" + whole, "header: an empty line"),
+        (whole.split("\n")[0], "time: no samples"),
+        (whole.split("\n")[0] + "\n\n\n", "time: no samples"),
+        ("", "header: an empty line"),
+    ):
+        (tmp_path / "x.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+        assert found in message_of(tmp_path / "x.csv")
+    pq.write_table(pa.Table.from_arrays([pa.array([1.0]), pa.array([2.0])], ["time", "time"]), tmp_path / "x.parquet")
+    assert "column 'time': given twice" in message_of(tmp_path / "x.parquet")
+    assert "time: no samples" in message_of(
+        save(
+            tmp_path / "y.parquet", {"time": pa.array([], pa.float64()), "joint_position.a": pa.array([], pa.float64())}
+        )
+    )
+
+
+@both
+def test_one_row_is_a_log_of_one_sample(tmp_path: Path, suffix: str) -> None:
+    log = read_log(save(tmp_path / f"x{suffix}", {"time": [2.5], "joint_position.a": [1.0]}))
+    assert (len(log), log.joint_names, float(log.time[0])) == (1, ("a",), 2.5)
+
+
+def test_an_unknown_column_is_an_unknown_name_to_those_who_catch_it(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError) as caught:
+        read_log(save(tmp_path / "x.csv", columns(base_quat__x=[1.0] * 3)))
+    assert caught.value.name == "base_quat"
+
+
+@both
+def test_names_with_dots_commas_and_quotes_round_trip_and_others_are_refused(tmp_path: Path, suffix: str) -> None:
+    def log_of(*names: str) -> Log:
+        return Log("x", np.array([0.0]), names, np.array([range(len(names))], dtype=float))
+
+    names = ("a.b", "c,d", 'e"f', "größe", "g h", "../i", "fx")
+    write_log(log_of(*names), tmp_path / f"x{suffix}")
+    assert read_log(tmp_path / f"x{suffix}").joint_names == names
+    for name in ("a\nb", "a ", "a [deg]", "a\udcff", "a" * 1000):
+        with pytest.raises(LogError, match="header|column"):
+            write_log(log_of(name), tmp_path / f"y{suffix}")
+        assert not (tmp_path / f"y{suffix}").exists()
+    wrench = Log("x", np.zeros(1), (), np.zeros((1, 0)), ft_names=("a.fx",), ft_wrench=np.ones((1, 1, 6)))
+    write_log(wrench, tmp_path / f"z{suffix}")
+    assert read_log(tmp_path / f"z{suffix}").ft_names == ("a.fx",)
+
+
+@both
+def test_every_float_survives_a_round_trip_to_the_bit(tmp_path: Path, suffix: str) -> None:
+    bits = np.random.default_rng(3).integers(-(2**63), 2**63, size=(5000, 1))
+    values = bits.view(np.float64)
+    values[~np.isfinite(values)] = np.nan
+    values[:4, 0] = -0.0, 5e-324, np.finfo(float).max, 0.1
+    log = Log("x", np.arange(5000.0), ("a",), np.zeros((5000, 1)), joint_torque=values)
+    write_log(log, tmp_path / f"x{suffix}")
+    again = read_log(tmp_path / f"x{suffix}").joint_torque
+    assert again is not None
+    measured = ~np.isnan(values)
+    np.testing.assert_array_equal(again[measured].view(np.int64), values[measured].view(np.int64))
+    assert np.isnan(again[~measured]).all()
+
+
+def test_sizes_without_bounds_are_refused_before_they_fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many = {"time": [0.0], **{f"joint_position.j{i}": [0.0] for i in range(MAX_COLUMNS)}}
+    for suffix in SUFFIXES:
+        assert f"{MAX_COLUMNS + 1} columns" in message_of(save(tmp_path / f"x{suffix}", many))
+    rows = 2_000_000  # of one value: a few bytes a column, 500 MB of zeros
+    zeros = pa.chunked_array([pa.array(np.zeros(rows))])
+    wide = {"time": zeros, **{f"joint_position.j{i}": zeros for i in range(30)}}
+    pq.write_table(pa.table(wide), tmp_path / "bomb.parquet")
+    assert (tmp_path / "bomb.parquet").stat().st_size < 300_000
+    assert "times the file's size" in message_of(tmp_path / "bomb.parquet")
+    (tmp_path / "line.csv").write_bytes(b"time," * 2_000_000)
+    assert "columns" in message_of(tmp_path / "line.csv")
+    (tmp_path / "row.csv").write_bytes(b"time,joint_position.a\n0," + b"1" * 10_000_000)
+    assert "cannot be read" in message_of(tmp_path / "row.csv")
+    monkeypatch.setattr(container_module, "MAX_BYTES", 100)
+    for suffix in SUFFIXES:
+        assert "at most 100 bytes" in message_of(save(tmp_path / f"z{suffix}", columns()))
+
+
+def test_a_long_text_in_every_row_of_a_parquet_file_is_kept_once(tmp_path: Path) -> None:
+    text = pa.DictionaryArray.from_arrays(
+        pa.array(np.zeros(200_000, np.int32)), ["a" * 100_000]
+    )  # 20 GB if spelled out
+    table = {"time": np.arange(200_000.0), "imu_frame": text}
+    table |= {f"imu_{x}.{axis}": np.zeros(200_000) for x in ("specific_force", "angular_velocity") for axis in "xyz"}
+    assert "a name of 100000 characters" in message_of(save(tmp_path / "x.parquet", table))
+
+
+def test_without_pyarrow_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = save(tmp_path / "x.csv", columns())
+    load = builtins.__import__
+
+    def absent(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.startswith("pyarrow"):
+            raise ImportError(name)
+        return load(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", absent)
+    assert "pip install 'torchid[tables]'" in message_of(path)
+    with pytest.raises(LogError, match="pyarrow is not installed"):
+        write_log(Log("x", np.zeros(1), (), np.zeros((1, 0))), tmp_path / "y.parquet")

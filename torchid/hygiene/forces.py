@@ -1,0 +1,96 @@
+"""Measured forces against the URDF's: signs, units, and which usual mistake explains what does not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from torchid.errors import InputError
+from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped, listed
+from torchid.hygiene.mistakes import mistakes
+from torchid.hygiene.model import ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
+from torchid.logs import Log
+from torchid.robot import Robot
+from torchid.sensing import Contact
+
+#: Misfit above which usual mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
+WRONG = 0.4
+#: Share of the misfit that a mistake must leave to be the explanation.
+BETTER = 0.5
+#: A torque this many times larger or smaller than needed is no error of the model.
+SCALE = 3.0
+_NAME = "forces against the URDF"
+
+
+def forces(
+    log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None
+) -> Iterator[Finding | Skipped]:
+    """Findings about joint torques and contact wrenches; `cutoff_hz` is that of the fit, None for a usual one."""
+    if robot is None:
+        yield Skipped(_NAME, "no robot (--urdf)")
+        return
+    cutoff = cutoff_hz or usual_cutoff(log)
+    try:
+        logs = filtered(log, cutoff)
+    except InputError as error:
+        yield Skipped(_NAME, f"{error.field}: {error.found}")
+        return
+    try:
+        samples = bound(logs, robot, contacts)
+    except InputError as error:
+        yield Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}")
+        return
+    if log.joint_torque is None and log.contact_wrench_local is None and log.contact_wrench_world is None:
+        yield Skipped(_NAME, "neither joint torques nor contact wrenches")
+        return
+    fit = model_fit(samples, robot, contacts)
+    if fit.misfit > WRONG:
+        yield _explained(log, robot, contacts, cutoff, fit)
+        return
+    if fit.torque is not None:
+        yield from _signs(log, robot, fit.torque)
+
+
+def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit) -> Finding:
+    """The mistake that leaves the least misfit, if it leaves much less; else that nothing explains it."""
+    best, least = None, BETTER * fit.misfit
+    for mistake in mistakes(log):
+        try:
+            samples = bound(filtered(mistake.mended(log), cutoff), robot, contacts)
+        except InputError:  # a mended log may be too fast for the filter: then that was not the mistake
+            continue
+        found = model_fit(samples, robot, contacts).misfit
+        if found < least:
+            best, least = mistake, found
+    apart = f"forces {_percent(fit.misfit)} apart from the URDF's"
+    if best is None:
+        text = f"{apart}, and no usual mistake explains it"
+        advice = "look at units, frames, the base link and the masses of the URDF"
+        return Finding("forces", SUSPICIOUS, "all", text, advice)
+    text = f"{best.found}: {apart}, {_percent(least)} without this"
+    return Finding("unit, sign or frame", CONDEMNED, best.field, text, best.advice)
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.3g} %" if share < 10.0 else f"{share:.3g} times"
+
+
+def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped]:
+    names = np.array(robot.joint_names)[fit.joints]
+    reversed_ = fit.clear & (fit.gain < 0.0)
+    if reversed_.any():
+        chosen = [str(name) for name in names[reversed_]]
+        gains = ", ".join(f"{gain:.2f}" for gain in fit.gain[reversed_][:4])
+        text = f"{listed(chosen)}: reversed; factors that fit the URDF best: {gains}"
+        yield Finding("sign", CONDEMNED, "joint_torque", text, "reverse these torques", tuple(chosen))
+    scaled = fit.clear & ~reversed_ & (np.abs(np.log(np.maximum(fit.gain, 1e-9))) > np.log(SCALE))
+    if scaled.any():
+        chosen = [str(name) for name in names[scaled]]
+        gains = ", ".join(f"{gain:.3g}" for gain in fit.gain[scaled][:4])
+        text = f"{listed(chosen)}: factors that fit the URDF best: {gains}"
+        advice = "look at gear ratios, torque constants and units"
+        yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(chosen))
+    if not fit.clear.all():
+        open_ = listed([str(name) for name in names[~fit.clear]])
+        yield Skipped("sign of torques", f"too little in this motion but friction and noise: {open_}")

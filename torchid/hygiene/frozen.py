@@ -1,0 +1,107 @@
+"""Findings about sensors that repeat themselves: frozen, saturated, held at a lower rate, or constant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from torchid.hygiene.channels import Group
+from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, counted, listed
+from torchid.hygiene.repeats import Runs, held_for, implausible
+from torchid.logs.fields import WRENCHES, BoolArray, FloatArray
+
+#: Samples at the very same extreme value from which on it is a limit and no coincidence.
+AT_LIMIT = 5
+
+_Stuck = list[tuple[str, Runs]]
+
+
+def frozen(groups: Iterable[Group]) -> Iterator[Finding]:
+    """Findings about frozen, held, saturated and constant channels."""
+    for group in groups:
+        steps = np.diff(group.values, axis=0)
+        constant = (steps == 0.0).all(axis=0)
+        if constant.any():
+            yield from _constant(group, constant)
+        if constant.all():
+            continue
+        together = (steps[:, ~constant] == 0.0).all(axis=1) & group.joined
+        if every := held_for(together):
+            yield _held(group, every)
+            continue
+        runs = implausible(group.values[:, ~constant], together)
+        if len(runs):
+            what = f"all {len(group.names)} channels" if len(group.names) > 1 else group.names[0]
+            yield _frozen(group, what, [(name, runs) for name in group.names], len(runs))
+        if len(group.names) > 1:
+            yield from _by_channel(group, steps, np.flatnonzero(~constant), runs.mask(len(steps)))
+
+
+def _by_channel(group: Group, steps: FloatArray, columns: np.ndarray, together: BoolArray) -> Iterator[Finding]:
+    """Channels that repeat by themselves."""
+    stuck: _Stuck = []
+    limits: list[tuple[str, Runs, float]] = []
+    for column in columns:
+        repeated = (steps[:, column] == 0.0) & group.joined & ~together
+        if held_for(repeated):
+            continue
+        name, values = group.names[column], group.values[:, column]
+        runs = implausible(values[:, None], repeated)
+        for extreme in (values.min(), values.max()):
+            at = values[runs.first] == extreme
+            if runs.where(at).lengths.sum() >= AT_LIMIT:
+                limits.append((name, runs.where(at), float(extreme)))
+                runs = runs.where(~at)
+        if len(runs):
+            stuck.append((name, runs))
+    if stuck:
+        yield _frozen(group, listed([name for name, _ in stuck]), stuck, sum(len(runs) for _, runs in stuck))
+    if limits:
+        yield _saturated(group, limits)
+
+
+def _spans(group: Group, channel: str, runs: Runs) -> Iterator[Span]:
+    for first, last in zip(runs.first, runs.last, strict=True):
+        yield Span(int(group.samples[first + 1]), int(group.samples[last + 1]), channel)
+
+
+def _frozen(group: Group, what: str, stuck: _Stuck, count: int) -> Finding:
+    spans = tuple(span for name, runs in stuck for span in _spans(group, name, runs))
+    longest = max(spans, key=len)
+    times = f"{counted(count, 'time')}, at most {counted(len(longest), 'sample')}, {longest}"
+    text = f"{what}: repeated to the last bit amid motion, {times}"
+    advice = "leave these samples out; look for lost messages or a stalled driver"
+    return Finding("frozen", CONDEMNED, group.field, text, advice, tuple(name for name, _ in stuck), spans)
+
+
+def _saturated(group: Group, limits: list[tuple[str, Runs, float]]) -> Finding:
+    spans = tuple(span for name, runs, _ in limits for span in _spans(group, name, runs))
+    names = tuple(dict.fromkeys(name for name, _, _ in limits))
+    channel, _, extreme = limits[0]
+    at = f"at an extreme value ({channel}: {extreme:.4g} {group.unit})"
+    text = f"{listed(names)}: {counted(len(spans), 'time')} {at}"
+    if group.field == "joint_position":  # on a stop, or on the bound of an inverse kinematics: it may be right there
+        advice = "none if these are the joint's stops; else raise the bound"
+        return Finding("saturated", SUSPICIOUS, group.field, text, advice, names, spans)
+    advice = "leave these samples out, or raise the sensor's range"
+    return Finding("saturated", CONDEMNED, group.field, text, advice, names, spans)
+
+
+def _held(group: Group, every: int) -> Finding:
+    text = f"new values only every {every} samples: recorded at 1/{every} of the log's rate, {0.5 * (every - 1):g} late"
+    advice = f"record at one rate, or set preprocessing.cutoff_hz below {0.25 / every:.2g} of the sample rate"
+    return Finding("held", SUSPICIOUS, group.field, text, advice, group.names)
+
+
+def _constant(group: Group, constant: BoolArray) -> Iterator[Finding]:
+    names = tuple(name for name, still in zip(group.names, constant, strict=True) if still)
+    zero = not group.values[0][constant].any()
+    if zero and group.field in WRENCHES:  # what a point contact cannot exert
+        return
+    text = f"{listed(names)}: {'0' if zero else 'one value'} throughout"
+    if zero and group.field == "joint_torque":
+        advice = "write NaN if they were not measured: zeros are fitted as measured torques"
+        yield Finding("constant", SUSPICIOUS, group.field, text, advice, names)
+    else:
+        yield Finding("constant", NOTE, group.field, text, "none if that is so: what does not move adds nothing", names)

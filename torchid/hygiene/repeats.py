@@ -1,0 +1,111 @@
+"""Runs of samples that repeat the one before to the last bit, and whether that can be chance or rest.
+
+A robot at rest repeats itself as well. Whether a run can be chance follows from its neighbourhood: where a channel
+moves by a median |d| from sample to sample on a grid of quantum q, one repeat has a probability of about q / (2 |d|);
+for k of them in c channels it is the product. And a robot that comes to rest slows down before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.hygiene.neighbours import beside, median_known
+from torchid.logs.fields import BoolArray, FloatArray
+
+#: Decades below which a run of repeats is no chance: of a million samples none would repeat like that.
+CHANCE = -8.0
+#: Steps on either side that a run is compared with.
+NEIGHBOURS = 10
+#: Steps on either side that say whether the robot moved when the run began and after it ended...
+_NEAREST = 4
+#: ... at this share of the speed in the neighbourhood at least: one that stops smoothly is below it.
+_MOVING = 0.5
+#: Share of repeats above which a channel is taken for one that was recorded at a lower rate and held...
+HELD = 0.2
+#: ... if this share of the runs has the typical length, give or take one sample.
+_REGULAR = 0.8
+#: Share of a channel's largest value below which differences are rounding.
+ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
+#: Runs after which nobody can tell chance from design.
+_MOST_RUNS = 20000
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Runs of repeats by the steps that they cover: `first`, `last` (R,), both included."""
+
+    first: NDArray[np.intp]
+    last: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, repeated: BoolArray) -> Runs:
+        """Of steps (M - 1,) that repeat the value before."""
+        edges = np.diff(np.concatenate([[False], repeated, [False]]).astype(np.int8))
+        return cls(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1)
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def lengths(self) -> NDArray[np.intp]:
+        """Number of repeats in each."""
+        return self.last - self.first + 1
+
+    def where(self, chosen: BoolArray) -> Runs:
+        """Some of the runs."""
+        return Runs(self.first[chosen], self.last[chosen])
+
+    def mask(self, steps: int) -> BoolArray:
+        """Which of so many steps they cover."""
+        edges = np.zeros(steps + 1, np.intp)
+        np.add.at(edges, self.first, 1)
+        np.add.at(edges, self.last + 1, -1)
+        return np.asarray(np.cumsum(edges[:-1]) > 0)
+
+
+def held_for(repeated: BoolArray) -> int:
+    """For how many samples a channel is held whose steps (M - 1,) repeat the value before; 0 if it is not."""
+    if float(np.mean(repeated)) <= HELD:
+        return 0
+    changes = np.flatnonzero(~repeated)
+    if len(changes) < NEIGHBOURS:
+        return 0
+    lengths = np.diff(changes)
+    typical = int(np.median(lengths))
+    return typical if typical > 1 and float(np.mean(np.abs(lengths - typical) <= 1)) >= _REGULAR else 0
+
+
+def implausible(values: FloatArray, repeated: BoolArray) -> Runs:
+    """Runs of repeats (M - 1,) in values (M, c), all channels at once, that are neither chance nor rest."""
+    runs = Runs.of(repeated)
+    if not 0 < len(runs) <= _MOST_RUNS:
+        return runs.where(np.zeros(len(runs), bool))
+    sizes = np.abs(np.diff(values, axis=0))
+    sides = [beside(sizes, runs.first, -1, NEIGHBOURS), beside(sizes, runs.last, 1, NEIGHBOURS)]  # (R, k, c)
+    typical = median_known(np.concatenate(sides, axis=1))
+    finest = _finest(sides, ROUNDING * np.abs(values).max(axis=0))
+    moving = np.ones(len(runs), bool)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one = np.where(typical > 0.0, np.minimum(0.5 * finest / typical, 1.0), 1.0)
+        chance = runs.lengths * np.log10(one).sum(axis=1)
+        for side in sides:
+            pace = np.where(typical > 0.0, side[:, :_NEAREST].mean(axis=1) / typical, np.nan)
+            at_end = np.isnan(side[:, 0]).all(axis=1)
+            moving &= at_end | (_mean_known(pace) >= _MOVING)
+    return runs.where((chance < CHANCE) & moving)
+
+
+def _finest(sides: list[FloatArray], rounding: FloatArray) -> FloatArray:
+    """The smallest difference of values or of steps that is not rounding in the neighbourhood, (R, c)."""
+    sizes = np.concatenate([*sides, *(np.abs(np.diff(side, axis=1)) for side in sides)], axis=1)
+    least = np.where(sizes > rounding, sizes, np.inf).min(axis=1)  # so written, NaN is none either
+    return np.where(np.isfinite(least), least, 0.0)
+
+
+def _mean_known(values: FloatArray) -> FloatArray:
+    """Mean along the last axis over what is a number; 0 where nothing is."""
+    known = np.isfinite(values)
+    return np.where(known, values, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)

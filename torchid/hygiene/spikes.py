@@ -1,0 +1,179 @@
+"""Findings about spikes and steps: which jumps of a log are no motion and no force, and what to do about them.
+
+Positions cannot jump at all. Velocities and forces can where a foot lands or lifts, torques where friction changes its
+sign, and accelerations wherever something hits something. There only what exceeds the channel's whole range counts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from torchid.hygiene.channels import Group, median_step
+from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Span, listed
+from torchid.hygiene.jumps import LONGEST_SPIKE, Jump, jumps
+from torchid.hygiene.neighbours import near
+from torchid.logs import Log
+from torchid.logs.fields import BoolArray, FloatArray
+from torchid.logs.transitions import near_contact_changes
+
+POSES = ("joint_position", "base_quat_xyzw", "base_position_world")
+#: Fields whose lasting steps are worth a word; velocities and accelerations have theirs from impacts and commands.
+_STEPPING = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "ft_wrench")
+#: Ends of the names of fields in which impacts show as spikes.
+_RINGING = ("acceleration", "acceleration_world", "acceleration_base", "specific_force")
+#: Share of a channel's range, between its 1st and 99th percentile (of a force or moment: that of its component with the
+#: largest), below which a spike changes no fit...
+RELEVANT = 0.1
+#: ... and a lasting step is no reset of a sensor.
+RESET = 0.3
+#: Jump of a position [rad, m, or of a quaternion's component] that nobody needs to hear of: 0.03 degrees, 0.5 mm.
+NEGLIGIBLE = 5e-4
+#: A lasting step of a position that is within the error of its calibration.
+HARMLESS = 0.01
+#: Share of a log that may be given up where a position has another zero before or after a step.
+SHORT_SIDE = 0.1
+#: Time around a change of contact [s] in which forces and velocities may jump: impacts ring that long.
+_IMPACT = 0.1
+#: Samples around a reversal of a joint in which its torque may jump, and the share of its usual speed below which it
+#: counts as about to reverse.
+_REVERSAL, _SLOW = 5, 0.2
+#: How far a step may be from a whole number of turns, in turns, to count as a wrapped angle.
+_WRAPPED = 0.01
+
+#: Jumps by channel, in numbers of samples of the log.
+_Jumps = list[tuple[str, Jump]]
+
+
+def spikes(log: Log, groups: Iterable[Group]) -> Iterator[Finding]:
+    """Findings about jumps in all channels."""
+    impacts = _contact_changes(log)
+    by_field: dict[str, tuple[str, _Jumps]] = {}
+    for group in groups:
+        _, found = by_field.setdefault(group.field, (group.unit, []))
+        for column, name in enumerate(group.names):
+            for jump in _jumps(log, group, column, impacts):
+                first, last = (int(group.samples[i]) for i in (jump.first, jump.last))
+                found.append((name, dataclasses.replace(jump, first=first, last=last)))
+    for field, (unit, found) in by_field.items():
+        lasting = [(name, jump) for name, jump in found if jump.lasting]
+        yield from _spikes(field, unit, [(name, jump) for name, jump in found if not jump.lasting])
+        if field in POSES:
+            yield from _position_steps(field, unit, lasting, len(log))
+        elif lasting and field in _STEPPING:
+            advice = "if the sensor was reset there, split the log: each part has its own offset"
+            yield _finding("step", SUSPICIOUS, field, unit, lasting, advice)
+
+
+def _spikes(field: str, unit: str, found: _Jumps) -> Iterator[Finding]:
+    if found and field.endswith(_RINGING):
+        yield _finding("spike", SUSPICIOUS, field, unit, found, "none if something hit something there")
+    elif found:
+        yield _finding("spike", CONDEMNED, field, unit, found, "leave these samples out; look for a loose contact")
+
+
+def _finding(
+    name: str, severity: str, field: str, unit: str, found: _Jumps, advice: str, spans: tuple[Span, ...] | None = None
+) -> Finding:
+    channels = tuple(dict.fromkeys(channel for channel, _ in found))
+    channel, clearest = max(found, key=lambda pair: pair[1].spreads)
+    where = f"{clearest.first} to {clearest.last}" if clearest.lasting else str(_span("", clearest))
+    size = abs(clearest.size)
+    if field == "base_quat_xyzw":
+        size, unit = np.degrees(2.0 * size), "deg"
+    count = len({(jump.first, jump.last) for _, jump in found})
+    text = f"{count} in {listed(channels)}; the clearest, {size:.3g} {unit} or {clearest.spreads:.3g} local spreads,"
+    text += f" at {where} in {channel}"
+    if spans is None:
+        spans = tuple(_span(channel, jump) for channel, jump in found)
+    return Finding(name, severity, field, text, advice, channels, spans)
+
+
+def _span(channel: str, jump: Jump, shift: float = 0.0) -> Span:
+    return Span(jump.first, jump.last, channel, shift)
+
+
+def _jumps(log: Log, group: Group, column: int, impacts: BoolArray) -> list[Jump]:
+    """The jumps of a channel that neither motion nor contact explains, in numbers of the group's samples."""
+    values = group.values[:, column]
+    if group.field in POSES:
+        found = jumps(values, group.elapsed, group.piece, max(LONGEST_SPIKE, int(SHORT_SIDE * len(values))))
+        return [jump for jump in found if abs(jump.size) > NEGLIGIBLE]
+    found = jumps(values, group.elapsed, group.piece)
+    if not found:
+        return found
+    excused = impacts[group.samples] | group.field.endswith(_RINGING)
+    if group.field == "joint_torque":
+        excused = excused | _reversals(log.joint_position[:, log.joint_names.index(group.names[column])])[group.samples]
+    like = values[:, None] if not group.name else group.values[:, column // 3 * 3 : column // 3 * 3 + 3]
+    low, high = np.percentile(like, (1.0, 99.0), axis=0)
+    span = float((high - low).max())
+    return [
+        jump
+        for jump in found
+        if abs(jump.size) > (RESET if jump.lasting else RELEVANT) * span
+        and (abs(jump.size) > span or not excused[jump.first : jump.last + 1].any())
+    ]
+
+
+def _contact_changes(log: Log) -> BoolArray:
+    """Samples close to a change of any contact, (N,)."""
+    return near_contact_changes(log, log.time, max(_IMPACT, LONGEST_SPIKE * median_step(log)))
+
+
+def _reversals(position: FloatArray) -> BoolArray:
+    """Samples close to where a joint is about to reverse, (N,)."""
+    speed = np.abs(np.gradient(position))
+    smooth = np.convolve(speed, np.ones(_REVERSAL) / _REVERSAL, mode="same")
+    return near(smooth <= _SLOW * np.median(smooth), _REVERSAL)
+
+
+def _position_steps(field: str, unit: str, lasting: _Jumps, samples: int) -> Iterator[Finding]:
+    """Positions have another zero after a step: the shorter side is lost, or the whole log if neither is short."""
+    kinds: dict[str, _Jumps] = {}
+    for name, jump in lasting:
+        together = max(abs(other.size) for _, other in lasting if other.first == jump.first)
+        kinds.setdefault(_kind(field, jump, together, samples), []).append((name, jump))
+    for kind, found in kinds.items():
+        if kind == "wrapped":
+            spans = tuple(_span(name, jump, 2.0 * np.pi * _turns(jump)) for name, jump in found)
+            advice = "unwrap the angle: a turn is no motion"
+            yield _finding("wrapped angle", CONDEMNED, field, unit, found, advice, spans)
+        elif kind == "place":
+            spans = tuple(_span(name, jump, jump.size) for name, jump in found)
+            advice = "leave these samples out; where the robot is does not matter, only how it moves"
+            yield _finding("step", CONDEMNED, field, unit, found, advice, spans)
+        elif kind == "harmless":
+            advice = "none at this size; look for a marker or an encoder that slipped"
+            yield _finding("step", SUSPICIOUS, field, unit, found, advice)
+        elif kind == "short":
+            spans = tuple(_shorter_side(jump, name, samples) for name, jump in found)
+            advice = "leave the shorter side out: its zero is another one"
+            yield _finding("step", CONDEMNED, field, unit, found, advice, spans)
+        else:
+            advice = "split the log there and find out which part has the right zero"
+            yield _finding("step", CONDEMNED, field, unit, found, advice, ())
+
+
+def _kind(field: str, jump: Jump, together: float, samples: int) -> str:
+    """What a step is: `together` is the largest of all channels at the same place."""
+    turns = jump.size / (2.0 * np.pi)
+    if field == "joint_position" and _turns(jump) and abs(turns - _turns(jump)) < _WRAPPED:
+        return "wrapped"
+    if together < HARMLESS:
+        return "harmless"
+    if field == "base_position_world":
+        return "place"
+    return "short" if min(jump.first + 1, samples - jump.last) <= SHORT_SIDE * samples else "whole"
+
+
+def _turns(jump: Jump) -> int:
+    return round(jump.size / (2.0 * np.pi))
+
+
+def _shorter_side(jump: Jump, channel: str, samples: int) -> Span:
+    if jump.first + 1 < samples - jump.last:
+        return Span(0, jump.first, channel)
+    return Span(jump.last, samples - 1, channel)

@@ -1,0 +1,153 @@
+"""What the contacts carry against the robot's weight, and an accelerometer at rest against gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from torchid.hygiene.channels import median_step
+from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped
+from torchid.hygiene.rest import at_rest
+from torchid.logs import Log
+from torchid.logs.fields import WRENCHES, BoolArray, FloatArray
+from torchid.logs.quaternion import rotate
+from torchid.regressor.motion import GRAVITY_WORLD
+from torchid.robot import Robot
+
+GRAVITY = -GRAVITY_WORLD[2]
+#: How far the carried mass may be from the URDF's without a word, and from where on no CAD model is that wrong.
+KNOWN, WRONG = 0.02, 0.2
+#: What a force sensor's unit makes of 1 N, and how far the URDF's mass may then be off.
+UNITS = {"kN": 1e-3, "kg": 1.0 / GRAVITY, "lbf": 0.22481, "g": 1e3 / GRAVITY, "mN": 1e3}
+_UNIT_WITHIN = 0.15
+#: Rest [s] that it takes; else the mean over a log of at least so long [s]: a change of speed of 1 m/s between its ends
+#: counts 2 % then.
+_REST, _LONG = 0.5, 5.0
+#: Samples for which the pose of the contact frames is computed.
+_POSES = 4000
+#: How far the accelerometer's reading at rest may be from gravity: a good one is within 0.5 %.
+_ACCELEROMETER = 0.02
+#: Angle [deg] between gravity as an accelerometer sees it and as the orientation says.
+_TILT = 5.0
+_NAME, _IMU = "weight at rest", "accelerometer at rest"
+
+
+def weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
+    """Findings about the sum of the contact forces."""
+    still = at_rest(log)
+    step = median_step(log)
+    rests = still.sum() * step >= _REST
+    if not rests and log.time[-1] - log.time[0] < _LONG:
+        yield Skipped(_NAME, f"the robot never rests for {_REST:g} s")
+        return
+    chosen = np.flatnonzero(still) if rests else np.arange(len(log))
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(_POSES, len(chosen))).astype(int)]
+    upward = _upward(log.select(chosen), robot)
+    if isinstance(upward, str):
+        yield Skipped(_NAME, upward)
+        return
+    when = f"at rest ({still.sum() * step:.3g} s)" if rests else f"on average over {log.time[-1] - log.time[0]:.4g} s"
+    field = WRENCHES[0] if log.contact_wrench_world is None else WRENCHES[1]
+    yield from _judged(float(upward.mean()), when, field, robot)
+
+
+def _judged(carried: float, when: str, field: str, robot: Robot | None) -> Iterator[Finding]:
+    mass = carried / GRAVITY
+    if carried < 0.0:
+        text = f"contacts pull with {-carried:.4g} N {when}"
+        yield Finding("sign", CONDEMNED, field, text, "reverse it: wrenches are what the ground exerts on the robot")
+        return
+    if robot is None:
+        text = f"contacts carry {mass:.4g} kg {when}"
+        yield Finding("weight", NOTE, field, text, "compare with a scale, or give a URDF")
+        return
+    nominal = float(robot.nominal[:, 0].sum())
+    ratio = mass / nominal
+    text = f"contacts carry {mass:.4g} kg {when}, the URDF weighs {nominal:.4g} kg ({100 * (ratio - 1):+.2g} %)"
+    for unit, size in UNITS.items():
+        if abs(ratio / size - 1.0) < _UNIT_WITHIN:
+            text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {unit}?"
+            yield Finding("unit", CONDEMNED, field, text, "convert forces to N and moments to N m")
+            return
+    if abs(ratio - 1.0) > WRONG:
+        advice = "look for a contact that is not measured, a payload, a sensor's offset or gain"
+        yield Finding("weight", SUSPICIOUS, field, text, advice)
+    elif abs(ratio - 1.0) > KNOWN:
+        yield Finding("weight", NOTE, field, text, "identification will tell, if no sensor has an offset")
+
+
+def _upward(log: Log, robot: Robot | None) -> FloatArray | str:
+    """Sum of the vertical contact forces (M,) [N] over samples where all active ones were measured, or why not."""
+    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    if wrench is None or log.contact_active is None:
+        return "no contact forces"
+    force = np.where(log.contact_active[..., None], wrench[..., :3], 0.0)
+    if log.contact_wrench_world is None:
+        if robot is None:
+            return "contact forces along the frames' own axes, and no robot"
+        if log.base_quat_xyzw is None and not robot.fixed_base:
+            return "contact forces along the frames' own axes, and no orientation of the base"
+        if set(log.joint_names) != set(robot.joint_names) or not set(log.contact_names) <= set(robot.links):
+            return "the log's joints or contacts are not the robot's"
+        force = _in_world(log, robot, force)
+    known = np.isfinite(force).all(axis=(1, 2))
+    return force[known, :, 2].sum(axis=1) if known.any() else "no sample at which all active contacts were measured"
+
+
+def _in_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
+    order = [log.joint_names.index(name) for name in robot.joint_names]
+    poses = robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+    turned = [
+        np.einsum("nij,nj->ni", poses[name][:, :3, :3].numpy(), force[:, index])
+        for index, name in enumerate(log.contact_names)
+    ]
+    if log.base_quat_xyzw is not None:
+        turned = [rotate(log.base_quat_xyzw, one) for one in turned]
+    return np.stack(turned, axis=1)
+
+
+def accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
+    """Findings about the IMU's specific force."""
+    if log.imu_specific_force is None:
+        return
+    still = at_rest(log)
+    if still.sum() < 10:
+        yield Skipped(_IMU, f"the robot never rests for {_REST:g} s")
+        return
+    mean = log.imu_specific_force[still].mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    name, text = "imu_specific_force", f"{size:.4g} m/s^2 at rest"
+    if abs(size - 1.0) < 0.1:
+        yield Finding("unit", CONDEMNED, name, f"{text}: in units of g", f"multiply by {GRAVITY}")
+    elif size < 0.1 * GRAVITY:
+        advice = "give what the accelerometer reads: acceleration minus gravity, upward at rest"
+        yield Finding("gravity", CONDEMNED, name, f"{text}: gravity has been taken out", advice)
+    elif abs(size / GRAVITY - 1.0) > _ACCELEROMETER:
+        yield Finding("gravity", SUSPICIOUS, name, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
+    if size > 0.5 * GRAVITY or abs(size - 1.0) < 0.1:
+        yield from _tilt(log, robot, still)
+
+
+def _tilt(log: Log, robot: Robot | None, still: BoolArray) -> Iterator[Finding | Skipped]:
+    """Whether gravity points where the base's orientation says."""
+    if log.base_quat_xyzw is None or log.imu_specific_force is None:
+        return
+    if robot is None or robot.links.get(log.imu_frame, (1, None))[0] != 0:
+        yield Skipped("gravity against orientation", "no robot that says where the IMU is on the base")
+        return
+    T_base_imu = robot.links[log.imu_frame][1]
+    world = rotate(log.base_quat_xyzw[still], log.imu_specific_force[still] @ T_base_imu[:3, :3].T)
+    up = world.mean(axis=0)
+    angle = float(np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1.0, 1.0))))
+    if angle > 90.0:
+        text = f"{angle:.0f} degrees from up at rest"
+        advice = (
+            "reverse it if it is gravity minus acceleration; else look at the IMU's frame and the quaternion's order"
+        )
+        yield Finding("gravity", CONDEMNED, "imu_specific_force", text, advice)
+    elif angle > _TILT:
+        text = f"{angle:.1f} degrees from up at rest, by base_quat"
+        advice = "look at the IMU's frame in the URDF and the order of the quaternion"
+        yield Finding("gravity", SUSPICIOUS, "imu_specific_force", text, advice)

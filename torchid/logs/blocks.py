@@ -1,0 +1,182 @@
+"""Logs that are read a block of samples at a time, for those that no memory holds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.errors import LogError
+from torchid.logs.checks import as_names, as_real, check_shape, check_time
+from torchid.logs.container import Container, open_container, translated
+from torchid.logs.fields import NAMES, SHAPES, FloatArray, shape_of
+from torchid.logs.kinds import Kind, kind_to_read
+from torchid.logs.log import Log
+from torchid.logs.read import check_fields_given, checked_log
+from torchid.logs.spill import Sliced, Spill
+from torchid.logs.table import table_blocks, table_size
+
+_ACCEPTED = "a plain array of numbers, truth values or text"
+_SAMPLE = re.compile(r"\bsample (\d+)")
+_SMALL = 4  # a cell of a table takes two characters at least, a number eight bytes
+
+
+def size_of(path: Path, limit: float) -> int:
+    """Bytes of a log's arrays, 0 for a bag, which is always read whole, and for a table that must be below a limit.
+
+    Raises:
+        LogError: the file cannot be read.
+    """
+    kind = kind_to_read(path)
+    if kind is Kind.TABLE:
+        compressed = path.suffix.lower() != ".csv"
+        return table_size(path) if compressed or _SMALL * path.stat().st_size > limit else 0
+    if kind is Kind.BAG:
+        return 0
+    with open_container(path, whole=False) as container:
+        return sum(container.sizes().values())
+
+
+def counted_from(start: int, error: LogError) -> LogError:
+    """An error in a part of a log, with samples counted from the log's beginning."""
+    found = _SAMPLE.sub(lambda match: f"sample {int(match[1]) + start}", error.found)
+    return LogError(error.source, error.field, found.replace(" in all)", " near it)"), error.accepted)
+
+
+@dataclass
+class Blocks:
+    """An open log, of which nothing but the stamps is in memory.
+
+    Attributes:
+        source: the log's file name.
+        names: arrays of text, by field.
+        time: (N,) [s].
+        fields: everything else that has samples.
+    """
+
+    source: str
+    names: Mapping[str, NDArray[Any]]
+    time: FloatArray
+    fields: Mapping[str, Sliced]
+    _last: tuple[int, FloatArray] | None = field(default=None, init=False)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a sample."""
+        return 8 + sum(int(np.prod(x.shape[1:])) * x.dtype.itemsize for x in self.fields.values())
+
+    def read(self, samples: slice, only: tuple[str, ...] | None = None) -> Log:
+        """Some samples as a log of their own, or just some fields of them with positions of 0.
+
+        Signs of quaternions go on from those of the samples that were read before, if these reach up to them.
+
+        Raises:
+            LogError: a value that is none; the message counts samples from the beginning.
+        """
+        raw: dict[str, Any] = dict(self.names) | {"time": self.time[samples]}
+        if only is not None:
+            raw["joint_position"] = np.zeros((len(raw["time"]), len(self.names["joint_names"])))
+        for name, array in self.fields.items():
+            if only is None or name in only:
+                with translated(self.source, name, _ACCEPTED):
+                    raw[name] = np.asarray(array[samples])
+        try:
+            log = checked_log(self.source, raw)
+        except LogError as error:
+            raise counted_from(samples.start, error) from error
+        if log.base_quat_xyzw is not None:
+            self._continue_signs(log.base_quat_xyzw, samples)
+        return log
+
+    def _continue_signs(self, quat: FloatArray, samples: slice) -> None:
+        """Give quaternions (M, 4) of some samples the sign that goes with those before."""
+        if self._last is not None:
+            index, before = self._last
+            if samples.start <= index + 1 and quat[max(index - samples.start, 0)] @ before < 0.0:
+                quat *= -1.0
+        self._last = samples.start + len(quat) - 1, quat[-1].copy()
+
+
+@contextmanager
+def open_blocks(path: Path, folder: Path) -> Iterator[Blocks]:
+    """Open a log (.h5, .npz, .csv or .parquet).
+
+    An .h5 file is read where it is; others are unpacked, to files without a name in `folder`.
+
+    Raises:
+        LogError: the file is not what it should be.
+        SpillError: there is no room in the folder.
+    """
+    source = str(path)
+    if kind_to_read(path) is Kind.TABLE:
+        yield _checked(source, *_of_table(path, folder))
+        return
+    with open_container(path, whole=False) as container:
+        yield _checked(source, *_of_container(source, container, folder))
+
+
+def _of_container(source: str, container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Sliced]]:
+    """Text and arrays of a container."""
+    given = list(container.sizes())
+    check_fields_given(source, given)
+    names: dict[str, NDArray[Any]] = {}
+    fields: dict[str, Sliced] = {}
+    for name in given:
+        with translated(source, name, _ACCEPTED):
+            if _is_text(name):
+                names[name] = container.load(name)
+            else:
+                fields[name] = container.sliced(name, folder)
+    return names, fields
+
+
+def _of_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Sliced]]:
+    """Text and arrays of a table, which is read once, from its beginning to its end."""
+    names: dict[str, NDArray[Any]] = {}
+    spills: dict[str, Spill] = {}
+    for number, block in enumerate(table_blocks(path)):
+        if not number:
+            check_fields_given(str(path), block)
+            continue
+        for name, array in block.items():
+            if not _is_text(name):
+                spills.setdefault(name, Spill(path, folder)).append(array)
+            elif names.setdefault(name, array).tolist() != array.tolist():
+                found = f"'{names[name]}' and '{array}'"
+                raise LogError(path, f"column '{name}'", found, "one name, the same in every row")
+    if not spills:
+        raise LogError(path, "time", "no samples", "at least one sample")
+    return names, {name: spill.array() for name, spill in spills.items()}
+
+
+def _is_text(name: str) -> bool:
+    return name in NAMES or SHAPES.get(name) == ()
+
+
+def _checked(source: str, names: dict[str, NDArray[Any]], fields: dict[str, Sliced]) -> Blocks:
+    """The blocks, after checks of all that can be said before values are read."""
+    time = fields.pop("time")
+    check_shape(source, "time", _empty(time), SHAPES["time"], {})
+    with translated(source, "time", _ACCEPTED):
+        stamps = as_real(source, "time", np.asarray(time[:]))
+    check_time(source, stamps)
+    sizes = {"N": len(stamps)}
+    for name, letter in NAMES.items():
+        sizes[letter] = len(as_names(source, name, names[name])) if name in names else 0
+    for name, array in fields.items():
+        check_shape(source, name, _empty(array), shape_of(name), sizes)
+    return Blocks(source, names, stamps, fields)
+
+
+def _empty(array: Sliced) -> NDArray[Any]:
+    """An array of the same shape that takes no memory."""
+    return np.broadcast_to(np.zeros((), dtype=array.dtype if array.dtype.kind in "biuf" else bool), array.shape)

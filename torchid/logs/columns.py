@@ -1,0 +1,162 @@
+"""One column per scalar: the names of a table's columns, and which field each belongs to."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.errors import LogError
+from torchid.logs import limits
+from torchid.logs.fields import NAMES, SHAPES, VARIANTS, UnknownFieldError, is_quaternion, shape_of
+from torchid.text import is_plain, shown
+from torchid.wrenches import COMPONENTS
+
+#: The one column of text: the same in every row.
+TEXT = "imu_frame"
+FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAMES)
+#: Most columns of a table, and characters in the name of one. A humanoid with every sensor has about 500 columns.
+MAX_COLUMNS, MAX_LETTERS = 20_000, 2 * limits.MAX_LETTERS
+
+_UNIT = re.compile(r"\[.*\]$|\(.*\)$")
+_KIND = {"joint_names": "joint", "contact_names": "contact", "ft_names": "sensor"}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One scalar: its field and, where the field has them, the name and the component."""
+
+    field: str
+    name: str = ""
+    component: str = ""
+
+    def __str__(self) -> str:
+        return ".".join(part for part in (self.field, self.name, self.component) if part)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which columns make up which field.
+
+    Attributes:
+        names: names of joints, contacts and sensors, by field.
+        columns: by field, its columns in the order of its elements.
+    """
+
+    names: dict[str, tuple[str, ...]]
+    columns: dict[str, tuple[str, ...]]
+
+    def fields(self, samples: int, take: Callable[[str], NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """The arrays of a log file: `take` gives the values (N,) of a column, once."""
+        out: dict[str, NDArray[Any]] = {name: np.array(names, dtype=np.str_) for name, names in self.names.items()}
+        for field, columns in self.columns.items():
+            if field == TEXT:
+                out[field] = take(field)
+                continue
+            flat = np.stack([take(column) for column in columns], axis=-1)
+            sizes = {letter: len(self.names.get(name, ())) for name, letter in NAMES.items()}
+            shape = [sizes[x] if isinstance(x, str) else x for x in shape_of(field)[1:]]
+            out[field] = flat.reshape(samples, *shape)
+        if not out["joint_names"].size:  # a robot without joints
+            out["joint_position"] = np.zeros((samples, 0))
+        return out
+
+
+def layout_of(source: str, texts: Sequence[str]) -> Layout:
+    """Sort the columns of a table into fields.
+
+    Joints, contacts and sensors are named by the columns of the first of their fields; the others have the same.
+
+    Raises:
+        LogError: a column that is unknown, given twice, missing or too many.
+    """
+    if len(texts) > MAX_COLUMNS:
+        raise LogError(source, "file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
+    given: dict[str, dict[str, Column]] = {}
+    for text in texts:
+        if len(text) > MAX_LETTERS or not is_plain(text):
+            found = f"a name of {len(text)} characters: {shown(text)}"
+            raise LogError(source, "header", found, f"names of one line and at most {MAX_LETTERS} characters")
+        column = parse_column(source, text)
+        of_field = given.setdefault(column.field, {})
+        if text in of_field:
+            raise LogError(source, f"column '{text}'", "given twice", "every column once")
+        of_field[text] = column
+    names: dict[str, tuple[str, ...]] = {}
+    for field in FIELDS:
+        of = _names_of(field)
+        if of and of not in names and field in given:
+            names[of] = tuple(dict.fromkeys(column.name for column in given[field].values()))
+    columns = {field: columns_of(field, names) for field in given}
+    for field, expected in columns.items():
+        _check_complete(source, field, expected, given[field])
+    return Layout({"joint_names": (), **names}, columns)
+
+
+def _check_complete(source: str, field: str, expected: Sequence[str], given: Mapping[str, Column]) -> None:
+    missing = [text for text in expected if text not in given]
+    if missing:
+        accepted = f"every column of {spelled(field)}; a cell may be empty where nothing was measured"
+        raise LogError(source, f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
+    stray = list(given.keys() - set(expected))
+    if stray:
+        found = f"a {_KIND[_names_of(field)]} that the first field of its kind does not name"
+        raise LogError(source, f"column '{stray[0]}'", found, "the same names in all fields")
+
+
+def parse_column(source: str, text: str) -> Column:
+    """What the name of a column says: the field up to its first dot, a component after its last.
+
+    Raises:
+        LogError: no column has such a name.
+    """
+    field, _, rest = text.partition(".")
+    if _UNIT.search(text):
+        raise LogError(source, f"column '{text}'", "a unit in its name", "names without units, values in SI units")
+    if field not in FIELDS:
+        raise UnknownFieldError(source, f"column '{text}'", field, FIELDS)
+    components, of = components_of(field), _names_of(field)
+    if of and components:
+        name, _, component = rest.rpartition(".")
+    else:
+        name, component = (rest, "") if of else ("", rest)
+    column = Column(field, name, component)
+    if str(column) != text or bool(name) != bool(of) or (component not in components if components else component):
+        raise LogError(source, f"column '{text}'", "no such part of this field", spelled(field))
+    return column
+
+
+def columns_of(field: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    """The columns of a field in the order of its elements; `names` by field."""
+    of = _names_of(field)
+    return tuple(
+        str(Column(field, name, component))
+        for name in (names[of] if of else ("",))
+        for component in components_of(field) or ("",)
+    )
+
+
+def components_of(field: str) -> tuple[str, ...]:
+    """What the last part of a column's name may be, nothing for fields without components."""
+    size = shape_of(field)[-1] if len(shape_of(field)) > 1 else None
+    if size == 6:
+        return COMPONENTS
+    if is_quaternion(field):
+        return tuple(field.rpartition("_")[2])
+    return ("x", "y", "z") if size == 3 else ()
+
+
+def spelled(field: str) -> str:
+    """The names of a field's columns in general, such as `ft_wrench.<sensor>.{fx, fy, fz, mx, my, mz}`."""
+    of, components = _names_of(field), components_of(field)
+    return str(Column(field, f"<{_KIND[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))
+
+
+def _names_of(field: str) -> str:
+    """The field that names what a field has one of each for, or nothing."""
+    letter = next((x for x in shape_of(field)[1:2] if isinstance(x, str)), None)
+    return next((name for name, of in NAMES.items() if of == letter), "")

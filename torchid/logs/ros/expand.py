@@ -1,0 +1,39 @@
+"""Undo the compression of a chunk of a bag, as long as it does not fill the memory."""
+
+from __future__ import annotations
+
+import bz2
+import io
+
+import lz4.frame
+import zstandard
+
+from torchid.logs.ros.storage import MAX_RECORD
+from torchid.text import shown
+
+#: Most bytes that one compressed byte may stand for, in chunks of more than `_FREE`. Messages that never change but for
+#: their stamps shrink a hundredfold.
+_MOST, _FREE = 1000, 2**20
+
+
+def expanded(data: bytes, compression: str) -> bytes:
+    """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
+
+    Raises:
+        ValueError: another compression, or a chunk that grows out of all proportion.
+    """
+    limit = min(MAX_RECORD, max(_FREE, _MOST * len(data)))
+    if compression in ("", "none"):
+        return data
+    if compression == "bz2":
+        out = bz2.BZ2Decompressor().decompress(data, limit + 1)
+    elif compression == "lz4":
+        out = lz4.frame.LZ4FrameDecompressor().decompress(data, limit + 1)
+    elif compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
+            out = stream.read(limit + 1)
+    else:
+        raise ValueError(f"chunks compressed by '{shown(compression)}'")
+    if len(out) > limit:
+        raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
+    return out

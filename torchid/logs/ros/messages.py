@@ -1,0 +1,212 @@
+"""What each type of message holds, as rows of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+
+from torchid.errors import LogError
+from torchid.logs.fields import FloatArray
+from torchid.logs.limits import check_names
+from torchid.logs.ros.storage import Channel, plain
+
+_ZSTD = b"\x28\xb5\x2f\xfd"
+_JOINT_FIELDS = {"position": "joint_position", "velocity": "joint_velocity", "effort": "joint_torque"}
+
+
+class Decoder(Protocol):
+    """Turns the messages of one topic into rows of equal length, and the rows into fields of a log."""
+
+    types: tuple[str, ...]
+
+    def row(self, message: Any) -> FloatArray | None:
+        """The numbers (k,) of a message; None where it has nothing to say. LogError where it does not fit."""
+
+    def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
+        """What rows (N, k) mean."""
+
+
+def deserializer(source: str, topic: str, channel: Channel) -> Callable[[bytes], Any]:
+    """What makes messages of the bytes on a channel, by the definitions of ROS itself and never those in the bag.
+
+    Raises:
+        LogError: they are not serialized as ROS does.
+    """
+    store = _typestore(channel.encoding)
+    if store is None:
+        raise LogError(source, topic, f"messages serialized as '{channel.encoding}'", "cdr (ROS 2) or ros1")
+    if channel.encoding == "ros1":
+        return lambda data: store.deserialize_ros1(data, channel.type)
+
+    def deserialize(data: bytes) -> Any:
+        if data.startswith(_ZSTD):
+            raise LogError(source, topic, "messages compressed one by one", "a bag without message compression")
+        return store.deserialize_cdr(data, channel.type)
+
+    return deserialize
+
+
+@cache
+def _typestore(encoding: str) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    stores = {"ros1": Stores.ROS1_NOETIC, "cdr": Stores.ROS2_HUMBLE}  # the types read here never changed within ROS 2
+    return get_typestore(stores[encoding]) if encoding in stores else None
+
+
+class _Constant:
+    """A text that all messages of a topic have to share."""
+
+    def __init__(self, source: str, topic: str, field: str) -> None:
+        self._where, self._field, self.value = (source, topic), field, ""
+
+    def check(self, value: str) -> None:
+        self.value = self.value or plain(value)
+        if value != self.value:
+            raise LogError(*self._where, f"{self._field} '{self.value}', then '{plain(value)}'", f"one {self._field}")
+
+
+class JointStates:
+    """`sensor_msgs/JointState`: joints by name, in any order that may change from message to message."""
+
+    types: tuple[str, ...] = ("sensor_msgs/msg/JointState",)
+
+    def __init__(self, source: str, topic: str, joints: list[str] | None) -> None:
+        """Take the given joints, or those of the first message."""
+        self.names = tuple(joints or ())
+        self._given, self._where = joints is not None, (source, topic)
+        self._parts: tuple[str, ...] = ()
+        self._orders: dict[tuple[str, ...], list[int] | slice | None] = {}
+
+    def row(self, message: Any) -> FloatArray | None:
+        """Position, then velocity and effort where there are any, of every joint; None for other joints' messages."""
+        names = tuple(message.name)
+        if names not in self._orders:
+            check_names([len(names)])
+            for name in names:
+                plain(name)
+            self._orders[names] = self._order(names)
+        order = self._orders[names]
+        if order is None:
+            return None
+        parts = tuple(part for part in _JOINT_FIELDS if len(getattr(message, part)))
+        self._parts = self._parts or parts
+        if parts != self._parts or "position" not in parts:
+            found = f"a message with {' and '.join(parts) or 'nothing'}"
+            accepted = f"positions, and in every message {' and '.join(self._parts) or 'the same'}"
+            raise LogError(*self._where, found, accepted)
+        values = [getattr(message, part) for part in parts]
+        if any(len(x) != len(names) for x in values):
+            raise LogError(*self._where, f"{[len(x) for x in values]} values of {len(names)} names", "one per name")
+        return np.concatenate([x[order] for x in values])
+
+    def _order(self, names: tuple[str, ...]) -> list[int] | slice | None:
+        if len(set(names)) != len(names):
+            raise LogError(*self._where, f"names {', '.join(names[:4])}, ... that repeat", "joints of different names")
+        self.names = self.names or names
+        known = {name: i for i, name in enumerate(names)}
+        missing = [name for name in self.names if name not in known]
+        if self._given and len(missing) == len(self.names):
+            return None
+        if missing or (not self._given and len(names) != len(self.names)):
+            found = f"a message without {missing[0]}" if missing else f"a message with {len(names)} joints"
+            accepted = f"all {len(self.names)} joints in every message, or joint_states.joints with those that are"
+            raise LogError(*self._where, found, accepted)
+        order = [known[name] for name in self.names]
+        return slice(None) if order == list(range(len(names))) else order  # which need not be copied
+
+    def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
+        """Fields (N, n)."""
+        parts = np.split(rows, max(len(self._parts), 1), axis=1)
+        return {_JOINT_FIELDS[part]: values for part, values in zip(self._parts, parts, strict=False)}
+
+
+class Imu:
+    """`sensor_msgs/Imu`: its linear acceleration is a specific force, which reads +g upwards at rest."""
+
+    types: tuple[str, ...] = ("sensor_msgs/msg/Imu",)
+
+    def __init__(self, source: str, topic: str) -> None:
+        """For the messages of a topic."""
+        self.frame, self._where = _Constant(source, topic, "header.frame_id"), (source, topic)
+
+    def row(self, message: Any) -> FloatArray:
+        """Specific force and angular velocity."""
+        self.frame.check(message.header.frame_id)
+        for part in ("linear_acceleration", "angular_velocity"):
+            if getattr(message, f"{part}_covariance")[0] == -1.0:
+                raise LogError(*self._where, f"no {part} (the first of its covariances is -1)", "an IMU with both")
+        return np.array([*_vector(message.linear_acceleration), *_vector(message.angular_velocity)])
+
+    def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
+        """Fields (N, 3)."""
+        return {"imu_specific_force": rows[:, :3], "imu_angular_velocity": rows[:, 3:]}
+
+
+class Odometry:
+    """`nav_msgs/Odometry` of the base link: its twist is in the child frame unless its driver says otherwise."""
+
+    types: tuple[str, ...] = ("nav_msgs/msg/Odometry",)
+
+    def __init__(self, source: str, topic: str, twist: str) -> None:
+        """With the twist in the frame `child` or `world`, or `none`."""
+        self._child, self._twist = _Constant(source, topic, "child_frame_id"), twist
+
+    def row(self, message: Any) -> FloatArray:
+        """Position, orientation (xyzw), linear and angular velocity."""
+        self._child.check(message.child_frame_id)
+        pose, twist, turn = message.pose.pose, message.twist.twist, message.pose.pose.orientation
+        quat = (turn.x, turn.y, turn.z, turn.w)
+        return np.array([*_vector(pose.position), *quat, *_vector(twist.linear), *_vector(twist.angular)])
+
+    def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
+        """Fields (N, 3) and (N, 4)."""
+        out = {"base_position_world": rows[:, :3], "base_quat_xyzw": rows[:, 3:7]}
+        if self._twist != "none":
+            frame = "base" if self._twist == "child" else "world"
+            out[f"base_linear_velocity_{frame}"] = rows[:, 7:10]
+            out[f"base_angular_velocity_{frame}"] = rows[:, 10:]
+        return out
+
+
+class Wrench:
+    """`geometry_msgs/WrenchStamped`, or `Wrench`, which says neither when nor in which frame."""
+
+    types: tuple[str, ...] = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
+
+    def __init__(self, source: str, topic: str, sign: int) -> None:
+        """With the sign that makes it the environment's or the parent side's action."""
+        self.frame, self._sign = _Constant(source, topic, "header.frame_id"), sign
+
+    def row(self, message: Any) -> FloatArray:
+        """Force and moment."""
+        stamped = hasattr(message, "header")
+        if stamped:
+            self.frame.check(message.header.frame_id)
+        wrench = message.wrench if stamped else message
+        return np.array([*_vector(wrench.force), *_vector(wrench.torque)])
+
+    def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
+        """Wrenches (N, 6)."""
+        return {"wrench": rows if self._sign == 1 else -rows}
+
+
+class Flag:
+    """`std_msgs/Bool`."""
+
+    types: tuple[str, ...] = ("std_msgs/msg/Bool",)
+
+    def row(self, message: Any) -> FloatArray:
+        """1 or 0."""
+        return np.array([float(message.data)])
+
+    def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
+        """Flags (N, 1)."""
+        return {"active": rows}
+
+
+def _vector(value: Any) -> tuple[float, float, float]:
+    return value.x, value.y, value.z

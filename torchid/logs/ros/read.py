@@ -1,0 +1,205 @@
+"""Read a bag: pick topics, decode their messages, bring them to common stamps, name them as a log does."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.errors import LogError, TorchidWarning, UnknownNameError
+from torchid.logs.fields import FloatArray
+from torchid.logs.kinds import bag_files
+from torchid.logs.ros.align import Clock, clock_of
+from torchid.logs.ros.messages import Decoder, Flag, Imu, JointStates, Odometry, Wrench, deserializer
+from torchid.logs.ros.series import Rows, Series
+from torchid.logs.ros.storage import Channel, open_bag_file
+from torchid.logs.ros.topics import ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
+
+_EVENT = "contact_active"
+#: Messages between two reports of progress, and topics that a message lists.
+_REPORT_EVERY, _LISTED = 1000, 30
+
+
+@dataclass
+class _Bag:
+    """A bag with what its topics are used for; several roles may share a topic."""
+
+    source: str
+    topics: Topics
+    channels: Mapping[str, Channel]
+    decoders: dict[str, Decoder] = field(default_factory=dict)
+    rows: dict[str, Rows] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Look every topic up."""
+        for role, topic in self.topics.by_role.items():
+            if topic.topic is None:
+                continue
+            name, place = topic.topic, f"logs.topics.{role}"
+            if name not in self.channels:
+                raise UnknownNameError(self.source, place, name, self.channels)
+            decoder, given = _decoder(self.source, topic), self.channels[name].type
+            if given not in decoder.types:
+                raise LogError(self.source, place, f"{name} carries {given}", " or ".join(decoder.types))
+            self.decoders[role], self.rows[role] = decoder, Rows(self.source, name, decoder)
+
+
+def read_bag(
+    path: Path, topics: Topics | None, progress: Callable[[float], None] | None = None
+) -> dict[str, NDArray[Any]]:
+    """The fields of a log file, from a bag.
+
+    Args:
+        path: a .bag, .mcap or .db3 file, or the folder of several.
+        topics: which hold what.
+        progress: called with the share that has been read.
+
+    Raises:
+        LogError: the bag is damaged, or its messages do not make up a log.
+        UnknownNameError: it has no such topic.
+
+    Warns:
+        TorchidWarning: messages without stamps, messages that come twice, channels that are NaN in part.
+    """
+    source, files = str(path), bag_files(path)
+    if topics is not None:
+        check_topics(source, topics)
+    channels: dict[str, Channel] = {}
+    for file in files:
+        with open_bag_file(file) as opened:
+            for channel in opened.channels():
+                first = channels.setdefault(channel.topic, channel)
+                if first != channel:
+                    found = f"both {first.type} and {channel.type}"
+                    raise LogError(source, channel.topic, found, "one type of message per topic")
+    if topics is None:
+        raise LogError(source, "logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
+    bag = _Bag(source, topics, channels)
+    _read(bag, files, progress or (lambda share: None))
+    series = {role: rows.series() for role, rows in bag.rows.items()}
+    unstamped = dict.fromkeys(x.topic for x in series.values() if not x.stamped)
+    if unstamped:
+        what = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
+        warnings.warn(f"{source}: {', '.join(unstamped)}: {what}", TorchidWarning, stacklevel=3)
+    sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
+    events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
+    clock = clock_of(source, sampled[topics.rate_topic], sampled, events)
+    return {
+        "time": clock.time,
+        **_motion(bag, clock, series),
+        **_contacts(bag, clock, series),
+        **_ft_sensors(bag, clock, series),
+    }
+
+
+def _listed(channels: Mapping[str, Channel]) -> str:
+    shown = [f"{name} ({channel.type})" for name, channel in list(channels.items())[:_LISTED]]
+    more = len(channels) - len(shown)
+    return (", ".join(shown) or "no topics") + (f", and {more} more" if more else "")
+
+
+def _decoder(source: str, topic: object) -> Decoder:
+    if isinstance(topic, JointTopic):
+        return JointStates(source, topic.topic, topic.joints)
+    if isinstance(topic, ImuTopic):
+        return Imu(source, topic.topic)
+    if isinstance(topic, OdometryTopic):
+        return Odometry(source, topic.topic, topic.twist)
+    return Wrench(source, topic.topic, topic.sign) if isinstance(topic, WrenchTopic) else Flag()
+
+
+def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> None:
+    """Decode every message of the topics in use."""
+    users: dict[str, list[Rows]] = {}
+    for rows in bag.rows.values():
+        users.setdefault(rows.topic, []).append(rows)
+    make = {topic: deserializer(bag.source, topic, bag.channels[topic]) for topic in users}
+    for i, file in enumerate(files):
+        with open_bag_file(file) as opened:
+            for n, record in enumerate(opened.records(users.keys())):
+                message = make[record.topic](record.data)
+                for rows in users[record.topic]:
+                    rows.add(message, record.received)
+                if n % _REPORT_EVERY == 0:
+                    progress((i + record.share) / len(files))
+
+
+def _motion(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+    """Joints, base and IMU."""
+    out: dict[str, NDArray[Any]] = {}
+    for role in ("joint_states", "odometry", "imu"):
+        if role in series:
+            out |= clock.aligned(series[role])
+        decoder = bag.decoders.get(role)
+        if isinstance(decoder, JointStates):
+            out["joint_names"] = np.array(decoder.names, dtype=np.str_)
+        elif isinstance(decoder, Imu) and bag.topics.imu is not None:
+            frame = bag.topics.imu.frame or decoder.frame.value.removeprefix("/")
+            if not frame:
+                accepted = "logs.topics.imu.frame, the frame of the URDF it sits at"
+                raise LogError(bag.source, bag.topics.imu.topic, "no header.frame_id", accepted)
+            out["imu_frame"] = np.array(frame)
+    return out
+
+
+def _contacts(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+    """Contacts in the order of `Topics.contacts`; NaN for the wrench of one without a topic."""
+    names = bag.topics.contacts
+    if not names:
+        return {}
+    active = np.stack([_active(bag, clock, series, name) for name in names], axis=1)
+    out: dict[str, NDArray[Any]] = {"contact_names": np.array(names), "contact_active": active}
+    if bag.topics.contact_wrenches:
+        nothing = np.full((len(clock.stamps), 6), np.nan)
+        wrenches = [_wrench(bag, clock, series, f"contact_wrenches.{name}", nothing) for name in names]
+        out["contact_wrench_local"] = np.stack(wrenches, axis=1)
+        for name, topic in bag.topics.contact_wrenches.items():
+            _check_frame(bag, f"contact_wrenches.{name}", topic.frame or name)
+    return out
+
+
+def _active(bag: _Bag, clock: Clock, series: Mapping[str, Series], name: str) -> NDArray[np.bool_]:
+    """Whether a contact touches, (N,), as was last said or as its force was last."""
+    if name in bag.topics.contact_active:
+        said = series.get(f"contact_active.{name}")
+        if said is None:
+            return np.ones(len(clock.stamps), dtype=np.bool_)
+        return clock.held(said, said.fields["active"])[:, 0] != 0.0
+    measured, threshold = series[f"contact_wrenches.{name}"], bag.topics.contact_force_threshold
+    with np.errstate(over="ignore"):  # infinite is above any threshold
+        force = np.linalg.norm(measured.fields["wrench"][:, :3], axis=1)
+    if np.isnan(force).any() or threshold is None:
+        accepted = "forces to compare with contact_force_threshold, or contact_active"
+        raise LogError(bag.source, measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
+    return clock.held(measured, force) > threshold
+
+
+def _wrench(
+    bag: _Bag, clock: Clock, series: Mapping[str, Series], role: str, nothing: FloatArray | None = None
+) -> FloatArray:
+    return clock.aligned(series[role])["wrench"] if nothing is None or role in series else nothing
+
+
+def _ft_sensors(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+    names = tuple(bag.topics.ft_wrenches)
+    if not names:
+        return {}
+    wrenches = [_wrench(bag, clock, series, f"ft_wrenches.{name}") for name in names]
+    for name, topic in bag.topics.ft_wrenches.items():
+        if topic.frame is not None:
+            _check_frame(bag, f"ft_wrenches.{name}", topic.frame)
+    return {"ft_names": np.array(names), "ft_wrench": np.stack(wrenches, axis=1)}
+
+
+def _check_frame(bag: _Bag, role: str, expected: str) -> None:
+    """Warn of wrenches in another frame than they are taken to be in: nothing here could transform them."""
+    decoder = bag.decoders[role]
+    if isinstance(decoder, Wrench) and decoder.frame.value.removeprefix("/") not in ("", expected):
+        what = f"in frame '{decoder.frame.value}', taken to be in '{expected}'"
+        message = f"{bag.source}: {bag.rows[role].topic}: {what}; logs.topics.{role}.frame says that this is meant"
+        warnings.warn(message, TorchidWarning, stacklevel=5)

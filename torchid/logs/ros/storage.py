@@ -1,0 +1,92 @@
+"""What the files of a bag have in common: channels, and records on them."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from torchid.errors import LogError
+from torchid.logs.container import translated
+from torchid.logs.limits import MAX_LETTERS
+from torchid.text import is_plain, shown
+
+#: Most bytes of one record. A camera's image has a few million, the chunk of messages around it hardly more.
+MAX_RECORD = 2**28
+
+
+def plain(text: str) -> str:
+    """A name out of a bag, ValueError where no name is like that and no message can show it."""
+    if len(text) > MAX_LETTERS or not is_plain(text):
+        raise ValueError(f"a name of {len(text)} characters: {shown(text)}")
+    return text
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What a topic carries: a message type such as `sensor_msgs/msg/Imu`, and how it is serialized (cdr, ros1)."""
+
+    topic: str
+    type: str
+    encoding: str
+
+    def __post_init__(self) -> None:
+        """Refuse what no message can show."""
+        for text in (self.topic, self.type, self.encoding):
+            plain(text)
+
+
+@dataclass(frozen=True)
+class Record:
+    """One message as it lies in the file: when it was received [ns], and the share of the file read up to it."""
+
+    topic: str
+    received: int
+    data: bytes
+    share: float
+
+
+class BagFile(Protocol):
+    """An open file of a bag."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+    def channels(self) -> list[Channel]:
+        """All topics, some of them perhaps several times."""
+
+    def records(self, topics: Collection[str]) -> Iterator[Record]:
+        """The messages of some topics, in any order."""
+
+
+@contextlib.contextmanager
+def open_bag_file(path: Path) -> Iterator[BagFile]:
+    """Open a .bag, .mcap or .db3 file.
+
+    Raises:
+        LogError: it is damaged, and so does what is read later; or its reader is not installed.
+    """
+    suffix = path.suffix.lower()
+    try:
+        import mcap.exceptions
+        import rosbags.rosbag1
+        import rosbags.serde
+        import zstandard
+    except ImportError as error:
+        found = f"a bag, but {error.name} is not installed"
+        raise LogError(path, "file", found, "pip install 'torchid[ros]'") from error
+    from torchid.logs.ros.mcap_file import McapFile
+    from torchid.logs.ros.ros1_file import Ros1File
+    from torchid.logs.ros.sqlite_file import SqliteFile
+
+    readers: dict[str, Callable[[Path], BagFile]] = {".bag": Ros1File, ".mcap": McapFile, ".db3": SqliteFile}
+    failures = (
+        mcap.exceptions.McapError, rosbags.rosbag1.ReaderError, rosbags.serde.SerdeError, zstandard.ZstdError,
+        sqlite3.Error, AssertionError, ArithmeticError, LookupError, AttributeError,
+    )  # fmt: skip
+    accepted = f"a complete {suffix} file of ROS messages"
+    with translated(str(path), "file", accepted, failures), contextlib.closing(readers[suffix](path)) as file:
+        yield file

@@ -1,0 +1,133 @@
+"""Which topics of a bag hold what: the `logs.topics` of an experiment file."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from torchid.errors import ConfigError, UnknownNameError
+
+_STRICT = ConfigDict(extra="forbid")
+_Name = Annotated[str, Field(min_length=1)]
+_Force = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+@dataclass(config=_STRICT, frozen=True)
+class JointTopic:
+    """`sensor_msgs/JointState`: `joints` are those to take, by default all of the first message."""
+
+    topic: _Name
+    joints: Annotated[list[_Name], Field(min_length=1)] | None = None
+
+
+@dataclass(config=_STRICT, frozen=True)
+class ImuTopic:
+    """`sensor_msgs/Imu`: `frame` is that of the URDF it sits at, by default the messages' `header.frame_id`."""
+
+    topic: _Name
+    frame: _Name | None = None
+
+
+@dataclass(config=_STRICT, frozen=True)
+class OdometryTopic:
+    """`nav_msgs/Odometry` of the base link: the frame its twist is expressed in, `none` to derive it from the pose."""
+
+    topic: _Name
+    twist: Literal["child", "world", "none"] = "child"
+
+
+@dataclass(config=_STRICT, frozen=True)
+class WrenchTopic:
+    """`geometry_msgs/WrenchStamped` or `Wrench`.
+
+    `sign` is -1 where it is the robot's action on the environment, or the child side's on the parent side. `frame` is
+    the `header.frame_id` to expect, by default the contact's frame.
+    """
+
+    topic: _Name
+    sign: Literal[1, -1] = 1
+    frame: _Name | None = None
+
+
+@dataclass(config=_STRICT, frozen=True)
+class ContactTopic:
+    """`std_msgs/Bool`, or a contact that is `always` active."""
+
+    topic: _Name | None = None
+    always: bool = False
+
+
+def _topic(value: object) -> object:
+    return {"topic": value} if isinstance(value, str) else value
+
+
+def _contact(value: object) -> object:
+    return {"always": True} if value is True else _topic(value)
+
+
+_Wrenches = dict[str, Annotated[WrenchTopic, BeforeValidator(_topic)]]
+_Contacts = dict[str, Annotated[ContactTopic, BeforeValidator(_contact)]]
+
+
+@dataclass(config=_STRICT, frozen=True, kw_only=True)
+class Topics:
+    """The topics of a bag; a name alone stands for a topic with default settings.
+
+    Attributes:
+        joint_states: positions, velocities and efforts.
+        imu: specific force and angular velocity.
+        odometry: pose and twist of the base link.
+        contact_wrenches: by contact, the environment's action on the robot at the contact frame, along its axes.
+        contact_active: by contact, whether it touches; those with a wrench may do without.
+        contact_force_threshold: [N], force above which a contact that is not in `contact_active` touches.
+        ft_wrenches: by fixed joint, what the parent side exerts on the child side, in the joint's child frame.
+        rate_topic: whose stamps the log takes: `joint_states`, `contact_wrenches.l_sole`, ...
+    """
+
+    joint_states: Annotated[JointTopic, BeforeValidator(_topic)]
+    imu: Annotated[ImuTopic, BeforeValidator(_topic)] | None = None
+    odometry: Annotated[OdometryTopic, BeforeValidator(_topic)] | None = None
+    contact_wrenches: _Wrenches = dataclasses.field(default_factory=dict)
+    contact_active: _Contacts = dataclasses.field(default_factory=dict)
+    contact_force_threshold: _Force | None = None
+    ft_wrenches: _Wrenches = dataclasses.field(default_factory=dict)
+    rate_topic: str = "joint_states"
+
+    @property
+    def by_role(self) -> dict[str, JointTopic | ImuTopic | OdometryTopic | WrenchTopic | ContactTopic]:
+        """The topics by their place, such as `imu` or `ft_wrenches.l_ankle_ft`."""
+        single = {"joint_states": self.joint_states, "imu": self.imu, "odometry": self.odometry}
+        several = {
+            f"{key}.{name}": topic
+            for key in ("contact_wrenches", "contact_active", "ft_wrenches")
+            for name, topic in getattr(self, key).items()
+        }
+        return {role: topic for role, topic in {**single, **several}.items() if topic is not None}
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """Names of all contacts."""
+        return tuple(dict.fromkeys((*self.contact_wrenches, *self.contact_active)))
+
+
+def check_topics(source: object, topics: Topics) -> None:
+    """Make sure that a map of topics says what it has to.
+
+    Raises:
+        ConfigError: a contact of which nothing says when it touches.
+        UnknownNameError: a rate topic that there is not.
+    """
+    for name, contact in topics.contact_active.items():
+        if (contact.topic is None) != contact.always:
+            accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
+            raise ConfigError(source, f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
+    unsaid = [name for name in topics.contact_wrenches if name not in topics.contact_active]
+    if unsaid and topics.contact_force_threshold is None:
+        found = f"missing, though nothing else says when {unsaid[0]} touches"
+        raise ConfigError(source, "logs.topics.contact_force_threshold", found, "a force [N], or contact_active")
+    stamped = [role for role in topics.by_role if not role.startswith("contact_active.")]
+    if topics.rate_topic not in stamped:
+        raise UnknownNameError(source, "logs.topics.rate_topic", topics.rate_topic, stamped)

@@ -1,0 +1,94 @@
+"""An overview of a log: all channels over time, with what the checks found in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, Checked
+from torchid.hygiene.channels import channel_names
+from torchid.logs import Log
+from torchid.logs.fields import FloatArray
+from torchid.report.figures import STYLE
+
+COLORS = {CONDEMNED: "tab:red", SUSPICIOUS: "tab:orange", NOTE: "tab:blue"}
+_ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0  # inches
+_POINTS = 2000
+_NARROW = 1.0 / 600.0  # of the width: a single sample of a long log is to be seen
+_RANGE = (0.5, 99.5)  # percentiles that fill a row
+
+
+@matplotlib.rc_context(STYLE | {"axes.grid": False})
+def hygiene_figure(logs: Sequence[Checked]) -> Figure:
+    """One panel per log, one row per channel, each scaled to its own range; findings are marked in their color."""
+    rows = [len(_rows(one.log)) for one in logs]
+    heights = [_ROW * count + _HEAD for count in rows]
+    figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
+    panels = figure.subplots(len(logs), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
+    for axes, one in zip(panels, logs, strict=True):
+        _panel(axes, one)
+    marks = [Patch(color=color, alpha=0.6, label=severity) for severity, color in COLORS.items() if severity != NOTE]
+    handles = [*marks, Line2D([], [], color="0.35", linewidth=0.8, label="channel")]
+    panels[0].legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+    return figure
+
+
+def _rows(log: Log) -> dict[tuple[str, str], FloatArray]:
+    """Channels in rows, by field and name; those that hold nothing are left out."""
+    rows = {}
+    for field in log.arrays():
+        if field == "time":
+            continue
+        flat = np.asarray(getattr(log, field), dtype=np.float64).reshape(len(log), -1)
+        for name, values in zip(channel_names(log, field), flat.T, strict=True):
+            if np.isfinite(values).any() and np.nanmax(np.abs(values)) > 0.0:
+                rows[field, name] = values
+    return rows
+
+
+def _panel(axes: Axes, checked: Checked) -> None:
+    log, rows = checked.log, _rows(checked.log)
+    time = log.time - log.time[0]
+    places = {channel: -row for row, channel in enumerate(rows)}
+    every = slice(None, None, max(1, len(time) // _POINTS))
+    lines = [
+        np.column_stack([time[every], _scaled(values)[every] + place])
+        for (values, place) in zip(rows.values(), places.values(), strict=True)
+    ]
+    axes.add_collection(LineCollection(lines, colors="0.35", linewidths=0.6))
+    for finding in checked.findings:
+        if finding.severity != NOTE:
+            for span in finding.spans:
+                inside = [
+                    place
+                    for (field, name), place in places.items()
+                    if finding.field in (field, "time") and span.channel in ("", name)
+                ]
+                _mark(axes, float(time[span.first]), float(time[span.last]), inside, time[-1], finding.severity)
+    axes.set(xlim=(time[0], max(time[-1], 1e-9)), ylim=(-len(rows) + 0.4, 0.6), xlabel="time [s]")
+    axes.set_yticks(list(places.values()), [f"{field} {name}" for field, name in places], fontsize=6)
+    axes.tick_params(axis="y", length=0)
+    axes.set_title(f"{Path(log.source).name}: {checked.verdict}", loc="left", fontsize=9, wrap=True)
+
+
+def _mark(axes: Axes, start: float, end: float, places: Sequence[int], lasts: float, severity: str) -> None:
+    width = max(end - start, _NARROW * lasts)
+    middle = 0.5 * (start + end)
+    for place in places:
+        axes.broken_barh(
+            [(middle - 0.5 * width, width)], (place - 0.5, 1.0), color=COLORS[severity], alpha=0.6, linewidth=0
+        )
+
+
+def _scaled(values: FloatArray) -> FloatArray:
+    """The values in a row of height 0.8, those beyond its range at the edge."""
+    low, high = np.nanpercentile(values, _RANGE)
+    return np.clip((values - low) / max(high - low, 1e-300), 0.0, 1.0) * 0.8 - 0.4

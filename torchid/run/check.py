@@ -1,0 +1,148 @@
+"""`torchid check`: hygiene of logs before they are fitted."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+
+from torchid.config import load_analysis
+from torchid.config.topics import load_topics
+from torchid.errors import ConfigError
+from torchid.hygiene import Checked, check
+from torchid.logs import Log, read_log
+from torchid.report.hygiene_figure import hygiene_figure
+from torchid.report.hygiene_tables import hygiene_document
+from torchid.robot import load_robot
+from torchid.run.experiment import set_up_scene
+from torchid.run.progress import progress_bars
+from torchid.sensing import Contact
+
+EXPERIMENTS = (".yaml", ".yml")
+FIGURES = (".png", ".pdf", ".svg")
+_WRENCH = (slice(0, 3), slice(3, 6))
+
+
+def check_files(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    urdf: str | Path | None = None,
+    base_link: str | None = None,
+    fixed_base: bool = False,
+    topics: str | Path | None = None,
+) -> list[Checked]:
+    """Check the logs of an experiment file, or one log; see `check_experiment` and `check_log`.
+
+    Raises:
+        ConfigError: options of the one with the other.
+    """
+    options = {"--urdf": urdf, "--base-link": base_link, "--fixed-base": fixed_base, "--topics": topics}
+    given = [name for name, value in options.items() if value]
+    if Path(path).suffix.lower() in EXPERIMENTS:
+        if given:
+            raise ConfigError("command line", given[0], "given with an experiment file", "overrides, robot.urdf=...")
+        return check_experiment(path, overrides)
+    if overrides:
+        found = f"{overrides[0]}, given with a log"
+        raise ConfigError("command line", "overrides", found, f"an experiment file ({', '.join(EXPERIMENTS)})")
+    if urdf is None and (base_link or fixed_base):
+        raise ConfigError("command line", given[0], "given without a robot", "--urdf too")
+    return [check_log(path, urdf, base_link, fixed_base, topics)]
+
+
+def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Checked]:
+    """Check all logs of an experiment file against its robot and contacts.
+
+    Raises:
+        InputError: whatever in the file does not fit the robot, or a log that cannot be read.
+    """
+    config = load_analysis(path, overrides)
+    if config.logs is None:
+        raise ConfigError(path, "logs", "missing", "logs to check")
+    scene = set_up_scene(config, path)
+    files = [*config.logs.train, *config.logs.validation, *config.logs.test]
+    found = []
+    with progress_bars() as bars:
+        for file in bars.track(files, description="checking"):
+            log = read_log(file, config.logs.topics)
+            found.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
+    return found
+
+
+def check_log(
+    path: str | Path,
+    urdf: str | Path | None = None,
+    base_link: str | None = None,
+    fixed_base: bool = False,
+    topics: str | Path | None = None,
+) -> Checked:
+    """Check one log, by itself or against a robot.
+
+    Args:
+        path: the log.
+        urdf: the robot; None: what needs it is skipped.
+        base_link: as in an experiment file.
+        fixed_base: likewise.
+        topics: experiment file whose `logs.topics` says what the topics of a bag hold.
+
+    Raises:
+        InputError: the log or the URDF cannot be read.
+    """
+    log = read_log(path, None if topics is None else load_topics(topics))
+    if urdf is None:
+        return check(log)
+    robot = load_robot(urdf, base_link, fixed_base, log.ft_names)
+    for name in log.contact_names:
+        robot.link(name, "contact_names", log.source)
+    return check(log, robot, [_contact(log, index) for index in range(len(log.contact_names))])
+
+
+def _contact(log: Log, index: int) -> Contact:
+    """A contact of a log without an experiment file: a point if forces without any moment were measured."""
+    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    force, moment = (False, True) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
+    return Contact(log.contact_names[index], "point" if force and not moment else "flat")
+
+
+def check_outputs(document: str | None, figure: str | None) -> None:
+    """Make sure, before any work, that files can be written there.
+
+    Raises:
+        ConfigError: another extension, a folder in the way, or no folder to write to.
+    """
+    for option, name, accepted in (("--json", document, (".json",)), ("--figure", figure, FIGURES)):
+        if name is None:
+            continue
+        path = Path(name)
+        if path.suffix.lower() not in accepted:
+            raise ConfigError("command line", option, f"'{name}'", f"a file name that ends in {', '.join(accepted)}")
+        if os.path.isdir(path) or not os.path.isdir(path.parent):
+            raise ConfigError("command line", option, f"'{name}', no file in an existing folder", "a file name")
+
+
+def write_outputs(checked: Sequence[Checked], document: str | None, figure: str | None) -> None:
+    """Write all findings as JSON and an overview as a figure, each complete or not at all."""
+    if document is not None:
+        with _new_file(Path(document)) as new:
+            new.write_text(json.dumps(hygiene_document(checked), indent=1, allow_nan=False) + "\n")
+    if figure is not None:
+        with _new_file(Path(figure)) as new:
+            hygiene_figure(checked).savefig(new, dpi=130, format=Path(figure).suffix[1:].lower())
+
+
+@contextmanager
+def _new_file(path: Path) -> Iterator[Path]:
+    """A temporary file that takes the place of `path` when the block ends without an error."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        raise ConfigError(path, "file", f"cannot be written ({error.strerror})", "a writable folder") from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
