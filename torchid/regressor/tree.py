@@ -68,7 +68,8 @@ class KinematicTree(nn.Module):
         in_parent: Array = np.asarray(np.linalg.inv(joint_frame[self.parents]) @ T_parent_joint @ joint_frame, float)
         in_parent[0] = np.eye(4)
         self.T_parent_joint: Array = in_parent
-        self.T_joint_link: Array = np.asarray(np.linalg.inv(joint_frame) @ np.stack([node.T_joint_link for node in nodes]))
+        T_joint_link = np.stack([node.T_joint_link for node in nodes])
+        self.T_joint_link: Array = np.asarray(np.linalg.inv(joint_frame) @ T_joint_link)
 
         is_ancestor = np.eye(count)
         depth = np.zeros(count, dtype=int)

@@ -15,7 +15,6 @@ from torchid.errors import TorchidWarning, UnknownNameError, UrdfError
 from torchid.parameters import Array
 from torchid.robot.urdf import MAX_NUMBER, MOVING_TYPES
 
-
 FT_FIELD = "force/torque sensor at a fixed joint"
 
 
