@@ -12,7 +12,7 @@ test: .venv/ready-for-tests
 	.venv/bin/ruff format --check torchid scripts tests
 	.venv/bin/mypy
 	.venv/bin/lint-imports
-	.venv/bin/pytest
+	.venv/bin/pytest -n auto --dist loadfile
 
 clean:
 	rm -rf .venv

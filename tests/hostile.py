@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import resource
 import signal
 import sys
+import tempfile
 import time
 import warnings
 from collections import Counter
@@ -14,11 +16,12 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning
 from torchid.text import is_plain
 
-SECONDS = 5.0
+SECONDS, WAITING = 5.0, 30.0  # of work, which other processes do not prolong; and until a case that waits is given up
 BYTES = 2**30
 LONGEST_LINE = 3000
 _ADDRESS_SPACE = 6 * 2**30  # what a case may reserve beyond what there is: keeps the machine alive if a bomb goes off
@@ -27,6 +30,7 @@ _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod")
 _RUNS = ("os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "pickle.find_class")
 _CALLS = ("socket.connect", "socket.getaddrinfo", "urllib.Request", "ftplib.connect", "http.client.connect")
+_OURS = "|".join(kind.__name__ for kind in (TorchidWarning, *TorchidWarning.__subclasses__()))
 _HARMLESS = (TorchidWarning, DeprecationWarning, PendingDeprecationWarning)
 
 
@@ -41,7 +45,7 @@ class Verdict:
     name: str
     outcome: str = "accepted"
     message: str = ""
-    seconds: float = 0.0
+    seconds: float = 0.0  # of work
     growth: int = 0
     faults: list[str] = field(default_factory=list)
 
@@ -83,6 +87,8 @@ class _Watch:
             path, _, flags = arguments
             if isinstance(flags, int) and flags & _WRITING and not self._may(path):
                 self.events.append(f"opened {path} for writing")
+        elif event == "os.mkdir" and os.path.isdir(str(arguments[0])):
+            pass  # which changes nothing
         elif event in _CHANGES and not self._may(*_with_folder(event, arguments)):
             self.events.append(f"{event} {arguments[0]}")
         elif event in _RUNS or event in _CALLS:
@@ -119,9 +125,14 @@ def judged(name: str, call: Callable[[], object], folder: Path, may_write: Itera
     before, printed = _listing(folder, allowed), io.StringIO()
     _watch.events.clear()
     _watch.allowed = allowed
-    rested, start = _resting(), time.perf_counter()
+    rested, start = _resting(), time.process_time()
     try:
-        with _limits(), warnings.catch_warnings(record=True) as caught, redirect_stdout(io.StringIO()):
+        with (
+            _limits(),
+            _elsewhere(folder),
+            warnings.catch_warnings(record=True) as caught,
+            redirect_stdout(io.StringIO()),
+        ):
             warnings.simplefilter("always")
             with redirect_stderr(printed):
                 _watch.on = True
@@ -134,9 +145,9 @@ def judged(name: str, call: Callable[[], object], folder: Path, may_write: Itera
         verdict.faults.append(f"raised {type(error).__name__}: {str(error)[:300]}")
     finally:
         _watch.on = False
-        verdict.seconds = time.perf_counter() - start
+        verdict.seconds = time.process_time() - start
         verdict.growth = max(0, _peak() - rested)
-    verdict.faults += _watch.events
+    verdict.faults += dict.fromkeys(_watch.events)
     verdict.faults += [f"warned {w.category.__name__}: {w.message}" for w in caught if _is_foreign(w)]
     verdict.faults += [f"warned {w.message!r}" for w in caught if not is_plain(str(w.message))]
     verdict.faults += [f"left {path}" for path in sorted(_listing(folder, allowed) ^ before)]
@@ -144,13 +155,31 @@ def judged(name: str, call: Callable[[], object], folder: Path, may_write: Itera
     return verdict
 
 
+def examined(
+    kind: str,
+    cases: Iterable[tuple[str, Any]],
+    call: Callable[[Any], object],
+    folder: Path,
+    may_write: Iterable[Path] = (),
+) -> Tally:
+    """Every case of a kind, given to a call; asserts that nothing went wrong and prints what became of them."""
+    tally, allowed = Tally(kind), tuple(may_write)
+    for name, case in cases:
+        tally.verdicts.append(judged(name, lambda case=case: call(case), folder, allowed))
+    print(tally)
+    assert not tally.faults, "\n".join(tally.faults[:20])
+    return tally
+
+
 def _settle(verdict: Verdict, status: object, printed: io.StringIO) -> None:
     """Take a command's exit status and what it said on standard error, warnings aside."""
-    lines = [line for line in printed.getvalue().splitlines() if "Warning: " not in line.split(": /")[0]]
+    lines = [line for line in printed.getvalue().splitlines() if not re.match(rf"torchid: ({_OURS}): ", line)]
     if not isinstance(status, int) or isinstance(status, bool):
         return
     verdict.outcome = {0: "accepted", 1: "failed", 2: "refused"}[status]
     verdict.message = "\n".join(lines)
+    if not status and lines:
+        verdict.faults.append(f"said {verdict.message[:200]!r}")
     if status == 1:
         verdict.faults.append(f"exit status 1: {verdict.message[:300]}")
     if status and not verdict.message.startswith("torchid: "):
@@ -188,6 +217,19 @@ def _listing(folder: Path, allowed: list[str]) -> set[tuple[str, int, int]]:
 
 
 @contextmanager
+def _elsewhere(folder: Path) -> Iterator[None]:
+    """Work in the folder, and make temporary files in it too, so that both are seen."""
+    before, temporary = os.getcwd(), tempfile.tempdir
+    os.chdir(folder)
+    tempfile.tempdir = str(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+        tempfile.tempdir = temporary
+
+
+@contextmanager
 def _limits() -> Iterator[None]:
     """Stop what takes too long, and fail what wants too much memory."""
 
@@ -198,15 +240,18 @@ def _limits() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (bytes_, hard))
 
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    before = signal.signal(signal.SIGALRM, too_slow)
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    timers = {signal.ITIMER_PROF: (signal.SIGPROF, SECONDS), signal.ITIMER_REAL: (signal.SIGALRM, WAITING)}
+    before = {number: signal.signal(number, too_slow) for number, _ in timers.values()}
+    for timer, (_, seconds) in timers.items():
+        signal.setitimer(timer, seconds)
     limited(_kilobytes("VmSize:") * 1024 + _ADDRESS_SPACE if _STATUS.exists() else soft)
     try:
         yield
     finally:
         limited(soft)
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        for timer, (number, _) in timers.items():
+            signal.setitimer(timer, 0.0)
+            signal.signal(number, before[number])
 
 
 def _resting() -> int:

@@ -304,7 +304,7 @@ def _comment(path: Path) -> None:
 _ARCHIVES: dict[str, Callable[[Path], None]] = {
     "a name twice": _twice,
     "a name with and without suffix": _also_without_suffix,
-    "a bomb of 250 MiB": _bomb(250),
+    "a bomb of 60 MiB": _bomb(60),
     "a bomb of 2 GiB": _bomb(2048),
     "a bomb that declares 1 byte": _bomb(1024, 1),
     "a bomb that declares what fits": _bomb(1024, 640 + 128),

@@ -6,6 +6,7 @@ import io
 import pickle
 import zipfile
 from collections import OrderedDict
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +75,8 @@ def _documents(whole: str) -> dict[str, str | bytes]:
 # ---------------------------------------------------------------------------------------------------------- checkpoints
 
 
-def checkpoints(path: Path, count: int, seed: int) -> Cases:
-    """Versions of a valid checkpoint, which is left as it was."""
+def checkpoints(path: Path, count: int, seed: int, share: int = 1) -> Cases:
+    """Versions of a valid checkpoint, which is left as it was; every so manieth of those with one value changed."""
     whole = path.read_bytes()
     state = torch.load(io.BytesIO(whole), weights_only=True)
     try:
@@ -85,10 +86,9 @@ def checkpoints(path: Path, count: int, seed: int) -> Cases:
         for name, other in _states(state).items():
             torch.save(other, path)
             yield name, path
-        for place in _places(state):
-            for value in VALUES:
-                torch.save(_with(state, place, value), path)
-                yield f"{'.'.join(map(str, place))} = {str(value)[:30]}", path
+        for place, value in islice(product(_places(state), VALUES), 0, None, share):
+            torch.save(_with(state, place, value), path)
+            yield f"{'.'.join(map(str, place))} = {str(value)[:30]}", path
         rng = np.random.default_rng(seed)
         for number in range(count):
             kind, content = mutated(whole, rng)
@@ -117,7 +117,9 @@ def _files(whole: bytes) -> dict[str, bytes]:
         "a compressed bomb": _archive({"archive/data.pkl": bytes(2 * 10**8), "archive/version": b"3"}, 8),
         "entries that climb": _archive({"../../x/data.pkl": evil, "../../x/version": b"3"}),
         "20000 entries": _archive({f"archive/{k}": b"" for k in range(20_000)}),
-        "a large array of bytes": _archive({"a/data.pkl": b"cbuiltins\nbytearray\n(I4000000000\ntR.", "a/version": b"3"}),
+        "a large array of bytes": _archive(
+            {"a/data.pkl": b"cbuiltins\nbytearray\n(I4000000000\ntR.", "a/version": b"3"}
+        ),
         "endless tuples": _archive({"a/data.pkl": b"\x80\x02" + b"(" * 10**5 + b"t" * 10**5 + b".", "a/version": b"3"}),
         "a long number": _archive({"a/data.pkl": b"\x80\x02\x8b" + b"\xff\xff\xff\x7f" + b"1.", "a/version": b"3"}),
         "a name of os": _archive({"a/data.pkl": b"cos\nsystem\n(S'touch pwned'\ntR.", "a/version": b"3"}),
@@ -153,7 +155,8 @@ def _states(state: dict[str, Any]) -> dict[str, Any]:
         "a key too many": state | {"x": 1},
         "keys that are numbers": {1: 2},
         "a deep list": state | {"logs": deep},
-        "settings that laugh": state | {"config": "a: &a [1, 2]\n" + "".join(f"b{k}: &b{k} [*a, *a]\n" for k in range(9))},
+        "settings that laugh": state
+        | {"config": "a: &a [1, 2]\n" + "".join(f"b{k}: &b{k} [*a, *a]\n" for k in range(9))},
         "settings that multiply": state | {"config": _laughs()},
         "settings with a tag": state | {"config": "a: !!python/object/apply:os.system ['touch pwned']"},
         "a tensor that is expanded": state | {"logs": torch.zeros(1).expand(10**12)},

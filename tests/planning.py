@@ -34,7 +34,7 @@ class Machine:
     """Chains of joints, each from a named link, with contacts and the states they touch in.
 
     A chain `{"leg": ("base", ("x", "slide z", RANDOM))}` has links leg1, leg2, ... at random poses; but "y" turns
-    nothing and stays in the plane, so that a chain of these is planar.
+    nothing and stays in the plane, so that a chain of these is planar. A "weld" can carry a force/torque sensor.
     """
 
     chains: dict[str, tuple[str, tuple[str, ...]]]
@@ -45,7 +45,7 @@ class Machine:
     mimics: dict[str, str] = field(default_factory=dict)
 
     def robot(self, folder: Path) -> Robot:
-        rng, parts = np.random.default_rng(self.seed), [link("base")]
+        rng, parts, welds = np.random.default_rng(self.seed), [link("base")], list[str]()
         for name, (parent, axes) in self.chains.items():
             for place, kind in enumerate(axes, start=1):
                 child, planar = f"{name}{place}", "y" in kind
@@ -56,10 +56,11 @@ class Machine:
                 extra += f'<origin xyz="{numbers(offset)}" rpy="{turned}"/><axis xyz="{axis}"/>'
                 if child in self.mimics:
                     extra += f'<mimic joint="{self.mimics[child]}" multiplier="-0.7"/>'
-                sliding = "prismatic" if kind.startswith("slide") else "revolute"
+                sliding = "fixed" if kind == "weld" else "prismatic" if kind.startswith("slide") else "revolute"
                 parts += [link(child), joint(f"j_{child}", parent, child, sliding, extra)]
+                welds += [f"j_{child}"] if kind == "weld" else []
                 parent = child
-        return load(write(folder, *parts))
+        return load(write(folder, *parts), ft_joints=welds)
 
 
 def numbers(x: np.ndarray) -> str:
@@ -79,7 +80,7 @@ def sees_the_base(
     oracle, result = Oracle.of(robot), np.ones(len(sets), dtype=bool)
     for number, state in enumerate(states):
         q = random_states(np.random.default_rng(number), robot.n, 1)[0]
-        torque = np.eye(robot.nv)[6:]
+        torque = np.eye(6 + robot.dofs)[6:]
         rows = [(c, k) for c, active in enumerate(state) if active for k in contacts[c].components]
         J = {c: oracle.jacobian(q, contacts[c].frame)[0] for c in {c for c, _ in rows}}
         A = np.vstack([torque, *(J[c][[k]] for c, k in rows)])
@@ -113,7 +114,7 @@ def minimal_of(sufficient: np.ndarray, choice: Sequence[Candidate]) -> set[froze
 
 def axes_and_devices(machine: Machine, robot: Robot, costs: dict[str, float] | None = None) -> tuple[Candidate, ...]:
     """The machine's candidates."""
-    return candidates(robot, machine.contacts, per=machine.per, costs=costs)
+    return candidates(robot, machine.contacts, per=machine.per, costs=costs, ft_sensors=robot.ft_names)
 
 
 SIX = (RANDOM,) * 6
@@ -161,6 +162,31 @@ MACHINES = {
     "a wheel on a line": Machine({"leg": ("base", SIX)}, (Contact("leg6", "line", "y"),), states_of("1")),
     "a slide": Machine(
         {"leg": ("base", ("slide z", "x", "slide x", "slide y"))}, (Contact("leg4", "flat"),), states_of("1")
+    ),
+    "a sensor in the ankle": Machine(
+        {"leg": ("base", (RANDOM, RANDOM, RANDOM, "weld", RANDOM, RANDOM))},
+        (Contact("leg6", "flat"),),
+        states_of("1"),
+        "device",
+    ),
+    "a sensor in the ankle, axis by axis": Machine(
+        {"leg": ("base", (RANDOM, RANDOM, "weld", RANDOM))}, (Contact("leg4", "point"),), states_of("1")
+    ),
+    "sensors in two limbs and in the trunk that they share": Machine(
+        {
+            "trunk": ("base", (RANDOM, "weld", RANDOM)),
+            "left": ("trunk3", (RANDOM, "weld")),
+            "right": ("trunk3", ("weld", RANDOM)),
+        },
+        (Contact("left2", "point"), Contact("right2", "line")),
+        states_of("11", "10", "01"),
+        "device",
+    ),
+    "a weld alone between base and toes": Machine(
+        {"leg": ("base", ("weld",)), "toe": ("leg1", (RANDOM, RANDOM))},
+        (Contact("leg1", "point"), Contact("toe2", "point")),
+        states_of("11", "01"),
+        "device",
     ),
     "a joint that mimics another": Machine(
         {"leg": ("base", (RANDOM,) * 5)}, (Contact("leg5", "line"),), states_of("1"), mimics={"leg4": "j_leg2"}

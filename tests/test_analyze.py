@@ -341,3 +341,57 @@ def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
     assert scenario.plan.cost < len(TORQUES)
     assert set(analysis.accuracies) == {"proposed", "planned for logs"}
     assert {removal.base_rank for removal in scenario.plan.removals} == {None}
+
+
+WELDS = tuple(f"{leg}_sole" for leg in LEGS)
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
+def test_sensors_in_limbs_are_planned_named_and_drawn(experiment: Path) -> None:
+    """A dear knee: a three-axis reading of the lower leg's weld takes its place, and the proposal is checked."""
+    file = asked(
+        experiment,
+        sensors={"joint_torques": [*TORQUES[:-3]], "ft_sensors": [WELDS[-1]]},
+        analysis={
+            "candidates": {"contacts": "none", "ft_sensors": list(WELDS)},
+            "costs": {"joint_torque": 3.0, "ft_sensor": 1.0},
+            "exclude": [WELDS[0]],
+        },
+        output=str(experiment / "limbs"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    folder = experiment / "limbs.analysis"
+    (answer,) = json.loads((folder / "analysis.json").read_text())["scenarios"].values()
+    candidates = {c["name"]: c for c in answer["candidates"]}
+    assert [candidates[weld]["channels"] for weld in WELDS] == [6] * 4
+    assert set(answer["sensors"]) == {*TORQUES[:3], *WELDS[1:]}
+    assert (answer["cost"], answer["proven"]) == (27.0, True)
+    assert {check["random_postures"]["rank"] for check in answer["checks"] + answer["proposed"]} == {6}
+    assert answer["exclude"] == [WELDS[0]]
+    assert (folder / "sensors-all_contacts.png").stat().st_size > 10_000
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
+def test_a_fixed_joint_that_does_not_exist_is_looked_for_in_the_file(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = asked(experiment, analysis={"candidates": {"ft_sensors": ["front_left_soul"]}}, output=str(experiment / "x"))
+    assert main(["analyze", str(file)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(
+        f"torchid: {file}: analysis.candidates.ft_sensors: unknown name 'front_left_soul'; accepted: "
+    )
+    assert "front_left_sole" in line
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
+def test_a_weld_is_drawn_with_what_is_measured_in_it(experiment: Path) -> None:
+    robot = torchid.load_robot(experiment / "quadruped.urdf", ft_joints=WELDS[:2])
+    contacts = [torchid.Contact(foot, "point") for foot in FEET]
+    figure = tree_figure("", robot, contacts, [f"{WELDS[0]}.{k}" for k in ("fx", "mz")], {}, [])
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert f"{WELDS[0]}: fx, mz" in texts
+    assert WELDS[1] in texts
+    assert "sensor in a limb" in [text.get_text() for text in figure.legends[0].get_texts()]
+    plain = tree_figure("", torchid.load_robot(experiment / "quadruped.urdf"), contacts, [], {}, [])
+    assert "sensor in a limb" not in [text.get_text() for text in plain.legends[0].get_texts()]

@@ -193,7 +193,7 @@ def quadruped(samples: int = 400) -> Bench:
 # --------------------------------------------------------------------------------------------------------- repetitions
 
 
-@pytest.mark.parametrize("repetitions", [60, pytest.param(REPETITIONS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("repetitions", [40, pytest.param(REPETITIONS, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("share", [0.0, 0.05])
 @pytest.mark.parametrize("kind", LOSSES)
 def test_intervals_of_robust_fits_hold_the_truth_with_and_without_outliers(
@@ -207,14 +207,14 @@ def test_intervals_of_robust_fits_hold_the_truth_with_and_without_outliers(
         assert found.converged
     holds = covered(robust, arm.true)
     assert holds.shape == (repetitions, 10)
-    least = 0.93 if repetitions == REPETITIONS else 0.91
+    least = 0.93 if repetitions == REPETITIONS else 0.90
     assert least < holds.mean() < 0.5 * (least + 1.0) + 0.01
     known = robust[0].verdict == "identified"
     ratio = np.mean(np.var(phis(robust)[:, known], axis=0) / np.var(phis(plain)[:, known], axis=0))
     if share:
         assert ratio < 1.0 / 200.0, "14 times more accurate than least squares; measured: 20 and 22 times"
     else:
-        assert ratio < (1.08 if repetitions == REPETITIONS else 1.12), "on clean noise; measured: 1.03 to 1.06"
+        assert ratio < (1.08 if repetitions == REPETITIONS else 1.15), "on clean noise; measured: 1.03 to 1.06"
 
 
 def phis(estimates: list[Estimate]) -> Array:
@@ -390,32 +390,19 @@ def tampered(tmp_path: Path) -> Path:
     return folder / "quadruped.yaml"
 
 
-def identified(file: Path, *overrides: str) -> dict[str, object]:
-    """metrics.json."""
-    output = file.parent / "run"
-    assert main(["identify", str(file), f"output={output}", *overrides]) == 0
-    return dict(json.loads((output / "metrics.json").read_text()))
-
-
 @pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
-def test_a_run_says_how_its_robust_fit_went(tampered: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    metrics = identified(tampered, "estimator.robust=huber")
-    assert "of the weight kept" in capsys.readouterr().out
-    robust = metrics["robust"]
-    assert isinstance(robust, dict)
-    assert (robust["loss"], robust["tuning"], robust["converged"]) == ("huber", 1.345, True)
+def test_a_run_says_how_its_robust_fit_went_and_whether_it_settled(
+    tampered: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tampered.parent / "run"
+    assert main(["identify", str(tampered), f"output={output}", "estimator.robust={loss: tukey, passes: 1}"]) == 0
+    printed = capsys.readouterr()
+    assert "of the weight kept, 1 passes" in printed.out
+    assert "NumericalWarning: " in printed.err
+    assert "estimator.robust: not settled after 1 passes; accepted: more passes" in printed.err
+    robust = json.loads((output / "metrics.json").read_text())["robust"]
+    assert (robust["loss"], robust["tuning"], robust["passes"], robust["converged"]) == ("tukey", 4.685, 1, False)
     assert 0.9 < robust["mean_weight"] < 1.0
-    assert robust["passes"] > 2
-
-
-@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
-def test_too_few_passes_are_said_to_be_too_few(tampered: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    metrics = identified(tampered, "estimator.robust={loss: tukey, passes: 1}")
-    assert "NumericalWarning: " in (printed := capsys.readouterr().err)
-    assert "estimator.robust: not settled after 1 passes; accepted: more passes" in printed
-    robust = metrics["robust"]
-    assert isinstance(robust, dict)
-    assert not robust["converged"]
 
 
 @pytest.mark.parametrize(

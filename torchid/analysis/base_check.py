@@ -112,7 +112,7 @@ def check_set(
         return []
     builder, postures = RowBuilder(robot, contacts, sensors), postures or {}
     drawn = random_postures(robot, samples, np.random.default_rng(seed))
-    channels = candidates(robot, contacts, per="axis")
+    channels = candidates(robot, contacts, per="axis", ft_sensors=robot.ft_names)
     everything = tuple(dict.fromkeys((*channels, *choice)))
     mounted = chosen_from(contacts, sensors, channels)
     checks = []

@@ -14,7 +14,7 @@ from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import SensorNoise, SensorSet
 
-KINDS = ("joint_torque", "contact")
+KINDS = ("joint_torque", "contact", "ft_sensor")
 PER = ("device", "axis", "none")
 
 
@@ -22,22 +22,22 @@ PER = ("device", "axis", "none")
 class Candidate:
     """A sensor that may be chosen.
 
-    `kind`: one of `KINDS`. `joint`: place among the robot's independent joints, of a torque sensor. `contact`: place
-    among the contacts, and `components`: places in `COMPONENTS`, of a force/torque sensor. `name`: the joint; the
-    contact's frame for a whole device, "l_sole.fx" for one axis of it.
+    `kind`: one of `KINDS`. `dofs`: places among the robot's `dof_names` that a torque sensor, or a force/torque sensor
+    in a limb, reads. `contact`: place among the contacts, and `components`: places in `COMPONENTS`, of a force/torque
+    sensor there. `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it.
     """
 
     name: str
     kind: str
     cost: float
-    joint: int | None = None
+    dofs: tuple[int, ...] = ()
     contact: int | None = None
     components: tuple[int, ...] = ()
 
     @property
     def channels(self) -> int:
         """Numbers it reads."""
-        return len(self.components) or 1
+        return len(self.components) + len(self.dofs)
 
 
 def total_cost(chosen: Iterable[Candidate]) -> float:
@@ -51,15 +51,18 @@ def candidates(
     joint_torques: Sequence[str] | None = None,
     per: str = "device",
     costs: Mapping[str, float] | None = None,
+    ft_sensors: Sequence[str] = (),
 ) -> tuple[Candidate, ...]:
-    """All candidate sensors: joint torques in the robot's order, then the contacts'.
+    """All candidate sensors: joint torques in the robot's order, then the contacts', then those in limbs.
 
     Args:
         robot: the robot.
         contacts: where the environment can push; a sensor reads components that its contact can exert.
         joint_torques: joints that can carry a torque sensor; None for all.
         per: "device", one force/torque sensor per contact, "axis", one candidate per component, or "none" at contacts.
+            In limbs, too, a candidate per component with "axis".
         costs: by name of a candidate, or by kind and then per channel; 1 per channel by default.
+        ft_sensors: fixed joints that can carry a force/torque sensor, among those that the robot was loaded with.
 
     Raises:
         UnknownNameError: a joint, or a name in `costs`, that does not exist.
@@ -72,7 +75,7 @@ def candidates(
         if name not in robot.joint_names:
             raise UnknownNameError("sensors", "candidates.joint_torques", name, robot.joint_names)
     found = [
-        Candidate(name, "joint_torque", 1.0, joint=j) for j, name in enumerate(robot.joint_names) if name in chosen
+        Candidate(name, "joint_torque", 1.0, dofs=(j,)) for j, name in enumerate(robot.joint_names) if name in chosen
     ]
     for place, contact in enumerate(contacts):
         if per == "device":
@@ -83,7 +86,21 @@ def candidates(
                 Candidate(f"{contact.frame}.{name}", "contact", 1.0, contact=place, components=(k,))
                 for name, k in names
             ]
-    return _priced(found, costs or {})
+    return _priced([*found, *_in_limbs(robot, ft_sensors, per == "axis")], costs or {})
+
+
+def _in_limbs(robot: Robot, names: Sequence[str], by_axis: bool) -> list[Candidate]:
+    """Force/torque sensors at fixed joints, as devices or axis by axis."""
+    found = []
+    for name in names:
+        if name not in robot.ft_names:
+            raise UnknownNameError("sensors", "candidates.ft_sensors", name, robot.ft_names)
+        first = robot.n + 6 * robot.ft_names.index(name)
+        if by_axis:
+            found += [Candidate(robot.dof_names[k], "ft_sensor", 1.0, dofs=(k,)) for k in range(first, first + 6)]
+        else:
+            found.append(Candidate(name, "ft_sensor", 1.0, dofs=tuple(range(first, first + 6))))
+    return found
 
 
 def _priced(found: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[Candidate, ...]:
@@ -101,10 +118,9 @@ def sensor_set(
     robot: Robot, contacts: Sequence[Contact], chosen: Iterable[Candidate], noise: SensorNoise | None = None
 ) -> SensorSet:
     """The sensor set that measures what some candidates read, and nothing else."""
-    torque, wrench = np.zeros(robot.n, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
+    torque, wrench = np.zeros(robot.dofs, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
     for candidate in chosen:
-        if candidate.joint is not None:
-            torque[candidate.joint] = True
+        torque[list(candidate.dofs)] = True
         if candidate.contact is not None:
             wrench[candidate.contact, list(candidate.components)] = True
     return SensorSet(torque, wrench, noise or SensorNoise())
@@ -118,6 +134,5 @@ def chosen_from(
     return tuple(
         c
         for c in candidates
-        if (c.joint is None or sensors.torque[c.joint])
-        and (c.contact is None or wrench[c.contact, list(c.components)].all())
+        if sensors.torque[list(c.dofs)].all() and (c.contact is None or wrench[c.contact, list(c.components)].all())
     )

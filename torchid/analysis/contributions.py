@@ -36,7 +36,7 @@ class PartContribution(Contribution):
 
 @dataclass(frozen=True)
 class SensorContribution(Contribution):
-    """Of a sensor: `kind` is "joint torque" or "contact wrench", the latter with all its measured components."""
+    """Of a sensor: `kind` is "joint torque", "wrench in a limb" or "contact wrench", with all measured components."""
 
     kind: str
 
@@ -57,7 +57,7 @@ def contributions(
     logs: Sequence[Samples],
     builder: RowBuilder,
     problem: LinearProblem,
-    joint_names: Sequence[str],
+    dof_names: Sequence[str],
     rank_tolerance: float = 1e-10,
     done: Callable[[int], None] | None = None,
 ) -> Contributions:
@@ -70,7 +70,7 @@ def contributions(
         logs: bound logs.
         builder: of their rows.
         problem: of all parts; only its scales and what is free matter.
-        joint_names: of the robot.
+        dof_names: of the robot.
         rank_tolerance: as in `LeastSquares`.
         done: called with the number of samples worked through.
     """
@@ -84,7 +84,7 @@ def contributions(
         for groups in (_groups(parts, factors, [part.source for part in parts]), states)
     )
     information = sensor_information(logs, builder, done=done)
-    sensors = _sensors(information, directions, builder, joint_names)
+    sensors = _sensors(information, directions, builder, dof_names)
     return Contributions(Knowledge.of(everything**2), by_log, by_contact_state, sensors)
 
 
@@ -148,15 +148,17 @@ def _rank(values: Array, tolerance: float) -> int:
 
 
 def _sensors(
-    information: SensorInformation, directions: Array, builder: RowBuilder, joint_names: Sequence[str]
+    information: SensorInformation, directions: Array, builder: RowBuilder, dof_names: Sequence[str]
 ) -> list[SensorContribution]:
     def known(H: Array) -> Knowledge:
         return Knowledge.of(np.asarray(np.linalg.eigvalsh(directions.T @ H @ directions)))
 
     everything, out = known(information.total), []
     frames = [contact.frame for contact in builder.contacts]
+    limbs = [name.rpartition(".")[0] for name in dof_names[builder.tree.n :: 6]]
     for kind, names, lost in (
-        ("joint torque", joint_names, information.torques),
+        ("joint torque", dof_names, information.torques),
+        ("wrench in a limb", limbs, information.limbs),
         ("contact wrench", frames, information.wrenches),
     ):
         for place, H in lost.items():

@@ -7,6 +7,8 @@ components of the contacts' velocities at zero. That is
 
     range(J_b)  lies in  span{J_j : torque j measured} + span{e_r : component r measured}.
 
+A force/torque sensor in a limb is six motionless joints more, so that it contributes six vectors J_j.
+
 Every sensor is thus a few vectors of one linear space, and a set suffices if their span contains the target range(J_b).
 Contacts that share no joint have rows of their own in every J_j and e_r, so each connected group of contacts makes
 a demand of its own, the same in every contact state it appears in.
@@ -113,10 +115,11 @@ def demands(
     if joint_position is None:
         joint_position = random_postures(robot, 1, np.random.default_rng(seed))[0]
     builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, ()))
+    linking = {*range(robot.n), *(dof for candidate in candidates for dof in candidate.dofs)}
     J = builder.contact_jacobian(at_rest(joint_position[None], (False,) * len(contacts)))[0].numpy()
-    above = [frozenset(builder.columns.joints_above(body)) for body, _ in builder.frames]
+    above = [linking.intersection(builder.columns.joints_above(body)) for body, _ in builder.frames]
     groups = dict.fromkeys(group for state in states for group in _groups(above, state))
-    joints = {group: sorted(frozenset().union(*(above[place] for place in group))) for group in groups}
+    joints = {group: sorted(set().union(*(above[place] for place in group)) & set(range(robot.n))) for group in groups}
     return [_demand(group, tuple(joints[group]), contacts, J, candidates) for group in groups]
 
 
@@ -144,16 +147,17 @@ def _demand(
     J: Array,
     candidates: Sequence[Candidate],
 ) -> Demand:
-    """What a group demands, from the Jacobians of all contacts, (C, 6, nv)."""
+    """What a group demands, from the Jacobians of all contacts, (C, 6, nv + 6 F)."""
     rows = [(place, k) for place in group for k in contacts[place].components]
     J_group = np.stack([J[row] for row in rows])
     J_group /= np.linalg.norm(J_group[:, :6])
     vectors = {}
     for candidate in candidates:
-        if candidate.joint is not None:
-            x = J_group[:, [6 + candidate.joint]]
-            if np.linalg.norm(x) > TOLERANCE:
-                vectors[candidate] = x / np.linalg.norm(x)
+        if candidate.dofs:
+            x = J_group[:, [6 + dof for dof in candidate.dofs]]
+            length = np.linalg.norm(x, axis=0)
+            if (length > TOLERANCE).any():
+                vectors[candidate] = x[:, length > TOLERANCE] / length[length > TOLERANCE]
         elif candidate.contact in group:
             read = [rows.index((candidate.contact, k)) for k in candidate.components]
             vectors[candidate] = np.eye(len(rows))[:, read]

@@ -85,12 +85,12 @@ class SetRanking:
         J = builder.contact_jacobian(samples)
         base, owners, ways = builder.tree.base_rows, [], []
         for number, candidate in enumerate(self.candidates):
-            if candidate.joint is not None:
+            for dof in candidate.dofs:
                 way = J.new_zeros(len(samples), J.shape[-1])
-                way[:, base + candidate.joint] = 1.0
+                way[:, base + dof] = 1.0
                 ways.append(way)
                 owners.append(number)
-            elif candidate.contact is not None and state[candidate.contact]:
+            if candidate.contact is not None and state[candidate.contact]:
                 ways += [J[:, candidate.contact, k] for k in candidate.components]
                 owners += [number] * len(candidate.components)
         return owners, torch.stack(ways, dim=1) if ways else J.new_zeros(len(samples), 0, J.shape[-1])

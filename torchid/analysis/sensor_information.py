@@ -25,11 +25,13 @@ _CHUNK = 256  # samples whose rows are computed together
 class SensorInformation:
     """Information (columns, columns) of all sensors together, and what of it is lost without each.
 
-    `torques`: by place among the robot's joints; `wrenches`: by contact, with all its measured components.
+    `torques`: by place among the robot's joints; `limbs`: by place among its force/torque sensors in limbs, and
+    `wrenches`: by contact, each with all its measured components.
     """
 
     total: Array
     torques: Mapping[int, Array]
+    limbs: Mapping[int, Array]
     wrenches: Mapping[int, Array]
 
 
@@ -48,13 +50,16 @@ def sensor_information(
         most: samples, about, that stand for all.
         done: called with the number of samples worked through.
     """
-    joints = np.flatnonzero(builder.sensors.torque).tolist()
+    n, base = builder.tree.n, builder.tree.base_rows
+    joints = np.flatnonzero(builder.sensors.torque[:n]).tolist()
+    in_limbs = builder.sensors.torque[n:].reshape(-1, 6)
+    limbs = np.flatnonzero(in_limbs.any(axis=1)).tolist()
     components = measured_components(builder.contacts, builder.sensors)
     contacts = np.flatnonzero(components.any(axis=1)).tolist()
-    count, base = builder.width, builder.tree.base_rows
-    nv = base + len(builder.columns.joint_rows)
-    torques = torch.eye(nv, dtype=torch.float64, device=builder.device)[[base + joint for joint in joints]]
-    total = torch.zeros(1 + len(joints) + len(contacts), count, count, dtype=torch.float64, device=builder.device)
+    count, first = builder.width, 1 + len(joints) + len(limbs)
+    units = torch.eye(base + len(builder.columns.joint_rows), dtype=torch.float64, device=builder.device)
+    torques = units[[base + joint for joint in joints]]
+    total = torch.zeros(first + len(contacts), count, count, dtype=torch.float64, device=builder.device)
     for samples, state, stands_for in _spread(logs, most):
         weight = stands_for / samples.oversampling
         rows, W = builder.rows_by_sample(samples.to(builder.device), state)
@@ -62,17 +67,24 @@ def sensor_information(
         total[0] += information_in(K, weight)
         lost = (unit_readings(torques, W) @ K).transpose(0, 1)  # (joints, B, columns)
         total[1 : 1 + len(joints)].baddbmm_(lost.mT, lost, alpha=weight)
+        for place, limb in enumerate(limbs, start=1 + len(joints)):
+            C = units[(base + n + 6 * limb + np.flatnonzero(in_limbs[limb])).tolist()]
+            total[place] += information_in(_span(C.expand(len(samples), *C.shape), W) @ K, weight)
         if any(state[contact] for contact in contacts):
             J = builder.contact_jacobian(samples.to(builder.device))
-            for place, contact in enumerate(contacts, start=1 + len(joints)):
+            for place, contact in enumerate(contacts, start=first):
                 if state[contact]:
                     C = J[:, contact, np.flatnonzero(components[contact]).tolist()]
                     total[place] += information_in(_span(C, W) @ K, weight)
         if done is not None:
             done(len(samples))
     found = total.cpu().numpy()
-    wrenches = dict(zip(contacts, found[1 + len(joints) :], strict=True))
-    return SensorInformation(found[0], dict(zip(joints, found[1:], strict=False)), wrenches)
+    return SensorInformation(
+        found[0],
+        dict(zip(joints, found[1:], strict=False)),
+        dict(zip(limbs, found[1 + len(joints) :], strict=False)),
+        dict(zip(contacts, found[first:], strict=True)),
+    )
 
 
 def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State, float]]:

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 
+import numpy as np
+
+from torchid import parameters
 from torchid.analysis.candidates import Candidate, sensor_set
 from torchid.analysis.rank import structural_rank
 from torchid.analysis.structure import structural_problem, structural_samples
 from torchid.errors import SensorError
+from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 from torchid.problem.plan import State
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import SensorSet
+
+_UNSEEN = 1e-9  # a share of the largest column in units of the scales, or of unit columns, that is rounding
 
 
 class MotionStack:
@@ -21,6 +27,8 @@ class MotionStack:
 
     `rank(S_b V_x) = 6` in every sample suffices to reach every body. It is not necessary: what a sample loses of the
     base depends on its posture, and another sample may show it.
+
+    How inertia is split at a weld with a force/torque sensor does not count: no other sensor could tell.
     """
 
     def __init__(
@@ -42,12 +50,38 @@ class MotionStack:
 
     def rank(self, chosen: Iterable[Candidate]) -> int:
         """Independent combinations of inertial parameters that a set of sensors determines."""
-        return structural_rank(self.problem(sensor_set(self.robot, self.contacts, chosen), friction=False)).rank
+        problem = self.problem(sensor_set(self.robot, self.contacts, chosen), friction=False)
+        return structural_rank(problem).rank - _rank_of(_splits(self.robot), problem)
 
     @cached_property
     def full(self) -> int:
         """The rank with all candidates."""
         return self.rank(self.candidates)
+
+
+def _splits(robot: Robot) -> Array:
+    """Changes of all parameters, (12 L, M), that take inertia from the body before a weld and add it to that beyond."""
+    found = [np.zeros((robot.nominal.size, 0))]
+    for index, body in enumerate(robot.bodies):
+        joint = body.joint
+        if joint is None or joint.kind != "fixed" or body.massless or robot.bodies[joint.parent].massless:
+            continue
+        changes = np.zeros((*robot.nominal.shape, parameters.INERTIAL.stop))
+        changes[index, parameters.INERTIAL] = np.eye(parameters.INERTIAL.stop)
+        X = parameters.change_of_frame(joint.T_parent_joint @ joint.T_joint_link)
+        changes[joint.parent, parameters.INERTIAL] = -X
+        found.append(changes.reshape(robot.nominal.size, -1))
+    return np.hstack(found)
+
+
+def _rank_of(changes: Array, problem: LinearProblem) -> int:
+    """Rank of what a problem's rows see of some changes of its parameters, (P, M), each of the size of one of them."""
+    least = _UNSEEN * np.linalg.norm(problem.A * problem.scale, axis=0).max(initial=0.0)
+    sizes = (np.abs(changes) / problem.scale[:, None]).max(axis=0, initial=0.0)
+    columns = problem.A @ (changes / np.maximum(sizes, np.finfo(float).tiny))
+    norms = np.linalg.norm(columns, axis=0)
+    seen = columns[:, norms > least] / norms[norms > least]
+    return int(np.linalg.matrix_rank(seen, tol=_UNSEEN)) if seen.size else 0
 
 
 def sparse_set(

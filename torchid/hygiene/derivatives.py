@@ -24,7 +24,8 @@ FOLLOWS = 0.9
 #: Misfit above which other frames and orders are tried, and the share of it that one must leave to be the right one.
 WRONG, BETTER = 0.15, 0.3
 #: Ratios that have a name, and by which share they may be missed.
-NAMED = {-1.0: "the sign is reversed", 180.0 / np.pi: "it is in degrees", np.pi / 180.0: "{base} is in degrees"}
+ANGLES = {-1.0: "the sign is reversed", 180.0 / np.pi: "it is in degrees", np.pi / 180.0: "{base} is in degrees"}
+LENGTHS = {-1.0: "the sign is reversed", 1e3: "it is in mm", 1e-3: "{base} is in mm"}
 _CLOSE = 0.15
 _TINY = 1e-300
 _NAME = "velocities and accelerations against positions"
@@ -50,7 +51,7 @@ def judged(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -
     follows = np.abs(found.correlation) >= FOLLOWS  # so written, NaN does not follow
     lost = ~follows & np.isfinite(found.correlation)
     named = np.zeros(len(channels), bool)
-    for ratio, meaning in NAMED.items():
+    for ratio, meaning in (LENGTHS if name.startswith("base_linear") else ANGLES).items():
         here = follows & (np.abs(found.ratio / ratio - 1.0) < _CLOSE)
         if here.any():
             named |= here

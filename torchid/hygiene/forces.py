@@ -9,8 +9,9 @@ import numpy as np
 from torchid.errors import InputError
 from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped, listed
 from torchid.hygiene.mistakes import mistakes
-from torchid.hygiene.model import ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
+from torchid.hygiene.model import TRIED, ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
 from torchid.logs import Log
+from torchid.logs.fields import WRENCHES
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
@@ -18,8 +19,6 @@ from torchid.sensing import Contact
 WRONG = 0.4
 #: Share of the misfit that a mistake must leave to be the explanation.
 BETTER = 0.5
-#: A torque this many times larger or smaller than needed is no error of the model.
-SCALE = 3.0
 _NAME = "forces against the URDF"
 
 
@@ -56,8 +55,10 @@ def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: floa
     """The mistake that leaves the least misfit, if it leaves much less; else that nothing explains it."""
     best, least = None, BETTER * fit.misfit
     for mistake in mistakes(log):
+        if not _may_explain(mistake.field, fit):
+            continue
         try:
-            samples = bound(filtered(mistake.mended(log), cutoff), robot, contacts)
+            samples = bound(filtered(mistake.mended(log), cutoff), robot, contacts, TRIED)
         except InputError:  # a mended log may be too fast for the filter: then that was not the mistake
             continue
         found = model_fit(samples, robot, contacts).misfit
@@ -66,10 +67,18 @@ def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: floa
     apart = f"forces {_percent(fit.misfit)} apart from the URDF's"
     if best is None:
         text = f"{apart}, and no usual mistake explains it"
-        advice = "look at units, frames, the base link and the masses of the URDF"
+        advice = "look at units, frames, friction, the base link and masses of the URDF"
         return Finding("forces", SUSPICIOUS, "all", text, advice)
     text = f"{best.found}: {apart}, {_percent(least)} without this"
     return Finding("unit, sign or frame", CONDEMNED, best.field, text, best.advice)
+
+
+def _may_explain(field: str, fit: ModelFit) -> bool:
+    """Whether a field is to blame at all: torques and wrenches for their own misfit each, the motion for both."""
+    misfits = {"joint_torque": fit.of_torques, **dict.fromkeys(WRENCHES, fit.of_wrenches)}
+    if field in misfits:
+        return (misfits[field] or 0.0) > WRONG
+    return all(misfit is None or misfit > WRONG for misfit in misfits.values())
 
 
 def _percent(share: float) -> str:
@@ -78,13 +87,13 @@ def _percent(share: float) -> str:
 
 def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped]:
     names = np.array(robot.joint_names)[fit.joints]
-    reversed_ = fit.clear & (fit.gain < 0.0)
+    reversed_ = fit.wrong & (fit.gain < 0.0)
     if reversed_.any():
         chosen = [str(name) for name in names[reversed_]]
         gains = ", ".join(f"{gain:.2f}" for gain in fit.gain[reversed_][:4])
         text = f"{listed(chosen)}: reversed; factors that fit the URDF best: {gains}"
         yield Finding("sign", CONDEMNED, "joint_torque", text, "reverse these torques", tuple(chosen))
-    scaled = fit.clear & ~reversed_ & (np.abs(np.log(np.maximum(fit.gain, 1e-9))) > np.log(SCALE))
+    scaled = fit.wrong & ~reversed_
     if scaled.any():
         chosen = [str(name) for name in names[scaled]]
         gains = ", ".join(f"{gain:.3g}" for gain in fit.gain[scaled][:4])

@@ -21,19 +21,24 @@ from torchid.sensing import Contact, SensorSet, named_sensors
 
 #: Samples that are differentiated: all of a short log, `PIECES` evenly spread runs of a long one.
 DIFFERENTIATED, PIECES = 40000, 4
-#: Of these, evenly spread ones are compared.
-COMPARED = 800
+#: Of these, evenly spread ones are compared; fewer to see which of many mistakes explains what does not fit.
+COMPARED, TRIED = 800, 150
 #: Cutoff [Hz] where nobody asked for one: robots move below 5 Hz. At most this share of the sample rate.
 CUTOFF, _OF_RATE = 10.0, 0.2
 #: How much larger a torque's own part in the projected forces must be than what the model leaves of these, for its sign
 #: to be judged.
 CLEAR = 1.0
-#: The same where contact wrenches are known or there are none, for each joint's own row: a correlation of 0.9.
+#: A torque this many times larger or smaller than needed is no error of the model: friction that the URDF lacks makes
+#: up a factor of several, a gear 50 to 160.
+SCALE = 10.0
+#: As `CLEAR` for each joint's own row, where contact wrenches are known or there are none: a correlation of 0.9.
 CLEAR_ROW = 2.0
 #: Misfit of the base force from which on contact wrenches are not trusted to tell the sign of a torque.
 _TRUSTED = 0.3
+#: A torque [N m] that no sensor reads.
+NOTHING = 1e-9
 #: Singular values below this share of the largest count as that large: such combinations of torques tell nothing.
-_DEPENDENT, _TINY = 1e-12, 1e-300
+_DEPENDENT, _TINY = 1e-12, 1e-100
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +50,19 @@ class TorqueFit:
         gain: (m,) factor that each should be multiplied by.
         clear: (m,) bool, whether the gain can be told.
         misfit: size of what the torques as they are miss of the model's, over the size of the model's.
-        misfit_with_signs: as `misfit`, with torques reversed whose gain is clear and negative.
+        misfit_mended: as `misfit`, with torques multiplied by their gain where that is clear and not plausible.
     """
 
     joints: np.ndarray
     gain: FloatArray
     clear: BoolArray
     misfit: float
-    misfit_with_signs: float
+    misfit_mended: float
+
+    @property
+    def wrong(self) -> BoolArray:
+        """Joints (m,) whose torque is clearly reversed or of another size."""
+        return wrong_gains(self.gain, self.clear)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +77,28 @@ class ModelFit:
     base_moment: float | None
 
     @property
+    def of_torques(self) -> float | None:
+        """Misfit of the torques: single ones that are clearly wrong do not count, all of them do."""
+        fit = self.torque
+        if fit is None:
+            return None
+        return fit.misfit if fit.wrong.sum() >= fit.clear.sum() else fit.misfit_mended
+
+    @property
+    def of_wrenches(self) -> float | None:
+        """The larger misfit of what the contact wrenches do to the base."""
+        return max((part for part in (self.base_force, self.base_moment) if part is not None), default=None)
+
+    @property
     def misfit(self) -> float:
-        """Rms of all that there are; torques with their signs set right, unless all are reversed."""
-        parts = [self.base_force, self.base_moment]
-        if self.torque is not None:
-            all_reversed = self.torque.clear.any() and (self.torque.gain[self.torque.clear] < 0.0).all()
-            parts.append(self.torque.misfit if all_reversed else self.torque.misfit_with_signs)
-        known = [part for part in parts if part is not None]
+        """Rms of all that there are."""
+        known = [x for x in (self.of_torques, self.base_force, self.base_moment) if x is not None]
         return float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
+
+
+def wrong_gains(gain: FloatArray, clear: BoolArray) -> BoolArray:
+    """Which gains (m,) no error of a model can be, among those that are clear."""
+    return clear & ((gain < 0.0) | (np.abs(np.log(np.maximum(np.abs(gain), _TINY))) > np.log(SCALE)))
 
 
 def usual_cutoff(log: Log) -> float:
@@ -96,8 +120,8 @@ def filtered(log: Log, cutoff_hz: float) -> list[Log]:
         return [preprocess(log.select(slice(start, start + length)), cutoff_hz) for start in starts]
 
 
-def bound(logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact]) -> list[Samples]:
-    """Evenly spread samples of filtered logs.
+def bound(logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED) -> list[Samples]:
+    """About `count` evenly spread samples of filtered logs.
 
     Raises:
         InputError: they do not fit the robot.
@@ -105,7 +129,7 @@ def bound(logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact]) -> lis
     out = []
     for log in logs:
         samples = bind(log, robot, contacts)
-        out.append(samples[torch.linspace(0, len(samples) - 1, min(COMPARED // len(logs), len(samples))).long()])
+        out.append(samples[torch.linspace(0, len(samples) - 1, min(count // len(logs), len(samples))).long()])
     return out
 
 
@@ -114,7 +138,7 @@ def model_fit(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Conta
     measured = np.zeros(robot.n, dtype=bool)
     if all(part.torque is not None for part in samples):
         torque = np.concatenate([part.torque[:, : robot.n].numpy() for part in samples if part.torque is not None])
-        measured = np.isfinite(torque).all(axis=0) & (torque != 0.0).any(axis=0)
+        measured = np.isfinite(torque).all(axis=0) & (np.abs(torque) > NOTHING).any(axis=0)
     builder = RowBuilder(robot, contacts, _joints_only(robot, contacts, measured))
     forces = [force_series(builder, part, robot.nominal.flatten()[None]) for part in samples]
     acting, needed = np.concatenate([f[0] for f in forces]), np.concatenate([f[1][0] for f in forces])
@@ -165,13 +189,13 @@ def _projected_fit(
     norms = np.linalg.norm(A, axis=0)
     norms[norms == 0.0] = 1.0
     U, values, Vh = np.linalg.svd(A / norms, full_matrices=False)
-    inverse = Vh.T / np.maximum(values, _DEPENDENT * values.max(initial=_TINY))
+    inverse = Vh.T / np.maximum(values, max(_DEPENDENT * values.max(initial=0.0), _TINY))
     gain = inverse @ (U.T @ y) / norms
     own = norms / np.sqrt(np.square(inverse).sum(axis=1))  # what of each torque the others cannot make up for
     clear = own * np.abs(gain) > CLEAR * np.linalg.norm(y - A @ gain)
-    signs = np.where(clear & (gain < 0.0), -1.0, 1.0)
+    mended = np.where(wrong_gains(gain, clear), gain, 1.0)
     size = max(float(np.linalg.norm(y)), _TINY)
-    missed = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), signs))
+    missed = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), mended))
     return TorqueFit(joints, gain, clear, *missed)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,12 +33,11 @@ def turning(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
         if found is None:
             yield Skipped(_NAME, f"{field}: the log is too short")
             continue
-        mistaken = next(_mistakes(log.time, quat, omega, found.misfit), None) if found.misfit > WRONG else None
+        mistaken = next(_explaining(log.time, quat, omega, found.misfit), None) if found.misfit > WRONG else None
         if mistaken is None:
             yield from judged(found, field, "base_quat", ("x", "y", "z"))
         else:
-            what, advice, field = mistaken[0], mistaken[1], mistaken[2] or field
-            yield Finding("frame or order", CONDEMNED, field, what, advice)
+            yield Finding("frame or order", CONDEMNED, mistaken.field or field, mistaken.found, mistaken.advice)
 
 
 def _measured(log: Log, robot: Robot | None) -> Iterator[tuple[str, FloatArray]]:
@@ -55,23 +55,34 @@ def _omega(time: FloatArray, quat: FloatArray) -> FloatArray:
     return angular_velocity_base(quat, np.gradient(quat, time, axis=0))
 
 
-def _mistakes(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> Iterator[tuple[str, str, str]]:
-    """Usual mistakes that explain what does not fit: what was found, what to do, and the field to blame if another."""
-    swapped = sign_continuous(np.roll(quat, 1, axis=1))  # if x, y, z, w are really w, x, y, z the other way round
-    reread = sign_continuous(np.roll(quat, -1, axis=1))
-    inverse = quat * np.array([-1.0, -1.0, -1.0, 1.0])
+@dataclass(frozen=True, eq=False)
+class _Mistake:
+    """A usual mistake: what was found, what to do, the field to blame ("": omega), and what was meant."""
+
+    found: str
+    advice: str
+    field: str
+    quat: FloatArray
+    omega: FloatArray
+
+
+def _mistakes(quat: FloatArray, omega: FloatArray) -> Iterator[_Mistake]:
+    """Usual mistakes with an orientation (N, 4) and an angular velocity (N, 3)."""
+    frame = "fits in the {} frame, not in the {} frame"
+    yield _Mistake(frame.format("world", "base"), "call it ..._world", "", quat, rotate_back(quat, omega))
+    yield _Mistake(frame.format("base", "world"), "call it ..._base", "", quat, rotate(quat, omega))
     order = "the components' order is the other one: w first against w last"
-    trials = [
-        (quat, rotate_back(quat, omega), "fits in the world frame, not in the base frame", "call it ..._world", ""),
-        (quat, rotate(quat, omega), "fits in the base frame, not in the world frame", "call it ..._base", ""),
-        *(
-            (other, value, order, "rename base_quat_wxyz and base_quat_xyzw", "base_quat_xyzw")
-            for other in (swapped, reread)
-            for value in (omega, rotate_back(other, rotate(quat, omega)))
-        ),
-        (inverse, omega, "rotates world to base, not base to world", "give the inverse", "base_quat_xyzw"),
-    ]
-    for other, value, what, advice, field in trials:
-        found = compare(time, integral(time, _omega(time, other)), value)
+    for shift in (1, -1):
+        other = sign_continuous(np.roll(quat, shift, axis=1))
+        for value in (omega, rotate_back(other, rotate(quat, omega))):  # as it is, or as it was given in the world
+            yield _Mistake(order, "rename base_quat_wxyz and base_quat_xyzw", "base_quat_xyzw", other, value)
+    inverse = quat * np.array([-1.0, -1.0, -1.0, 1.0])
+    yield _Mistake("rotates world to base, not base to world", "give the inverse", "base_quat_xyzw", inverse, omega)
+
+
+def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> Iterator[_Mistake]:
+    """Mistakes that leave little of a misfit once they are taken back."""
+    for mistake in _mistakes(quat, omega):
+        found = compare(time, integral(time, _omega(time, mistake.quat)), mistake.omega)
         if found is not None and found.misfit < BETTER * misfit:
-            yield what, advice, field
+            yield mistake

@@ -10,7 +10,7 @@ from torchid.errors import LogError
 
 #: Bytes that the arrays of a file of any size may declare, and how many times its own size those of a larger one may:
 #: measured motion shrinks to half, time stamps to a tenth, and only zeros to a thousandth.
-MAX_SMALL, MAX_GROWTH = 256 * 2**20, 100
+MAX_SMALL, MAX_GROWTH = 64 * 2**20, 100
 
 #: Most arrays in a file, names in an array, and characters in a name.
 MAX_FIELDS, MAX_NAMES, MAX_LETTERS = 200, 10_000, 200

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
+import torch
+from torch import Tensor
+
+from torchid.logs.spill import Spill
 from torchid.parameters import Array
 from torchid.problem.extra_columns import dof_column, reading_column
 from torchid.problem.extras import Extra
 from torchid.problem.samples import Samples
 from torchid.regressor.tree import KinematicTree
+
+_IN_MEMORY, _ROWS = 2**30, 2**16  # bytes of a copy; rows that are copied at a time
 
 
 def calibrated(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
@@ -21,8 +29,7 @@ def calibrated(samples: Samples, extras: Sequence[Extra], values: Array, tree: K
         values: of each, (E,).
         tree: of the robot.
     """
-    torque = None if samples.torque is None else samples.torque.clone()
-    wrench = None if samples.wrench is None else samples.wrench.clone()
+    torque, wrench = (None if x is None else _copied(x, samples.source) for x in (samples.torque, samples.wrench))
     for extra, value in zip(extras, values.tolist(), strict=True):
         if extra.what not in ("offset", "scale"):
             continue
@@ -32,3 +39,13 @@ def calibrated(samples: Samples, extras: Sequence[Extra], values: Array, tree: K
             contact, axis = extra.contact
             wrench[:, contact, axis] -= value * reading_column(extra, samples, contact, axis)
     return replace(samples, torque=torque, wrench=wrench)
+
+
+def _copied(x: Tensor, source: str) -> Tensor:
+    """A copy, on the disk if it is large: so are the samples of a log larger than memory."""
+    if x.nbytes <= _IN_MEMORY:
+        return x.clone()
+    spill = Spill(source, Path(tempfile.gettempdir()))
+    for rows in x.split(_ROWS):
+        spill.append(rows.numpy())
+    return torch.from_numpy(spill.array())

@@ -41,8 +41,8 @@ class ForceSeries:
 
 
 @matplotlib.rc_context(STYLE)
-def force_figure(series: ForceSeries, joint_names: Sequence[str], base_rows: int, most: int = 6) -> Figure:
-    """Measured and predicted forces over time: the largest base force and moment, then the joints with most torque."""
+def force_figure(series: ForceSeries, dof_names: Sequence[str], base_rows: int, most: int = 6) -> Figure:
+    """Measured and predicted forces over time: the largest base force and moment, then the largest of the others."""
     rows = _rows_to_show(series, base_rows, most)
     figure = Figure(figsize=(9.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 1, sharex=True, squeeze=False)[:, 0]
@@ -52,8 +52,8 @@ def force_figure(series: ForceSeries, joint_names: Sequence[str], base_rows: int
         axis.plot(
             series.time, series.identified[:, row], color=_IDENTIFIED, linewidth=1.0, label="predicted, identified"
         )
-        force = row < base_rows and row < 3
-        name = BASE_ROWS[row] if row < base_rows else joint_names[row - base_rows]
+        name = BASE_ROWS[row] if row < base_rows else dof_names[row - base_rows]
+        force = row < min(base_rows, 3) or name.endswith((".fx", ".fy", ".fz"))
         axis.set_title(name, loc="left", fontsize=9)
         axis.set_ylabel("[N]" if force else "[N m]")
     if rows:

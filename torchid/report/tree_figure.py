@@ -14,9 +14,9 @@ from matplotlib.lines import Line2D
 from torchid.report.figures import STYLE
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
-from torchid.sensing import Contact
+from torchid.sensing import COMPONENTS, Contact
 
-_TORQUE, _WRENCH, _PLAIN, _LOADED = "tab:blue", "tab:green", "0.75", "0.3"
+_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = "tab:blue", "tab:green", "tab:purple", "0.75", "0.3"
 _COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4  # inches
 
 Place = tuple[float, int]
@@ -28,7 +28,7 @@ def tree_figure(
     title: str,
     robot: Robot,
     contacts: Sequence[Contact],
-    torques: Collection[str],
+    measured: Collection[str],
     wrenches: Mapping[str, Sequence[str]],
     constrained: Collection[str],
 ) -> Figure:
@@ -38,10 +38,11 @@ def tree_figure(
         title: of the figure.
         robot: the robot.
         contacts: those of the scenario.
-        torques: joints whose torque is measured.
+        measured: those of the robot's `dof_names` that are.
         wrenches: measured components by contact frame.
         constrained: joints between the base and a contact.
     """
+    constrained = {*constrained, *_loaded_welds(robot, contacts)}
     places = _places(robot, contacts)
     hanging = _contact_rows(robot, contacts, places)
     right = max(x for x, _ in places)
@@ -51,7 +52,7 @@ def tree_figure(
     axes = figure.subplots()
     for body, link in enumerate(robot.bodies):
         if link.joint is not None:
-            _draw_joint(axes, link.joint, places[link.parent], places[body], torques, constrained)
+            _draw_joint(axes, link.joint, places[link.parent], places[body], measured, constrained)
     for contact in contacts:
         body, _ = robot.link(contact.frame)
         _draw_contact(axes, contact, places[body], hanging[contact.frame], wrenches.get(contact.frame, ()))
@@ -60,8 +61,19 @@ def tree_figure(
     axes.set(xlim=(-0.15, right + 0.95), ylim=(deepest + 0.6, -0.6))
     axes.axis("off")
     figure.suptitle(title, x=0.01, ha="left")
-    figure.legend(handles=_legend(), loc="outside lower left", ncols=5, fontsize=7.5)
+    figure.legend(handles=_legend(bool(robot.ft_names)), loc="outside lower left", ncols=5, fontsize=7.5)
     return figure
+
+
+def _loaded_welds(robot: Robot, contacts: Sequence[Contact]) -> set[str]:
+    """Fixed joints that can carry a sensor, between the base and a contact."""
+    found = set()
+    for contact in contacts:
+        body, _ = robot.link(contact.frame)
+        while (joint := robot.bodies[body].joint) is not None:
+            found |= {joint.name} & set(robot.ft_names)
+            body = joint.parent
+    return found
 
 
 def _places(robot: Robot, contacts: Sequence[Contact]) -> list[Place]:
@@ -92,16 +104,20 @@ def _contact_rows(robot: Robot, contacts: Sequence[Contact], places: Sequence[Pl
 
 
 def _draw_joint(
-    axes: Axes, joint: BodyJoint, parent: Place, place: Place, torques: Collection[str], constrained: Collection[str]
+    axes: Axes, joint: BodyJoint, parent: Place, place: Place, readings: Collection[str], constrained: Collection[str]
 ) -> None:
     name = joint.name if joint.mimic is None else joint.mimic.master
-    loaded, measured = name in constrained, name in torques
+    weld = [k for k in COMPONENTS if f"{name}.{k}" in readings] if joint.kind == "fixed" else []
+    loaded, measured = name in constrained, bool(weld) or name in readings
     (x, y), turn = place, parent[1] + 0.5
     style: dict[str, Any] = {"color": _LOADED if loaded else _PLAIN, "linewidth": 2.2 if loaded else 1.4, "zorder": 0}
     axes.plot([parent[0], parent[0], x, x], [parent[1], turn, turn, y], **style)
-    face = _TORQUE if measured else "white"
-    axes.plot(x, y, "o", color=_TORQUE if measured else "0.5", markerfacecolor=face, markersize=7)
+    color, part = _LIMB if weld else _TORQUE, 0 < len(weld) < len(COMPONENTS)
+    face = color if measured else "white"
+    style = {"color": color if measured else "0.5", "markerfacecolor": face, "fillstyle": "left" if part else "full"}
+    axes.plot(x, y, "h" if joint.kind == "fixed" else "o", markersize=8 if joint.kind == "fixed" else 7, **style)
     label = joint.name if joint.mimic is None else f"{joint.name} (follows)"
+    label += f": {', '.join(weld)}" if part else ""
     _label(axes, label, place, measured, fontsize=6.5, color="black" if measured or loaded else "0.45")
 
 
@@ -119,14 +135,16 @@ def _label(axes: Axes, text: str, place: Place, bold: bool = False, **style: Any
     axes.annotate(text, place, (8, 0), textcoords="offset points", va="center", fontweight=weight, **style)
 
 
-def _legend() -> list[Line2D]:
+def _legend(welds: bool) -> list[Line2D]:
     def marker(shape: str, color: str, face: str, label: str) -> Line2D:
         return Line2D([], [], marker=shape, color=color, markerfacecolor=face, linestyle="none", label=label)
 
+    in_limbs = [marker("h", _LIMB, _LIMB, "sensor in a limb"), marker("h", "0.5", "white", "weld without")]
     return [
         marker("o", _TORQUE, _TORQUE, "joint torque measured"),
         marker("o", "0.5", "white", "not measured"),
         marker("D", _WRENCH, _WRENCH, "contact sensor"),
         marker("D", "0.5", "white", "contact without"),
         Line2D([], [], color=_LOADED, linewidth=2.2, label="constrained by contacts"),
+        *(in_limbs if welds else []),
     ]

@@ -175,7 +175,7 @@ def _numbers(path: Path, field: str, element: etree._Element, name: str, count: 
 
 
 def _vertices(urdf: Path, filename: str) -> Array:
-    """Vertices (N, 3) [m] of a mesh, in the unit that the file states, if it does; other files it names are not read."""
+    """Vertices (N, 3) [m] of a mesh, in the unit that the file states, if any; other files it names are not read."""
     kind, content = mesh_content(urdf, filename)
     if kind == "stl" and len(content) == _STL_HEAD + _FACE.itemsize * int.from_bytes(content[80:_STL_HEAD], "little"):
         return _checked(filename, np.frombuffer(content, _FACE, offset=_STL_HEAD)["corners"].reshape(-1, 3))

@@ -82,8 +82,8 @@ def _picture(scene: Scene, scenario: Scenario) -> Figure:
         contact.frame: [COMPONENTS[k] for k in np.flatnonzero(row)]
         for contact, row in zip(scene.contacts, sensors.wrench, strict=True)
     }
-    torques = [name for name, measured in zip(robot.joint_names, sensors.torque, strict=True) if measured]
+    measured = [name for name, taken in zip(robot.dof_names, sensors.torque, strict=True) if taken]
     constrained = [joint for branch in plan.branches if branch.constrained for joint in branch.joints]
     channels = sum(candidate.channels for candidate in plan.chosen)
     title = f"{scenario.name}: {channels} of {sum(c.channels for c in plan.question.candidates)} sensor channels"
-    return tree_figure(title, robot, used, torques, wrenches, constrained)
+    return tree_figure(title, robot, used, measured, wrenches, constrained)

@@ -12,13 +12,15 @@ import numpy as np
 
 from torchid.config import load_analysis
 from torchid.config.topics import load_topics
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, LogError
 from torchid.hygiene import Checked, check
 from torchid.logs import Log, read_log
+from torchid.logs.blocks import size_of
 from torchid.report.hygiene_figure import hygiene_figure
 from torchid.report.hygiene_tables import hygiene_document
 from torchid.robot import load_robot
 from torchid.run.experiment import set_up_scene
+from torchid.run.large_logs import GIGABYTE
 from torchid.run.progress import progress_bars
 from torchid.sensing import Contact
 
@@ -68,9 +70,18 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     found = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
+            _check_size(file, config.preprocessing.memory_gb)
             log = read_log(file, config.logs.topics)
             found.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
     return found
+
+
+def _check_size(path: Path, memory_gb: float) -> None:
+    """Refuse a log that is not in memory at once."""
+    size = size_of(path, GIGABYTE * memory_gb) / GIGABYTE
+    if size > memory_gb:
+        accepted = f"parts of the log, or a preprocessing.memory_gb above {size:.2g}"
+        raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
 
 
 def check_log(

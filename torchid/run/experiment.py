@@ -154,7 +154,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "exp
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise
-        raise UnknownNameError(source, "sensors.ft_sensors", error.name, error.valid) from error
+        raise UnknownNameError(source, _ft_field(config, error.name), error.name, error.valid) from error
     if not robot.nv:
         raise ConfigError(source, "robot", "a bolted base without a joint, which never moves", "a robot that can move")
     contacts = check_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
@@ -162,9 +162,17 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "exp
 
 
 def _ft_joints(config: ExperimentConfig | AnalyzeConfig) -> list[str]:
-    """Fixed joints that carry a force/torque sensor in some sensor set of the file."""
+    """Fixed joints that carry a force/torque sensor in some sensor set of the file, or could in one to be planned."""
     choices = [config.sensors, *config.analysis.compare.values()]
-    return list(dict.fromkeys(name for choice in choices for name in choice.ft_sensors))
+    planned = config.analysis.candidates.ft_sensors if isinstance(config, AnalyzeConfig) else []
+    return list(dict.fromkeys([*(name for choice in choices for name in choice.ft_sensors), *planned]))
+
+
+def _ft_field(config: ExperimentConfig | AnalyzeConfig, name: str) -> str:
+    """Where a file names a fixed joint."""
+    choices = {"sensors": config.sensors} | {f"analysis.compare.{key}": x for key, x in config.analysis.compare.items()}
+    named = (f"{place}.ft_sensors" for place, choice in choices.items() if name in choice.ft_sensors)
+    return next(named, "analysis.candidates.ft_sensors")
 
 
 def set_up(config: ExperimentConfig, source: object = "experiment") -> Experiment:

@@ -38,7 +38,9 @@ def asked(scene: Scene, source: object = "experiment") -> Asked:
     settings, config = scene.config.analysis, scene.config
     wanted = settings.candidates
     with placed(source):
-        offered = candidates(scene.robot, scene.contacts, wanted.joint_torques, wanted.contacts, settings.costs)
+        offered = candidates(
+            scene.robot, scene.contacts, wanted.joint_torques, wanted.contacts, settings.costs, wanted.ft_sensors
+        )
     proposal = None if config.sensors.empty else scene.sensors_of(config.sensors, source)
     keep, exclude = (_chosen(getattr(settings, field), field, offered, source) for field in ("keep", "exclude"))
     return Asked(scene, source, offered, keep, exclude, proposal, _named_sets(scene, proposal, source))
@@ -97,7 +99,7 @@ def _chosen(names: Sequence[str], field: str, offered: Sequence[Candidate], sour
         if name not in by_name:
             raise UnknownNameError(source, f"analysis.{field}", name, by_name)
         if len(by_name[name]) > 1:
-            found = f"'{name}', the name of a joint and of a contact"
+            found = f"'{name}', the name of several sensors: joint, contact or fixed joint"
             raise ConfigError(source, f"analysis.{field}", found, "a name that only one sensor has")
     return frozenset(by_name[name][0] for name in names)
 

@@ -120,7 +120,7 @@ def forces_of(evaluation: Evaluation, samples: Samples, phi: Array, robot: Robot
     part = samples[:_PLOTTED_SAMPLES]
     measured, (nominal, identified) = force_series(evaluation.builder, part, phi)
     series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured, nominal, identified)
-    return force_figure(series, robot.joint_names, robot.base_rows)
+    return force_figure(series, robot.dof_names, robot.base_rows)
 
 
 def metrics_document(run: Identification) -> dict[str, object]:

@@ -1,0 +1,229 @@
+"""Samples that must not be fitted are found where they are, and a clean log has none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from faults import HERE, changed, demo_log, found, moving, only, places, with_rates
+from motions import position, value
+
+from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, check
+from torchid.hygiene.jumps import jumps
+from torchid.hygiene.repair import repaired
+from torchid.logs import Log
+
+Array = np.ndarray[Any, Any]
+
+
+def put(index: object, add: object) -> Callable[[Array], None]:
+    def change(array: Array) -> None:
+        array[index] += add
+
+    return change
+
+
+def stop(first: int, last: int, columns: object = slice(None)) -> Callable[[Array], None]:
+    """Samples that repeat the one before `first`."""
+
+    def change(array: Array) -> None:
+        array[first : last + 1, columns] = array[first - 1, columns]
+
+    return change
+
+
+@pytest.mark.parametrize("log", [demo_log(), moving(), with_rates(moving())], ids=["demo", "moving", "with rates"])
+def test_a_clean_log_has_no_condemned_samples(log: Log) -> None:
+    checked = check(log)
+    assert checked.verdict == "usable"
+    assert not [one for one in checked.findings if one.severity != NOTE]
+
+
+@pytest.mark.parametrize("last", [HERE, HERE + 2])
+@pytest.mark.parametrize(
+    ("field", "column", "size"),
+    [("joint_position", 2, 0.05), ("joint_torque", 4, 20.0), ("base_position_world", 1, 0.01)],
+)
+def test_a_spike_is_found_at_its_samples(field: str, column: int, size: float, last: int) -> None:
+    spike = only(check(changed(demo_log(), field, put((slice(HERE, last + 1), column), size))), "spike")
+    assert (spike.severity, spike.field) == (CONDEMNED, field)
+    assert places(spike) == {(HERE, last)}
+    assert len(spike.channels) == 1
+
+
+def test_a_spike_of_a_contact_force_is_found_by_contact_and_component() -> None:
+    spike = only(check(changed(demo_log(), "contact_wrench_local", put((HERE, 1, 2), 100.0))), "spike")
+    assert (spike.channels, places(spike)) == (("front_right_foot fz",), {(HERE, HERE)})
+
+
+def test_a_spike_of_the_orientation_is_found_in_degrees() -> None:
+    log = demo_log()
+    quat = value(log.base_quat_xyzw).copy()
+    quat[HERE] += np.array([np.sin(np.radians(5.0)), 0.0, 0.0, 0.0])  # about 10 degrees
+    quat[HERE] /= np.linalg.norm(quat[HERE])
+    spike = only(check(replace(log, base_quat_xyzw=quat)), "spike")
+    assert (spike.field, places(spike)) == ("base_quat_xyzw", {(HERE, HERE)})
+    assert " deg " in spike.found
+
+
+def test_a_reading_that_is_lost_for_a_while_is_condemned_from_end_to_end() -> None:
+    noise = 1e-4 * np.random.default_rng(1).normal(size=40)
+    log = changed(demo_log(), "joint_position", lambda q: q.__setitem__((slice(HERE, HERE + 40), 2), noise))
+    assert places(only(check(log), "spike")) == {(HERE, HERE + 39)}
+
+
+def test_a_lasting_step_of_a_position_makes_a_log_useless_unless_one_side_is_short() -> None:
+    middle = check(changed(demo_log(), "joint_position", put((slice(HERE, None), 2), 0.05)))
+    assert not middle.usable
+    assert only(middle, "step").whole
+    short = check(changed(demo_log(), "joint_position", put((slice(1250, None), 2), 0.05)))
+    assert short.usable
+    assert places(only(short, "step")) == {(1250, 1299)}
+
+
+def test_a_torque_may_step_which_is_only_worth_a_look() -> None:
+    checked = check(changed(demo_log(), "joint_torque", put((slice(HERE, None), 2), 30.0)))
+    step = only(checked, "step")
+    assert (step.severity, places(step)) == (SUSPICIOUS, {(HERE - 1, HERE)})
+    assert not checked.condemned.any()
+
+
+def test_a_wrapped_angle_costs_two_samples_and_is_unwrapped() -> None:
+    log = changed(demo_log(), "joint_position", put((slice(HERE, None), 2), -2.0 * np.pi))
+    checked = check(log)
+    assert places(only(checked, "wrapped angle")) == {(HERE - 1, HERE)}
+    np.testing.assert_allclose(checked.repaired.joint_position[HERE + 1 :], demo_log().joint_position[HERE + 1 :])
+
+
+def test_where_the_base_is_does_not_matter_so_that_its_jump_costs_two_samples() -> None:
+    checked = check(changed(demo_log(), "base_position_world", put((slice(HERE, None), 0), 0.5)))
+    assert places(only(checked, "step")) == {(HERE - 1, HERE)}
+    moved = value(checked.repaired.base_position_world) - value(demo_log().base_position_world)
+    assert np.abs(moved).max() < 0.01
+
+
+def test_motion_that_begins_and_ends_at_once_has_no_jumps() -> None:
+    time = np.arange(3000) / 1000.0
+    pulse = np.clip(time - 1.0, 0.0, 1.0)
+    for values in (pulse, np.sin(2 * np.pi * pulse), np.maximum(0.0, np.sin(3 * time)), np.round(pulse, 3)):
+        assert jumps(values, 1000.0 * time, np.zeros(3000, int)) == []
+
+
+def test_heavy_tailed_noise_has_no_spikes() -> None:
+    rng = np.random.default_rng(2)
+    for noise in (rng.laplace(size=200_000), rng.normal(size=200_000), rng.logistic(size=200_000)):
+        assert jumps(np.cumsum(0.1 * noise) + noise, np.arange(200_000.0), np.zeros(200_000, int)) == []
+
+
+@pytest.mark.parametrize("field", ["joint_position", "joint_torque"])
+@pytest.mark.parametrize("last", [HERE, HERE + 9])
+def test_a_frame_that_is_sent_again_is_condemned(field: str, last: int) -> None:
+    frozen = only(check(changed(demo_log(), field, stop(HERE, last))), "frozen")
+    assert (frozen.field, places(frozen)) == (field, {(HERE, last)})
+    assert len(frozen.channels) == 12
+
+
+@pytest.mark.parametrize("field", ["joint_position", "joint_torque"])
+def test_one_channel_that_freezes_is_condemned_by_name(field: str) -> None:
+    frozen = only(check(changed(demo_log(), field, stop(HERE, HERE + 19, 4))), "frozen")
+    assert (frozen.channels, places(frozen)) == (("front_right_thigh",), {(HERE, HERE + 19)})
+
+
+def test_a_robot_that_rests_between_motions_is_not_frozen() -> None:
+    time = np.arange(4000) / 500.0
+    pause = np.clip(time, 0.0, 3.0) + np.clip(time - 5.0, 0.0, None)
+    swing = np.sin(np.pi * pause)[:, None] ** 2 * [0.5, -0.3, 0.8]  # at rest, to the last bit, from 3 s to 5 s
+    for joints in (swing, np.round(swing, 4)):
+        assert not found(check(Log("rests.npz", time, ("a", "b", "c"), joints)), "frozen")
+
+
+def test_a_quantised_encoder_that_rests_is_not_frozen() -> None:
+    position = np.round(moving(noise=2e-3).joint_position * 0.0 + moving(noise=2e-3).joint_position[:1], 3)
+    flicker = position + 1e-3 * (np.random.default_rng(3).random(position.shape) < 0.3)
+    assert not found(check(replace(moving(), joint_position=flicker)), "frozen")
+
+
+def test_a_torque_that_was_recorded_at_a_lower_rate_and_held_is_named_but_not_condemned() -> None:
+    held = replace(demo_log(), joint_torque=value(demo_log().joint_torque)[np.arange(1300) // 4 * 4])
+    checked = check(held)
+    assert "every 4 samples" in only(checked, "held").found
+    assert not checked.condemned.any()
+
+
+def test_a_saturated_torque_is_condemned_where_it_is_saturated() -> None:
+    torque = value(demo_log().joint_torque)
+    limit = np.percentile(torque[:, 2], 90.0)
+    checked = check(
+        changed(demo_log(), "joint_torque", lambda t: t.__setitem__((slice(None), 2), np.minimum(t[:, 2], limit)))
+    )
+    assert only(checked, "saturated").channels == ("front_left_knee",)
+    at_limit = torque[:, 2] >= limit
+    assert np.mean(checked.condemned[at_limit]) > 0.9
+    assert not checked.condemned[~at_limit].any()
+
+
+def test_a_torque_of_zero_throughout_is_suspicious_and_a_joint_that_never_moves_a_note() -> None:
+    torque = only(check(changed(demo_log(), "joint_torque", lambda t: t[:, 2].fill(0.0))), "constant", "joint_torque")
+    assert torque.severity == SUSPICIOUS
+    still = only(
+        check(changed(demo_log(), "joint_position", lambda q: q[:, 2].fill(0.3))), "constant", "joint_position"
+    )
+    assert (still.severity, still.channels) == (NOTE, ("front_left_knee",))
+
+
+def test_holes_in_a_channel_are_condemned_and_a_channel_that_is_not_there_is_not() -> None:
+    holes = check(changed(demo_log(), "joint_torque", put((slice(200, 210), 1), np.nan)))
+    assert places(only(holes, "not measured")) == {(200, 209)}
+    assert np.isfinite(value(holes.repaired.joint_torque)).all()
+    absent = check(changed(demo_log(), "joint_torque", lambda t: t[:, 1].fill(np.nan)))
+    assert only(absent, "not measured").severity == NOTE
+    assert not absent.condemned.any()
+
+
+def test_values_that_nothing_can_have_are_condemned() -> None:
+    checked = check(changed(demo_log(), "joint_torque", put((HERE, 3), 1e200)))
+    assert places(only(checked, "absurd")) == {(HERE, HERE)}
+    assert not check(changed(demo_log(), "joint_torque", put(slice(None), 1e200))).usable
+
+
+def test_a_repaired_log_differs_where_it_was_condemned_and_nowhere_else() -> None:
+    log = changed(demo_log(), "joint_position", put((HERE, 2), 0.3))
+    checked = check(log)
+    difference = checked.repaired.joint_position != log.joint_position
+    assert np.argwhere(difference).tolist() == [[HERE, 2]]
+    assert abs(checked.repaired.joint_position[HERE, 2] - demo_log().joint_position[HERE, 2]) < 1e-3
+    assert repaired(demo_log(), ()) is demo_log()
+
+
+def test_stamps_in_milliseconds_are_named() -> None:
+    checked = check(replace(demo_log(), time=1e3 * demo_log().time))
+    assert "ms" in only(checked, "unit", "time").found
+    assert not checked.usable
+
+
+def test_a_gap_is_named_with_what_is_missing_and_a_long_one_makes_the_log_useless() -> None:
+    time = demo_log().time
+    short = only(check(replace(demo_log(), time=time + 0.04 * (np.arange(1300) >= HERE))), "gap")
+    assert (short.severity, places(short)) == (SUSPICIOUS, {(HERE - 1, HERE)})
+    assert "4 samples missing" in short.found
+    long = check(replace(demo_log(), time=time + 0.4 * (np.arange(1300) >= HERE)))
+    assert long.reasons == ("time: gap",)
+
+
+def test_of_two_stamps_that_nearly_coincide_one_is_condemned() -> None:
+    time = demo_log().time.copy()
+    time[HERE] = time[HERE - 1] + 1e-4
+    assert places(only(check(replace(demo_log(), time=time)), "coincident stamps")) == {(HERE, HERE)}
+
+
+def test_jitter_of_the_stamps_is_told_from_jitter_of_the_sampling() -> None:
+    late = 0.3 / 500.0 * np.random.default_rng(4).uniform(-1.0, 1.0, 2000)
+    log = moving()
+    stamped = only(check(replace(log, time=log.time + late)), "jitter")
+    sampled = only(check(replace(log, time=log.time + late, joint_position=position(log.time + late))), "jitter")
+    assert "the stamps jitter, not the sampling" in stamped.found
+    assert "the stamps jitter" not in sampled.found
+    assert not found(check(log), "jitter")
