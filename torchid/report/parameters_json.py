@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -95,7 +96,7 @@ def read_shared_extras(path: Path) -> dict[str, float]:
         if not (isinstance(entry, dict) and isinstance(entry.get("label"), str)):
             raise InputError(path, "extras", "an entry without a label", "what torchid identify wrote")
         value = entry.get("value")
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        if not _is_finite(value):
             raise InputError(path, f"extras, {entry['label']}, value", f"{value!r}", "a finite number")
         if entry.get("log") is None:
             out[entry["label"]] = float(value)
@@ -130,9 +131,14 @@ def _document(path: Path) -> dict[str, Any]:
 def _number(path: Path, body: dict[str, Any], name: str) -> float:
     identified = body.get("identified")
     value = identified.get(name) if isinstance(identified, dict) else None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+    if not _is_finite(value):
         raise InputError(path, f"body '{body['name']}', identified.{name}", f"{value!r}", "a finite number")
     return float(value)
+
+
+def _is_finite(value: object) -> TypeGuard[float]:
+    """Whether it is a number that a float64 can hold."""
+    return not isinstance(value, bool) and isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
 
 
 def _plain(x: Any) -> float | bool | str | None:

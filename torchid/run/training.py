@@ -29,6 +29,7 @@ from torchid.run.folder import EVENTS, TRAINING, check_free
 Evaluate = Callable[[Array], Mapping[str, Metrics]]
 
 _FREE_TO_CHANGE = ("output", "overwrite")
+_FOREIGN = (AttributeError, TypeError, ValueError, LookupError, RuntimeError, OverflowError)
 _SAME = 1e-9  # relative: the logs of a checkpoint, up to rounding
 
 
@@ -114,7 +115,8 @@ class Training:
                 self._evaluate(0, trainer.phi(), evaluate, events)
                 self._save(trainer, events)
             self._train(trainer, evaluate, events, lambda text: bars.update(bar, advance=1, description=text))
-        return trainer.estimate()
+        with self._foreign_state():
+            return trainer.estimate()
 
     def copy_curves(self, folder: Path) -> None:
         """Copy the event files into the finished run's folder."""
@@ -146,8 +148,9 @@ class Training:
         """Start a new folder, or take up what is in it."""
         if resume and (self.folder / CHECKPOINT).is_file():
             state = load_checkpoint(self.folder)
-            self._check(state, trainer)
-            trainer.load_state_dict(state["trainer"])
+            with self._foreign_state():
+                self._check(state, trainer)
+                trainer.load_state_dict(state["trainer"])
             self._saved = trainer.epoch
             return
         if self.folder.exists():
@@ -173,6 +176,17 @@ class Training:
         rows, cost = _fingerprint(trainer)
         if state["logs"][0] != rows or abs(state["logs"][1] - cost) > _SAME * cost:
             raise ConfigError(self.source, "logs", "not those of the checkpoint", "the same files, unchanged")
+
+    @contextmanager
+    def _foreign_state(self) -> Iterator[None]:
+        """Turn whatever torch makes of a state that was edited into one line."""
+        try:
+            yield
+        except InputError:
+            raise
+        except _FOREIGN as error:
+            found = f"holds no state of this training ({type(error).__name__})"
+            raise InputError(self.folder / CHECKPOINT, "file", found, "one that torchid identify wrote") from error
 
     @contextmanager
     def _interruptible(self, trainer: Trainer) -> Iterator[None]:
