@@ -57,8 +57,7 @@ def assert_oracles(robot: Robot, seed: int) -> None:
         np.testing.assert_allclose(J, oracle.jacobian(state[0], frame), rtol=0.0, atol=EXACT, err_msg=frame)
 
 
-@base_kinds
-@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize(("name", "fixed_base"), [(name, place % 2 == 1) for place, name in enumerate(REAL)])
 def test_the_wrench_through_a_weld_is_that_of_a_free_joint_at_rest(name: str, fixed_base: bool) -> None:
     path, welds = REAL[name]
     robot = load(path, None, fixed_base, welds)
@@ -155,7 +154,7 @@ def jacobian(oracle: Oracle, samples: Samples, contact: Contact) -> Array:
 
 
 @base_kinds
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_rows_are_whitened_combinations_of_k_that_no_unmeasured_force_enters(
     urdf: Path, fixed_base: bool, seed: int
 ) -> None:

@@ -112,6 +112,15 @@ def test_motion_that_begins_and_ends_at_once_has_no_jumps() -> None:
         assert jumps(values, 1000.0 * time, np.zeros(3000, int)) == []
 
 
+def test_a_sample_that_comes_late_is_no_jump() -> None:
+    time = np.arange(2000) / 500.0
+    time[1000:] += 0.4 / 500.0
+    assert jumps(np.sin(5.0 * time), 500.0 * time, np.zeros(2000, int)) == []
+    assert len(jumps(np.sin(5.0 * time), np.arange(2000.0), np.zeros(2000, int))) == 1, (
+        "it would be one with equal steps"
+    )
+
+
 def test_heavy_tailed_noise_has_no_spikes() -> None:
     rng = np.random.default_rng(2)
     for noise in (rng.laplace(size=200_000), rng.normal(size=200_000), rng.logistic(size=200_000)):
@@ -223,7 +232,8 @@ def test_jitter_of_the_stamps_is_told_from_jitter_of_the_sampling() -> None:
     late = 0.3 / 500.0 * np.random.default_rng(4).uniform(-1.0, 1.0, 2000)
     log = moving()
     stamped = only(check(replace(log, time=log.time + late)), "jitter")
-    sampled = only(check(replace(log, time=log.time + late, joint_position=position(log.time + late))), "jitter")
+    read = position(log.time + late) + 1e-4 * np.random.default_rng(5).normal(size=(2000, 3))
+    sampled = only(check(replace(log, time=log.time + late, joint_position=read)), "jitter")
     assert "the stamps jitter, not the sampling" in stamped.found
     assert "the stamps jitter" not in sampled.found
     assert not found(check(log), "jitter")

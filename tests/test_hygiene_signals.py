@@ -259,6 +259,14 @@ def carried(factor: float = 1.0, robot: bool = True, **fields: Any) -> Checked:
     return check(replace(log, **fields), demo_robot() if robot else None)
 
 
+def test_a_foot_that_stands_while_its_flag_is_off_is_no_offset() -> None:
+    active = np.ones((300, 4), bool)
+    active[100:150, 2] = False
+    checked = carried(contact_active=active)
+    assert places(only(checked, "force without contact")) == {(100, 149)}
+    assert not found(checked, "offset")
+
+
 def test_what_the_feet_carry_at_rest_is_compared_with_the_weight() -> None:
     log = carried().log
     assert not list(weight(log, demo_robot()))

@@ -18,6 +18,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning
+from torchid.interrupts import begin, written
 from torchid.interrupts import interrupt_held_back as _interrupt_held_back
 
 if TYPE_CHECKING:
@@ -47,13 +48,14 @@ def guarded(program: str, command: Callable[[], int | None], debug: bool = False
         warnings.simplefilter("always", TorchidWarning)
         warnings.showwarning = partial(_show_warning, program)
         try:
+            begin()
             with _termination_interrupts():
                 return command() or 0
         except (InputError, BaseLostError) as error:
             print(f"{program}: {error}", file=sys.stderr)
             return 2
         except KeyboardInterrupt as interrupt:
-            print(f"{program}: {str(interrupt) or 'interrupted; nothing was written'}", file=sys.stderr)
+            print(f"{program}: {str(interrupt) or f'interrupted; {written()} was written'}", file=sys.stderr)
             return 1
         except Exception as error:  # a bug or a full disk: still no wall of text unless asked for
             if debug:

@@ -1,4 +1,4 @@
-"""When Ctrl-C may act."""
+"""When Ctrl-C may act, and what it came too late for."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+_written: list[str] = []
+
 
 @contextmanager
-def interrupt_held_back(message: str = "") -> Iterator[None]:
+def interrupt_held_back() -> Iterator[None]:
     """Let Ctrl-C act when the block is done: what stands in it is short, and must happen as a whole.
 
     Raises:
-        KeyboardInterrupt: with the message, after a block that Ctrl-C fell into.
+        KeyboardInterrupt: after a block that Ctrl-C fell into.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -25,4 +27,19 @@ def interrupt_held_back(message: str = "") -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, before)
     if caught:
-        raise KeyboardInterrupt(message)
+        raise KeyboardInterrupt
+
+
+def begin() -> None:
+    """A command begins: it has written nothing yet."""
+    _written.clear()
+
+
+def note_written(result: object) -> None:
+    """A command has written a file or folder that stays."""
+    _written.append(str(result))
+
+
+def written() -> str:
+    """What a command has written, in words."""
+    return ", ".join(_written) or "nothing"

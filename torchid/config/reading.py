@@ -158,8 +158,9 @@ def _absolute_at(value: Any, place: Sequence[str], folder: Path) -> Any:
 def _absolute_path(value: str, folder: Path) -> str:
     """Raises ValueError or RuntimeError (the home folder of nobody) where the value names no file."""
     path = os.path.normpath(folder / Path(value).expanduser())
-    longest = max(len(os.fsencode(name)) for name in Path(path).parts)
-    if not value.strip() or not is_plain(value) or longest > _LONGEST_NAME or len(os.fsencode(path)) > _LONGEST_PATH:
+    names = [len(os.fsencode(name)) for name in Path(path).parts]
+    too_long = max(names) > _LONGEST_NAME or sum(names) + len(names) > _LONGEST_PATH
+    if not value.strip() or not Path(path).name or not is_plain(value) or too_long:
         raise ValueError(f"'{shown(value)}', no name of a file")
     return path
 

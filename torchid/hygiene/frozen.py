@@ -49,10 +49,10 @@ def _by_channel(group: Group, steps: FloatArray, columns: np.ndarray, together: 
         name, values = group.names[column], group.values[:, column]
         runs = implausible(values[:, None], repeated)
         for extreme in (values.min(), values.max()):
-            at = values[runs.first] == extreme
-            if runs.where(at).lengths.sum() >= AT_LIMIT:
-                limits.append((name, runs.where(at), float(extreme)))
-                runs = runs.where(~at)
+            at_limit = Runs.of(repeated & (values[1:] == extreme))
+            if (values[runs.first] == extreme).any() and at_limit.lengths.sum() >= AT_LIMIT:
+                limits.append((name, at_limit, float(extreme)))
+                runs = runs.where(values[runs.first] != extreme)
         if len(runs):
             stuck.append((name, runs))
     if stuck:
@@ -89,7 +89,7 @@ def _saturated(group: Group, limits: list[tuple[str, Runs, float]]) -> Finding:
 
 
 def _held(group: Group, every: int) -> Finding:
-    text = f"new values only every {every} samples: recorded at 1/{every} of the log's rate, {0.5 * (every - 1):g} late"
+    text = f"new values only every {every} samples, repeated in between: {0.5 * (every - 1):g} samples late on average"
     advice = f"record at one rate, or set preprocessing.cutoff_hz below {0.25 / every:.2g} of the sample rate"
     return Finding("held", SUSPICIOUS, group.field, text, advice, group.names)
 

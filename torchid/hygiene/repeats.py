@@ -19,10 +19,11 @@ from torchid.logs.fields import BoolArray, FloatArray
 CHANCE = -8.0
 #: Steps on either side that a run is compared with.
 NEIGHBOURS = 10
-#: Steps on either side that say whether the robot moved when the run began and after it ended...
-_NEAREST = 4
-#: ... at this share of the speed in the neighbourhood at least: one that stops smoothly is below it.
-_MOVING = 0.5
+#: Quanta per step that a channel must make to count: one that stops on a coarse grid repeats itself before it rests.
+_GRAINS = 4.0
+#: Share of the speed on one side that the robot must have next to a run: one that stops smoothly is below it. Of a
+#: noisy channel, the mean over so many steps counts.
+_MOVING, _NEAREST = 0.5, 4
 #: Share of repeats above which a channel is taken for one that was recorded at a lower rate and held...
 HELD = 0.2
 #: ... if this share of the runs has the typical length, give or take one sample.
@@ -89,13 +90,20 @@ def implausible(values: FloatArray, repeated: BoolArray) -> Runs:
     finest = _finest(sides, ROUNDING * np.abs(values).max(axis=0))
     moving = np.ones(len(runs), bool)
     with np.errstate(divide="ignore", invalid="ignore"):
-        one = np.where(typical > 0.0, np.minimum(0.5 * finest / typical, 1.0), 1.0)
+        one = np.where(typical > _GRAINS * finest, 0.5 * finest / typical, 1.0)
         chance = runs.lengths * np.log10(one).sum(axis=1)
         for side in sides:
-            pace = np.where(typical > 0.0, side[:, :_NEAREST].mean(axis=1) / typical, np.nan)
             at_end = np.isnan(side[:, 0]).all(axis=1)
-            moving &= at_end | (_mean_known(pace) >= _MOVING)
+            moving &= at_end | (_pace(side) >= _MOVING)
     return runs.where((chance < CHANCE) & moving)
+
+
+def _pace(side: FloatArray) -> FloatArray:
+    """Speed next to runs over that on the same side of them, (R,), of sizes of steps (R, k, c)."""
+    usual = median_known(side)
+    noisy = median_known(np.abs(np.diff(side, axis=1))) > 0.5 * usual
+    nearest = np.where(noisy, side[:, :_NEAREST].mean(axis=1), side[:, 0])
+    return _mean_known(np.where(usual > 0.0, nearest / usual, np.nan))
 
 
 def _finest(sides: list[FloatArray], rounding: FloatArray) -> FloatArray:

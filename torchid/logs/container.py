@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
+from torchid.interrupts import interrupt_held_back, note_written
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.limits import check_growth
 from torchid.logs.npz import Npz, open_archive
@@ -110,7 +111,9 @@ def appearing_whole(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield temporary
-        temporary.replace(path)
+        with interrupt_held_back():
+            temporary.replace(path)
+            note_written(path)
     except OSError as error:
         raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error
     finally:

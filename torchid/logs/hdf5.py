@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from torchid.errors import LogError
 from torchid.logs.limits import MAX_SMALL, check_fields, check_names
 from torchid.logs.spill import Sliced
+
+_OVERHEAD = 4096  # bytes that an array takes up beside its numbers
 
 
 class Hdf5:
@@ -85,10 +88,22 @@ def import_h5py(path: Path) -> Any:
 
 
 def save_hdf5(h5py: Any, path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays to a file that is not there yet."""
-    with h5py.File(path, "x") as file:
+    """Write arrays to a file that is not there yet.
+
+    Raises:
+        OSError: there is no room for them.
+    """
+    _check_room(path, sum(array.nbytes for array in arrays.values()) + _OVERHEAD * len(arrays))
+    with h5py.File(path, "w") as file:
         for name, array in arrays.items():
             if array.dtype.kind == "U":
                 file.create_dataset(name, data=array.astype(object), dtype=h5py.string_dtype())
             else:
                 file.create_dataset(name, data=array)
+
+
+def _check_room(path: Path, size: int) -> None:
+    """Take up the room of a file for a moment: when a disk fills up, the HDF5 library brings the interpreter down."""
+    with path.open("xb") as stream:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(stream.fileno(), 0, size)

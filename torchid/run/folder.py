@@ -13,13 +13,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 
-try:
-    import fcntl
-except ImportError:  # not on Windows
-    fcntl = None  # type: ignore[assignment]
-
 from torchid.errors import ConfigError
-from torchid.interrupts import interrupt_held_back
+from torchid.interrupts import interrupt_held_back, note_written
 
 
 @dataclass(frozen=True)
@@ -98,22 +93,19 @@ def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) ->
         ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
     """
     check_free(output, overwrite, kind)
-    made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
     temporary: Path | None = None
-    try:
-        with interrupt_held_back():
-            temporary = _temporary(output)
-        yield temporary
-        with interrupt_held_back(f"interrupted when {output} was complete"):
-            _put(temporary, output, overwrite, kind)
-    finally:
-        with interrupt_held_back():
-            if temporary is not None:
-                shutil.rmtree(temporary, ignore_errors=True)
-            if not output.exists():
-                with suppress(OSError):  # another run has put something there meanwhile
-                    for folder in made:
-                        folder.rmdir()
+    with parents_of(output):
+        try:
+            with interrupt_held_back():
+                temporary = _temporary(output)
+            yield temporary
+            with interrupt_held_back():
+                _put(temporary, output, overwrite, kind)
+                note_written(output)
+        finally:
+            with interrupt_held_back():
+                if temporary is not None:
+                    shutil.rmtree(temporary, ignore_errors=True)
 
 
 def remove_folder(folder: Path) -> None:
@@ -129,35 +121,33 @@ def remove_folder(folder: Path) -> None:
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """Keep other processes from claiming an existing folder; the system lets go of it when this one ends, if killed.
-
-    Raises:
-        ConfigError: another process has claimed it.
-    """
-    if fcntl is None:
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
+def parents_of(output: Path) -> Iterator[None]:
+    """The folders above `output`, which go with the block if they came with it and it leaves nothing in them."""
+    made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(handle)
-        raise ConfigError(folder, "output", "another run is at work there", "another output, or patience") from error
-    try:
+        with interrupt_held_back(), creating(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        os.close(handle)
+        with interrupt_held_back(), suppress(OSError):  # a run is in it, this one or another
+            for folder in made:
+                folder.rmdir()
+
+
+@contextmanager
+def creating(output: Path) -> Iterator[None]:
+    """Say in one line that something cannot be made beside `output`."""
+    try:
+        yield
+    except OSError as error:
+        found = f"no folder can be made there ({error.strerror})"
+        raise ConfigError(output, "output", found, "a place that can be written") from error
 
 
 def _temporary(output: Path) -> Path:
     """A new folder beside `output` whose name nobody takes for a run's."""
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
+    with creating(output):
         temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-    except OSError as error:
-        found = f"no folder can be made there ({error.strerror})"
-        raise ConfigError(output, "output", found, "a place that can be written") from error
     temporary.chmod(0o755)
     return temporary
 

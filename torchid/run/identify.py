@@ -6,7 +6,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -25,6 +25,7 @@ from torchid.problem.states import check_base, state_reports
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.run.calibration import Calibration, warn_of_confounded
+from torchid.run.claim import claimed
 from torchid.run.estimation import assembled, batch_estimator, stated_conditions
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.fit import Fit, fitted
@@ -32,7 +33,7 @@ from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
 from torchid.run.results import Identification, candidates, write_run
 from torchid.run.robust import RobustSummary, loss_of, robust_fit
-from torchid.run.training import Training, check_training
+from torchid.run.training import Training, check_training, training_folder
 
 _IMPLAUSIBLE = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
 
@@ -61,8 +62,14 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
         BaseLostError: the sensors cannot see the base.
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
-    check_training(config, resume, source)
-    check_free(config.output, config.overwrite)
+    trains = config.estimator.name == "sgd"
+    with claimed(training_folder(config.output)) if trains else nullcontext():
+        check_training(config, resume, source)
+        check_free(config.output, config.overwrite)
+        return _identify(config, source, resume)
+
+
+def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identification:
     clock = _Clock()
     with progress_bars() as bars:
         with clock("read"):

@@ -1,0 +1,124 @@
+"""Commands that are stopped at any moment: what they leave is a whole result, or nothing that looks like one."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from demo import shortened_demo
+from hostile_commands import Commands, commands
+from refusals import files_in
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+COMMANDS = ("identify", "train", "evaluate", "analyze", "convert")
+TIMES = [2, pytest.param(25, marks=pytest.mark.slow)]
+
+
+@pytest.fixture(scope="module")
+def place() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as name:
+        shortened_demo(Path(name) / "demo", 100)
+        yield Path(name)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Commands]:
+    with commands() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def run(place: Path, server: Commands) -> Path:
+    """A finished run, to be evaluated."""
+    assert server.run(["identify", *experiment(place, place / "run")]).status == 0
+    return place / "run"
+
+
+def experiment(place: Path, output: Path) -> list[str]:
+    return [str(place / "demo" / "quadruped.yaml"), f"output={output}"]
+
+
+def arguments(command: str, place: Path, run: Path, out: Path) -> tuple[list[str], Path]:
+    """A command line, and the file or folder that it makes in `out`."""
+    log = str(place / "demo" / "sway_test.npz")
+    if command == "evaluate":
+        shutil.copytree(run, out / "run", dirs_exist_ok=True)
+        return ["evaluate", str(out / "run"), "--log", log], out / "run" / "evaluation" / "sway_test"
+    if command == "convert":
+        return ["convert", str(place / "demo" / "sway_train.npz"), str(out / "log.h5")], out / "log.h5"
+    if command == "analyze":
+        return ["analyze", *experiment(place, out / "run")], out / "run.analysis"
+    sgd = ["estimator={name: sgd, training: {epochs: 30, checkpoint_seconds: 0}}"] if command == "train" else []
+    return ["identify", *experiment(place, out / "run"), *sgd], out / "run"
+
+
+def content(made: Path) -> set[str]:
+    """Names in a result, event files by kind; a file is its own name."""
+    names = files_in(made) if made.is_dir() else {made.name: b""}
+    return {name.split(".out.tfevents")[0] for name in names}
+
+
+def hidden(out: Path) -> list[str]:
+    """Temporary files and folders, wherever they are."""
+    return sorted(str(path.relative_to(out)) for path in out.rglob(".*") if path.name != ".checkpoint.pt")
+
+
+@pytest.mark.parametrize("times", TIMES)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_stopped_at_any_moment_leaves_all_or_nothing(
+    place: Path, server: Commands, run: Path, tmp_path: Path, command: str, times: int
+) -> None:
+    """And what is left, of a process that was killed, hinders no other."""
+    line, made = arguments(command, place, run, tmp_path / "whole")
+    (tmp_path / "whole").mkdir(exist_ok=True)
+    start = time.monotonic()
+    assert server.run(line).status == 0
+    seconds, whole = time.monotonic() - start, content(made)
+    draw, out = random.Random(COMMANDS.index(command)), tmp_path / "out"
+    for number in range(times):
+        kind = SIGNALS[(number + COMMANDS.index(command)) % 3]
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        line, made = arguments(command, place, run, out)
+        ended = server.stopped(line, kind, draw.uniform(0.0, 1.1) * seconds)
+        case = f"{command}, {kind.name} {number}: {ended}"
+        assert not made.exists() or content(made) == whole, case
+        assert ended.status in ((0, 1) if kind == signal.SIGINT else (0, 1, -kind)), case
+        assert len(ended.said) == (ended.status == 1), case
+        assert made.exists() == any(f"interrupted; {made} was written" in line for line in ended.said) or (
+            ended.status != 1
+        ), case
+        if kind != signal.SIGKILL:
+            assert hidden(out) == [], case
+        if command == "train" and ended.status and (out / "run.training" / "checkpoint.pt").exists():
+            line = [*line, "--resume"]
+        elif made.exists() and command in ("identify", "train", "analyze"):
+            line = [*line, "overwrite=true"]
+        if command == "convert":
+            line = [*line, "--overwrite"]
+        if number < 6:
+            assert server.run(line).status == 0, case
+            assert content(made) == whole, case
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_is_replaced_is_there_at_any_moment(
+    place: Path, server: Commands, run: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    """The old one or the new one, whenever the command is stopped."""
+    out, draw = tmp_path / "run", random.Random(int(number))
+    shutil.copytree(run, out)
+    start = time.monotonic()
+    line = ["identify", *experiment(place, out), "overwrite=true"]
+    assert server.run(line).status == 0
+    seconds = time.monotonic() - start
+    for _ in range(2):
+        server.stopped(line, number, draw.uniform(0.7, 1.0) * seconds)
+        assert content(out) == content(run)
+        assert [path.name for path in tmp_path.iterdir()] == ["run"]
