@@ -25,6 +25,7 @@ from torchid.estimators import Sgd, Trainer
 from torchid.problem import MiniBatches
 from torchid.report.tensorboard import RunEvents
 from torchid.run.experiment import set_up
+from torchid.run.reading import LogReader
 
 DEMO = Path(torchid.__file__).parent / "demo" / "quadruped.yaml"
 
@@ -67,7 +68,8 @@ def compare(options: argparse.Namespace) -> None:
     experiment = set_up(config, options.file)
     robot = experiment.robot
     builder = torchid.RowBuilder(robot, experiment.contacts, experiment.sensors)
-    train, test = (experiment.read(paths, required=True) for paths in (config.logs.train, config.logs.test))
+    reader = LogReader(experiment)
+    train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))
     problem = torchid.linear_problem(torchid.compress(train, builder), builder, robot, config.estimator.friction)
     settings = Sgd(ridge=config.estimator.ridge, epochs=options.epochs, residual=options.mode, residual_lr=0.01)
     torch.manual_seed(0)

@@ -24,7 +24,7 @@ from torchid.report.metrics import GROUPS
 from torchid.report.plan_tables import check_lines
 from torchid.report.tree_figure import tree_figure
 from torchid.run import analyze
-from torchid.run.experiment import Scene
+from torchid.run.reading import LogReader
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 FEET = tuple(f"{leg}_foot" for leg in LEGS)
@@ -215,7 +215,7 @@ def test_a_slip_in_a_set_to_compare_is_placed_before_any_work(
     logs = {"train": ["sway_train.npz"]}
     file = asked(experiment, logs=logs, sensors="joints", analysis={"compare": compare})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Scene, "read_logs", None)
+        patch.setattr(LogReader, "read", None)
         message = refusal(["analyze", str(file)], experiment, capsys)
     assert f"{file}: {field}" in message
     assert hint in message
@@ -230,7 +230,7 @@ def test_a_frozen_body_that_does_not_exist_is_looked_for_in_the_file(
 
 
 def test_an_output_without_a_name_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "no name for a folder" in refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
+    assert "no name for a file or folder" in refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
 
 
 def test_a_robot_that_cannot_move_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -195,6 +195,17 @@ def test_an_override_changes_its_key_and_no_other(file: Path) -> None:
     assert after == before
 
 
+def test_a_mapping_given_empty_clears_that_of_the_file_and_any_other_adds_to_it(file: Path) -> None:
+    sensors = load(file, ALL, "sensors.offsets={}", "sensors.scales.contact_force=all").sensors
+    assert sensors.offsets == {}
+    assert {str(channel): extent for channel, extent in sensors.scales.items()} == {
+        "ft_force": "log",
+        "contact_force": "all",
+    }
+    assert sensors.contact_wrenches == {"l_sole": ["fx", "mz"], "r_sole": []}
+    assert load(file, ALL, "sensors.contact_wrenches={r_sole: []}").sensors.contact_wrenches["l_sole"] == ["fx", "mz"]
+
+
 def test_an_override_may_add_what_the_file_leaves_out(file: Path) -> None:
     config = load(file, LEAST, "preprocessing.cutoff_hz=8", "contacts=[{frame: sole, type: flat}]", "overwrite=true")
     assert config.preprocessing.cutoff_hz == 8.0

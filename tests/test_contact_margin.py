@@ -18,6 +18,7 @@ from torchid.logs import read_log, write_log
 from torchid.logs.transitions import near_contact_changes
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.run.experiment import set_up
+from torchid.run.reading import LogReader
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 PHASE, STEP, SLIP = 40, 0.01, 0.05  # samples of a phase, s, s
@@ -45,7 +46,7 @@ def slipping(folder: Path, slip: float) -> tuple[Path, Array]:
 def read(file: Path, *overrides: str) -> tuple[Samples, RowBuilder]:
     experiment = set_up(load_config(file, overrides))
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors)
-    return experiment.read(experiment.config.logs.train, True)[0], builder
+    return LogReader(experiment).read(experiment.config.logs.train, experiment.sensors)[0], builder
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")

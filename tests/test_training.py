@@ -27,6 +27,7 @@ from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.run.checkpoint import load_checkpoint, save_checkpoint
 from torchid.run.experiment import set_up
+from torchid.run.reading import LogReader
 from torchid.sensing import SensorNoise, named_sensors
 
 DEMO = Path(torchid.__file__).parent / "demo" / "quadruped.yaml"
@@ -61,7 +62,7 @@ def demo() -> World:
     assert config.estimator.ridge == RIDGE
     experiment = set_up(config)
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors)
-    return World.of(experiment.robot, builder, experiment.read(config.logs.train, True), 128)
+    return World.of(experiment.robot, builder, LogReader(experiment).read(config.logs.train, experiment.sensors), 128)
 
 
 def true_arm(robot: Robot) -> Array:

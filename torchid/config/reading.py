@@ -65,7 +65,8 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
     Args:
         kind: of the file.
         path: the YAML file; paths in it are relative to it.
-        overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory.
+        overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory. A mapping
+            adds to that of the file, unless it is empty: `key={}` clears it.
 
     Raises:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
@@ -73,7 +74,7 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
     """
     settings = _absolute(path, _read(kind, path), kind.paths, path.resolve().parent)
     given = _absolute("command line", _parsed(overrides), kind.paths, Path.cwd())
-    layers = [kind.prepare(settings, given), kind.prepare(given, {})]
+    layers = [_cleared(kind.prepare(settings, given), given), kind.prepare(given, {})]
     try:
         merged = _container(OmegaConf.merge(*layers))
     except (OmegaConfBaseException, TypeError) as error:
@@ -130,6 +131,17 @@ def _parsed(overrides: Sequence[str]) -> Settings:
     return _container(OmegaConf.from_dotlist(list(overrides)))
 
 
+def _cleared(settings: Settings, given: Settings) -> Settings:
+    """The settings without what stands in mappings that are given empty, which a merge would leave as they are."""
+    out = dict(settings)
+    for key, value in given.items():
+        if value == {} and isinstance(out.get(key), dict):
+            out[key] = {}
+        elif isinstance(value, dict) and isinstance(out.get(key), dict):
+            out[key] = _cleared(out[key], value)
+    return out
+
+
 def _container(config: Any) -> Any:
     return OmegaConf.to_container(config, resolve=True)
 
@@ -161,7 +173,7 @@ def _absolute_path(value: str, folder: Path) -> str:
     names = [len(os.fsencode(name)) for name in Path(path).parts]
     too_long = max(names) > _LONGEST_NAME or sum(names) + len(names) > _LONGEST_PATH
     if not value.strip() or not Path(path).name or not is_plain(value) or too_long:
-        raise ValueError(f"'{shown(value)}', no name of a file")
+        raise ValueError(f"'{shown(value)}', no name for a file or folder")
     return path
 
 

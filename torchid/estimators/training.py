@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import operator
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -213,7 +214,11 @@ class Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where `state_dict` was called."""
+        """Go on where `state_dict` was called.
+
+        Raises:
+            TypeError: numbers of epochs that are none; what else is no such state raises whatever torch does.
+        """
         self._learn(state["learned"])
         self._best = state["best"]
         self._load_optimizer(copy.deepcopy(state["optimizer"]))
@@ -221,8 +226,8 @@ class Trainer:
             self.schedule.load_state_dict(copy.deepcopy(state["schedule"]))
         torch.set_rng_state(state["random"][0])
         torch.cuda.set_rng_state_all(state["random"][1:])
-        self.epoch = state["epoch"]
-        self.best_epoch, self.best_loss = state["best_epoch"], state["best_loss"]
+        self.epoch, self.best_epoch = (operator.index(state[name]) for name in ("epoch", "best_epoch"))
+        self.best_loss = float(state["best_loss"])
 
     def _load_optimizer(self, state: dict[str, Any]) -> None:
         """Load an optimizer's state, scalars in the precision they had (torch would widen those of NAdam)."""

@@ -69,7 +69,7 @@ class Checked:
         """In one line."""
         count = int(self.condemned.sum())
         if self.reasons:
-            return f"not usable: {', '.join(self.reasons)}"
+            return f"not usable: {'; '.join(self.reasons)}"
         return f"usable without {count} of {len(self.log)} samples" if count else "usable"
 
 

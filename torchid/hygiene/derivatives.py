@@ -69,7 +69,8 @@ def judged(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -
         yield _finding("delay", SUSPICIOUS, name, channels, late, text, "leave the field out: it is derived then")
     if lost.any():
         text = f"does not follow {base}: correlation {np.nanmin(np.abs(found.correlation)):.2f} with its derivative"
-        advice = "leave the field out, or look for its frame"
+        cause = "the order of its joints" if name.startswith("joint") else "its frame"
+        advice = f"leave the field out: it is derived then; or look for {cause}"
         yield _finding("derivative", SUSPICIOUS, name, channels, lost, text, advice)
 
 

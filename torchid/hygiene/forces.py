@@ -11,14 +11,18 @@ from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped, lis
 from torchid.hygiene.mistakes import mistakes
 from torchid.hygiene.model import TRIED, ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
 from torchid.logs import Log
-from torchid.logs.fields import WRENCHES
+from torchid.logs.fields import WRENCHES, FloatArray
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
 #: Misfit above which usual mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
 WRONG = 0.4
-#: Share of the misfit that a mistake must leave to be the explanation.
+#: Share of the misfit that a mistake must leave to be the explanation; of 1 at most, which no forces at all leave: what
+#: is far too large fits better by any factor that makes it small.
 BETTER = 0.5
+#: Factor of single torques in another unit, and by which factor it may be missed: see `SCALE` in `model`.
+UNITS = {1e-3: "in mN m", 1e3: "in kN m"}
+_UNIT_WITHIN = 3.0
 _NAME = "forces against the URDF"
 
 
@@ -53,7 +57,7 @@ def forces(
 
 def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit) -> Finding:
     """The mistake that leaves the least misfit, if it leaves much less; else that nothing explains it."""
-    best, least = None, BETTER * fit.misfit
+    best, least = None, BETTER * min(fit.misfit, 1.0)
     for mistake in mistakes(log):
         if not _may_explain(mistake.field, fit):
             continue
@@ -64,12 +68,12 @@ def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: floa
         found = model_fit(samples, robot, contacts).misfit
         if found < least:
             best, least = mistake, found
-    apart = f"forces {_percent(fit.misfit)} apart from the URDF's"
+    apart = f"measured forces miss the URDF's by {_percent(fit.misfit)}"
     if best is None:
         text = f"{apart}, and no usual mistake explains it"
-        advice = "look at units, frames, friction, the base link and masses of the URDF"
+        advice = "look at units, frames, the order of joints and contacts, friction, the URDF's base link and masses"
         return Finding("forces", SUSPICIOUS, "all", text, advice)
-    text = f"{best.found}: {apart}, {_percent(least)} without this"
+    text = f"{best.found}: {apart}, by {_percent(least)} once corrected"
     return Finding("unit, sign or frame", CONDEMNED, best.field, text, best.advice)
 
 
@@ -82,7 +86,11 @@ def _may_explain(field: str, fit: ModelFit) -> bool:
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.3g} %" if share < 10.0 else f"{share:.3g} times"
+    return f"{100.0 * share:.3g} %" if share < 10.0 else f"{share:.3g} times their size"
+
+
+def _gains(gains: FloatArray) -> str:
+    return listed([f"{gain:.3g}" for gain in gains])
 
 
 def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped]:
@@ -90,14 +98,20 @@ def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
     reversed_ = fit.wrong & (fit.gain < 0.0)
     if reversed_.any():
         chosen = [str(name) for name in names[reversed_]]
-        gains = ", ".join(f"{gain:.2f}" for gain in fit.gain[reversed_][:4])
-        text = f"{listed(chosen)}: reversed; factors that fit the URDF best: {gains}"
+        text = f"{listed(chosen)}: reversed; factors that fit the URDF best: {_gains(fit.gain[reversed_])}"
         yield Finding("sign", CONDEMNED, "joint_torque", text, "reverse these torques", tuple(chosen))
-    scaled = fit.wrong & ~reversed_
+    other_unit = np.zeros(len(names), bool)
+    for factor, unit in UNITS.items():
+        here = fit.wrong & ~reversed_ & (np.abs(np.log(np.abs(fit.gain) / factor)) < np.log(_UNIT_WITHIN))
+        if here.any():
+            other_unit |= here
+            chosen = [str(name) for name in names[here]]
+            text = f"{listed(chosen)}: {unit}; factors that fit the URDF best: {_gains(fit.gain[here])}"
+            yield Finding("unit", CONDEMNED, "joint_torque", text, f"multiply by {factor:g}", tuple(chosen))
+    scaled = fit.wrong & ~reversed_ & ~other_unit
     if scaled.any():
         chosen = [str(name) for name in names[scaled]]
-        gains = ", ".join(f"{gain:.3g}" for gain in fit.gain[scaled][:4])
-        text = f"{listed(chosen)}: factors that fit the URDF best: {gains}"
+        text = f"{listed(chosen)}: factors that fit the URDF best: {_gains(fit.gain[scaled])}"
         advice = "look at gear ratios, torque constants and units"
         yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(chosen))
     if not fit.clear.all():

@@ -1,4 +1,8 @@
-"""Findings about sensors that repeat themselves: frozen, saturated, held at a lower rate, or constant."""
+"""Findings about sensors that repeat themselves: frozen, saturated, held at a lower rate, or constant.
+
+A velocity or an acceleration of exactly zero while its joint's position repeats as well is a joint at rest, or at a
+stop.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +17,25 @@ from torchid.logs.fields import WRENCHES, BoolArray, FloatArray
 
 #: Samples at the very same extreme value from which on it is a limit and no coincidence.
 AT_LIMIT = 5
+#: Fields that are zero while a joint rests.
+RATES = ("joint_velocity", "joint_acceleration")
 
 _Stuck = list[tuple[str, Runs]]
 
 
 def frozen(groups: Iterable[Group]) -> Iterator[Finding]:
     """Findings about frozen, held, saturated and constant channels."""
-    for group in groups:
+    given = tuple(groups)
+    positions = next((group for group in given if group.field == "joint_position"), None)
+    for group in given:
         steps = np.diff(group.values, axis=0)
         constant = (steps == 0.0).all(axis=0)
         if constant.any():
             yield from _constant(group, constant)
         if constant.all():
             continue
-        together = (steps[:, ~constant] == 0.0).all(axis=1) & group.joined
+        rests = _at_rest(group, steps, positions)
+        together = ((steps == 0.0) & ~rests)[:, ~constant].all(axis=1) & group.joined
         if every := held_for(together):
             yield _held(group, every)
             continue
@@ -35,15 +44,25 @@ def frozen(groups: Iterable[Group]) -> Iterator[Finding]:
             what = f"all {len(group.names)} channels" if len(group.names) > 1 else group.names[0]
             yield _frozen(group, what, [(name, runs) for name in group.names], len(runs))
         if len(group.names) > 1:
-            yield from _by_channel(group, steps, np.flatnonzero(~constant), runs.mask(len(steps)))
+            repeated = (steps == 0.0) & ~rests & (group.joined & ~runs.mask(len(steps)))[:, None]
+            yield from _by_channel(group, repeated, np.flatnonzero(~constant))
 
 
-def _by_channel(group: Group, steps: FloatArray, columns: np.ndarray, together: BoolArray) -> Iterator[Finding]:
-    """Channels that repeat by themselves."""
+def _at_rest(group: Group, steps: FloatArray, positions: Group | None) -> BoolArray:
+    """Which steps (M - 1, c) of joint velocities or accelerations are those of a joint that does not move."""
+    if positions is None or group.field not in RATES or not np.isin(group.samples, positions.samples).all():
+        return np.zeros(steps.shape, bool)
+    columns = [positions.names.index(name) for name in group.names]
+    position = positions.values[np.searchsorted(positions.samples, group.samples)][:, columns]
+    return np.asarray((steps == 0.0) & (group.values[1:] == 0.0) & (np.diff(position, axis=0) == 0.0))
+
+
+def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> Iterator[Finding]:
+    """Channels that repeat by themselves, of steps (M - 1, c)."""
     stuck: _Stuck = []
     limits: list[tuple[str, Runs, float]] = []
     for column in columns:
-        repeated = (steps[:, column] == 0.0) & group.joined & ~together
+        repeated = all_repeated[:, column]
         if held_for(repeated):
             continue
         name, values = group.names[column], group.values[:, column]
@@ -61,28 +80,33 @@ def _by_channel(group: Group, steps: FloatArray, columns: np.ndarray, together: 
         yield _saturated(group, limits)
 
 
-def _spans(group: Group, channel: str, runs: Runs) -> Iterator[Span]:
+def _spans(group: Group, channel: str, runs: Runs, skip: int = 1) -> Iterator[Span]:
+    """Samples that repeat the one before; with it for a `skip` of 0."""
     for first, last in zip(runs.first, runs.last, strict=True):
-        yield Span(int(group.samples[first + 1]), int(group.samples[last + 1]), channel)
+        yield Span(int(group.samples[first + skip]), int(group.samples[last + 1]), channel)
 
 
 def _frozen(group: Group, what: str, stuck: _Stuck, count: int) -> Finding:
     spans = tuple(span for name, runs in stuck for span in _spans(group, name, runs))
     longest = max(spans, key=len)
-    times = f"{counted(count, 'time')}, at most {counted(len(longest), 'sample')}, {longest}"
-    text = f"{what}: repeated to the last bit amid motion, {times}"
+    times = f"{counted(len(longest), 'sample')} at {longest}"
+    if count > 1:
+        times = f"{count} times, the longest {times}"
+    whose = f"{group.name}, " if group.name else ""
+    text = f"{whose}{what}: repeated to the last bit amid motion, {times}"
     advice = "leave these samples out; look for lost messages or a stalled driver"
     return Finding("frozen", CONDEMNED, group.field, text, advice, tuple(name for name, _ in stuck), spans)
 
 
 def _saturated(group: Group, limits: list[tuple[str, Runs, float]]) -> Finding:
-    spans = tuple(span for name, runs, _ in limits for span in _spans(group, name, runs))
+    spans = tuple(span for name, runs, _ in limits for span in _spans(group, name, runs, 0))
     names = tuple(dict.fromkeys(name for name, _, _ in limits))
-    channel, _, extreme = limits[0]
-    at = f"at an extreme value ({channel}: {extreme:.4g} {group.unit})"
-    text = f"{listed(names)}: {counted(len(spans), 'time')} {at}"
+    shares = [(name, extreme, 100.0 * np.mean(group.values == extreme, axis=0)) for name, _, extreme in limits]
+    text = "stays at an extreme value: " + listed(
+        [f"{name} at {at:.4g} {group.unit} in {share[group.names.index(name)]:.2g} %" for name, at, share in shares]
+    )
     if group.field == "joint_position":  # on a stop, or on the bound of an inverse kinematics: it may be right there
-        advice = "none if these are the joint's stops; else raise the bound"
+        advice = "none if these are the joints' stops; else widen the bounds of the encoder or inverse kinematics"
         return Finding("saturated", SUSPICIOUS, group.field, text, advice, names, spans)
     advice = "leave these samples out, or raise the sensor's range"
     return Finding("saturated", CONDEMNED, group.field, text, advice, names, spans)

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from torchid.hygiene.angles import TWO_TURNS
+from torchid.hygiene.finding import listed
 from torchid.hygiene.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES
@@ -17,6 +20,7 @@ from torchid.logs.quaternion import sign_continuous
 #: What follows from positions and orientation, whoever gives it.
 _JOINT_RATES = ("joint_velocity", "joint_acceleration")
 _BASE_RATES = ("base_angular_velocity_base", "base_angular_acceleration_base")
+_MOMENTS_IN_MILLI = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 _INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
 
 
@@ -37,7 +41,11 @@ def mistakes(log: Log) -> Iterator[Mistake]:
         if given:
             text, advice = f"{' and '.join(given)} not what positions say", "leave them out: they are derived then"
             yield Mistake(given[-1], text, advice, _without(given))
-    yield Mistake("joint_position", "in degrees", "convert to radians", _in_degrees)
+    yield Mistake("joint_position", "in degrees", "convert to radians", lambda log: _in_degrees(log, slice(None)))
+    far = np.flatnonzero(np.abs(log.joint_position).max(axis=0, initial=0.0) > TWO_TURNS)
+    if 0 < len(far) < len(log.joint_names):
+        some = f"{listed([log.joint_names[joint] for joint in far])} in degrees"
+        yield Mistake("joint_position", some, "convert to radians", lambda log: _in_degrees(log, far))
     if log.base_quat_xyzw is not None:
         order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, -1, axis=1)))
@@ -59,6 +67,8 @@ def _of_wrenches(field: str, other: str) -> Iterator[Mistake]:
     yield Mistake(field, "all reversed", reverse, _scaled(field, -1.0))
     for unit, factor in (("kN and kN m", 1e3), ("kg", GRAVITY), ("mN and mN m", 1e-3)):
         yield Mistake(field, f"in {unit}", f"multiply by {factor:g}", _scaled(field, factor))
+    moments = _change(lambda log: {field: getattr(log, field) * _MOMENTS_IN_MILLI})
+    yield Mistake(field, "moments in N mm", "multiply moments by 0.001", moments)
     axes = "along the world's axes" if other == WRENCHES[1] else "along the contact frames' axes"
     moved = _change(lambda log: {other: getattr(log, field), field: None})
     yield Mistake(field, axes, f"call it {other}", moved)
@@ -76,9 +86,11 @@ def _scaled(field: str, factor: float) -> Callable[[Log], Log]:
     return _change(lambda log: {field: factor * getattr(log, field)})
 
 
-def _in_degrees(log: Log) -> Log:
-    """The log in radians; velocities and accelerations, which may be right, are derived anew."""
-    return dataclasses.replace(_without(_JOINT_RATES)(log), joint_position=np.radians(log.joint_position))
+def _in_degrees(log: Log, joints: slice | NDArray[np.intp]) -> Log:
+    """The log with joints in radians; velocities and accelerations, which may be right, are derived anew."""
+    position = log.joint_position.copy()
+    position[:, joints] = np.radians(position[:, joints])
+    return dataclasses.replace(_without(_JOINT_RATES)(log), joint_position=position)
 
 
 def _quaternions(change: Callable[[Any], Any]) -> Callable[[Log], Log]:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from torchid.hygiene.channels import Group, median_step
-from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Span, listed
+from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, counted, listed
 from torchid.hygiene.jumps import LONGEST_SPIKE, Jump, jumps
 from torchid.hygiene.neighbours import near
 from torchid.logs import Log
@@ -79,13 +79,16 @@ def _finding(
 ) -> Finding:
     channels = tuple(dict.fromkeys(channel for channel, _ in found))
     channel, clearest = max(found, key=lambda pair: pair[1].spreads)
-    where = f"{clearest.first} to {clearest.last}" if clearest.lasting else str(_span("", clearest))
+    where = f"from {clearest.first} to {clearest.last}" if clearest.lasting else f"at {_span('', clearest)}"
     size = abs(clearest.size)
     if field == "base_quat_xyzw":
         size, unit = np.degrees(2.0 * size), "deg"
-    count = len({(jump.first, jump.last) for _, jump in found})
-    text = f"{count} in {listed(channels)}; the clearest, {size:.3g} {unit} or {clearest.spreads:.3g} local spreads,"
-    text += f" at {where} in {channel}"
+    elif "," in unit:
+        unit = "N" if channel.split()[-1].startswith("f") else "N m"
+    text = f"{channel} by {size:.3g} {unit} {where}, {clearest.spreads:.3g} times the noise around it"
+    if len(found) > 1:
+        count = len({(jump.first, jump.last) for _, jump in found})
+        text = f"{counted(count, 'jump')} in {listed(channels)}; the clearest: {text}"
     if spans is None:
         spans = tuple(_span(channel, jump) for channel, jump in found)
     return Finding(name, severity, field, text, advice, channels, spans)
@@ -147,10 +150,10 @@ def _position_steps(field: str, unit: str, lasting: _Jumps, samples: int) -> Ite
             yield _finding("step", CONDEMNED, field, unit, found, advice, spans)
         elif kind == "harmless":
             advice = "none at this size; look for a marker or an encoder that slipped"
-            yield _finding("step", SUSPICIOUS, field, unit, found, advice)
+            yield _finding("step", NOTE, field, unit, found, advice)
         elif kind == "short":
             spans = tuple(_shorter_side(jump, name, samples) for name, jump in found)
-            advice = "leave the shorter side out: its zero is another one"
+            advice = "leave out the shorter side, whose zero is another one"
             yield _finding("step", CONDEMNED, field, unit, found, advice, spans)
         else:
             advice = "split the log there and find out which part has the right zero"

@@ -84,5 +84,5 @@ def _gaps(steps: FloatArray, median: float, long: BoolArray) -> Finding:
     if steps[longest] > LONGEST_STEP * median:
         advice = f"split the log after sample {longest}: no spline is drawn across more than {LONGEST_STEP:g} steps"
         return Finding("gap", CONDEMNED, "time", found, advice)
-    advice = f"none with preprocessing.cutoff_hz well below {0.5 / steps[longest]:.3g}: half a period fits in a gap"
+    advice = f"keep preprocessing.cutoff_hz well below {0.5 / steps[longest]:.3g}: half a period fits in the gap then"
     return Finding("gap", SUSPICIOUS, "time", found, advice, spans=tuple(Span(int(i), int(i) + 1) for i in where))

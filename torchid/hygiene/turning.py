@@ -33,7 +33,7 @@ def turning(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
         if found is None:
             yield Skipped(_NAME, f"{field}: the log is too short")
             continue
-        mistaken = next(_explaining(log.time, quat, omega, found.misfit), None) if found.misfit > WRONG else None
+        mistaken = _explaining(log.time, quat, omega, found.misfit) if found.misfit > WRONG else None
         if mistaken is None:
             yield from judged(found, field, "base_quat", ("x", "y", "z"))
         else:
@@ -76,13 +76,19 @@ def _mistakes(quat: FloatArray, omega: FloatArray) -> Iterator[_Mistake]:
         other = sign_continuous(np.roll(quat, shift, axis=1))
         for value in (omega, rotate_back(other, rotate(quat, omega))):  # as it is, or as it was given in the world
             yield _Mistake(order, "rename base_quat_wxyz and base_quat_xyzw", "base_quat_xyzw", other, value)
+    yield _Mistake("the sign is reversed", "reverse it", "", quat, -omega)
     inverse = quat * np.array([-1.0, -1.0, -1.0, 1.0])
     yield _Mistake("rotates world to base, not base to world", "give the inverse", "base_quat_xyzw", inverse, omega)
 
 
-def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> Iterator[_Mistake]:
-    """Mistakes that leave little of a misfit once they are taken back."""
+def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> _Mistake | None:
+    """The mistake that leaves the least of a misfit once it is taken back, if that is little.
+
+    The least, for a base that turns little is as well off with the inverse as with the reverse.
+    """
+    best, least = None, BETTER * misfit
     for mistake in _mistakes(quat, omega):
         found = compare(time, integral(time, _omega(time, mistake.quat)), mistake.omega)
-        if found is not None and found.misfit < BETTER * misfit:
-            yield mistake
+        if found is not None and found.misfit < least:
+            best, least = mistake, found.misfit
+    return best

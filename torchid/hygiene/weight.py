@@ -75,7 +75,9 @@ def _judged(carried: float, when: str, field: str, robot: Robot | None) -> Itera
         advice = "look for a contact that is not measured, a payload, a sensor's offset or gain"
         yield Finding("weight", SUSPICIOUS, field, text, advice)
     elif abs(ratio - 1.0) > KNOWN:
-        yield Finding("weight", NOTE, field, text, "identification will tell, if no sensor has an offset")
+        yield Finding(
+            "weight", NOTE, field, text, "none if the URDF may be that far off; a sensor's offset looks the same"
+        )
 
 
 def _upward(log: Log, robot: Robot | None) -> FloatArray | str:

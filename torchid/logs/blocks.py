@@ -28,15 +28,15 @@ _SMALL = 4  # a cell of a table takes two characters at least, a number eight by
 
 
 def size_of(path: Path, limit: float) -> int:
-    """Bytes of a log's arrays, 0 for a bag, which is always read whole, and for a table that must be below a limit.
+    """Bytes of a log's arrays, at most for a CSV file if that is below a limit, 0 for a bag, which is read whole.
 
     Raises:
         LogError: the file cannot be read.
     """
     kind = kind_to_read(path)
     if kind is Kind.TABLE:
-        compressed = path.suffix.lower() != ".csv"
-        return table_size(path) if compressed or _SMALL * path.stat().st_size > limit else 0
+        most = _SMALL * path.stat().st_size
+        return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
     if kind is Kind.BAG:
         return 0
     with open_container(path, whole=False) as container:

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.hygiene import Checked, Finding, Span
+from torchid.hygiene.finding import listed
 from torchid.logs.fields import FloatArray
 
 _SPANS = 3
@@ -29,10 +30,26 @@ def hygiene_table(findings: Sequence[Finding]) -> Table:
     table.add_column("samples", overflow="fold", max_width=12)
     table.add_column("found", overflow="fold", ratio=8)
     table.add_column("what to do", overflow="fold", ratio=5)
-    for finding in findings:
+    for finding, *others in _alike(findings):
         found = f"{finding.field}, {finding.name}: {finding.found}"
+        if others:
+            found += f"; likewise {listed([other.field for other in others])}"
         table.add_row(finding.severity, Text(_places(finding)), Text(found), Text(finding.advice))
     return table
+
+
+def _alike(findings: Sequence[Finding]) -> list[list[Finding]]:
+    """Findings, those together that say the same of several fields at the same samples."""
+    rows: dict[object, list[Finding]] = {}
+    for finding in findings:
+        same = (finding.name, finding.severity, finding.advice, _ranges(finding) or finding)
+        rows.setdefault(same, []).append(finding)
+    return list(rows.values())
+
+
+def _ranges(finding: Finding) -> tuple[tuple[int, int], ...]:
+    """First and last samples of its spans in ascending order; empty if it concerns all."""
+    return tuple(sorted({(span.first, span.last) for span in finding.spans}))
 
 
 def not_checked(checked: Checked) -> str:
@@ -44,7 +61,7 @@ def not_checked(checked: Checked) -> str:
 
 
 def _places(finding: Finding) -> str:
-    spans = list(dict.fromkeys(str(span) for span in finding.spans))
+    spans = [str(Span(first, last)) for first, last in _ranges(finding)]
     if not spans:
         return "all"
     return ", ".join(spans[:_SPANS]) + (f" and {len(spans) - _SPANS} more" if len(spans) > _SPANS else "")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -15,6 +14,9 @@ from torchid.errors import InputError
 from torchid.estimators import Estimate
 from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
 from torchid.robot import Robot
+
+_LARGEST = 1e100
+_ACCEPTED = "a number between -1e100 and 1e100"
 
 
 def parameters_document(
@@ -96,8 +98,8 @@ def read_shared_extras(path: Path) -> dict[str, float]:
         if not (isinstance(entry, dict) and isinstance(entry.get("label"), str)):
             raise InputError(path, "extras", "an entry without a label", "what torchid identify wrote")
         value = entry.get("value")
-        if not _is_finite(value):
-            raise InputError(path, f"extras, {entry['label']}, value", f"{value!r}", "a finite number")
+        if not _is_usable(value):
+            raise InputError(path, f"extras, {entry['label']}, value", f"{value!r}", _ACCEPTED)
         if entry.get("log") is None:
             out[entry["label"]] = float(value)
     return out
@@ -114,10 +116,11 @@ def read_parameters(path: Path, robot: Robot) -> Array:
         InputError: the file cannot be read or holds other bodies.
     """
     bodies = _document(path).get("bodies")
-    names = [body.get("name") if isinstance(body, dict) else None for body in bodies or []]
+    bodies = bodies if isinstance(bodies, list) else []
+    names = [body.get("name") if isinstance(body, dict) else None for body in bodies]
     if names != list(robot.body_names):
         raise InputError(path, "bodies", f"not the bodies of {robot.path}", ", ".join(robot.body_names))
-    return np.array([[_number(path, body, name) for name in PARAMETERS] for body in bodies or []])
+    return np.array([[_number(path, body, name) for name in PARAMETERS] for body in bodies])
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -131,14 +134,14 @@ def _document(path: Path) -> dict[str, Any]:
 def _number(path: Path, body: dict[str, Any], name: str) -> float:
     identified = body.get("identified")
     value = identified.get(name) if isinstance(identified, dict) else None
-    if not _is_finite(value):
-        raise InputError(path, f"body '{body['name']}', identified.{name}", f"{value!r}", "a finite number")
+    if not _is_usable(value):
+        raise InputError(path, f"body '{body['name']}', identified.{name}", f"{value!r}", _ACCEPTED)
     return float(value)
 
 
-def _is_finite(value: object) -> TypeGuard[float]:
-    """Whether it is a number that a float64 can hold."""
-    return not isinstance(value, bool) and isinstance(value, (int, float)) and abs(value) <= sys.float_info.max
+def _is_usable(value: object) -> TypeGuard[float]:
+    """Whether it is a number whose products and squares a float64 can hold."""
+    return not isinstance(value, bool) and isinstance(value, (int, float)) and abs(value) <= _LARGEST
 
 
 def _plain(x: Any) -> float | bool | str | None:

@@ -28,6 +28,7 @@ from torchid.run.experiment import set_up_scene
 from torchid.run.folder import ANALYSIS, check_free
 from torchid.run.progress import progress_bars
 from torchid.run.questions import Asked, asked, placed, scenarios
+from torchid.run.reading import LogReader
 from torchid.sensing import Contact, SensorSet
 
 
@@ -65,7 +66,7 @@ def analyze(config: AnalyzeConfig, source: object = "experiment") -> Analysis:
 
 
 def _read(ask: Asked, bars: Progress) -> tuple[list[Samples], list[Samples]]:
-    files, read = ask.scene.config.logs, ask.scene.read_logs
+    files, reader = ask.scene.config.logs, LogReader(ask.scene)
     if files is None:
         return [], []
     reading = bars.add_task("reading logs", total=len(files.train) + len(files.test))
@@ -73,7 +74,7 @@ def _read(ask: Asked, bars: Progress) -> tuple[list[Samples], list[Samples]]:
     def done(_: Path) -> None:
         bars.advance(reading)
 
-    return read(files.train, ask.proposal, done), read(files.test, None, done)
+    return reader.read(files.train, ask.proposal, done), reader.read(files.test, None, done)
 
 
 def _answered(ask: Asked, name: str, states: tuple[State, ...], train: Sequence[Samples], bars: Progress) -> Scenario:

@@ -15,6 +15,7 @@ from torchid.run.calibration import Calibration
 from torchid.run.experiment import set_up
 from torchid.run.folder import check_free, new_folder, write_json
 from torchid.run.progress import progress_bars
+from torchid.run.reading import LogReader
 from torchid.run.results import candidates, forces_of
 
 
@@ -52,7 +53,8 @@ def evaluate(
         phi = read_parameters(folder / "parameters.json", robot).flatten()
         calibration = Calibration(experiment, phi, read_shared_extras(folder / "parameters.json"))
         reading = bars.add_task("reading logs", total=len(logs))
-        samples = experiment.read([Path(log) for log in logs], False, lambda _: bars.advance(reading))
+        reader = LogReader(experiment)
+        samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
         samples = calibration.logs(samples)
         evaluation = Evaluation(robot, experiment.contacts, config.device, experiment.terms)
         both = candidates(robot, calibration.parameters(evaluation))
@@ -68,7 +70,7 @@ def evaluate(
             name: {"identified": after.as_dict(), "nominal": before.as_dict()}
             for name, (before, after) in metrics.items()
         }
-        for path, count in experiment.excluded.items():
+        for path, count in reader.excluded.items():
             document[Path(path).stem]["excluded_samples"] = count
         with new_folder(output, overwrite=True) as new:
             (new / "config.yaml").write_text((folder / "config.yaml").read_text())

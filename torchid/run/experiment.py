@@ -1,25 +1,17 @@
-"""What commands share: robot, contacts, sensors and logs of an experiment file."""
+"""What commands share: robot, contacts and sensors of an experiment file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.sensors import ChoiceConfig
-from torchid.errors import ConfigError, LogError, UnknownNameError
-from torchid.hygiene import Checked, check, without_condemned
-from torchid.logs import Log, preprocess, read_log
-from torchid.logs.blocks import size_of
-from torchid.problem import Samples, bind
+from torchid.errors import ConfigError, UnknownNameError
 from torchid.problem.extras import ExtraTerms
 from torchid.robot import Robot, load_robot
 from torchid.robot.tree import FT_FIELD
-from torchid.run.large_logs import GIGABYTE, LargeLog, away_from_changes, folder_beside
 from torchid.sensing import (
     Contact,
     SensorNoise,
@@ -33,15 +25,11 @@ from torchid.sensing import (
 
 @dataclass(frozen=True)
 class Scene:
-    """Robot and contacts of an experiment file, and what is read or chosen by their names.
-
-    `excluded`: how many samples of each log that was read were left out because they are condemned.
-    """
+    """Robot and contacts of an experiment file, and what is chosen by their names."""
 
     config: ExperimentConfig | AnalyzeConfig
     robot: Robot
     contacts: tuple[Contact, ...]
-    excluded: dict[str, int] = field(default_factory=dict, kw_only=True)
 
     @property
     def noise(self) -> SensorNoise:
@@ -69,59 +57,6 @@ class Scene:
             sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, source, ft)
         return with_ft_sensors(sensors, robot, choice.ft_sensors, source)
 
-    def read_logs(
-        self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
-    ) -> list[Samples]:
-        """Read, preprocess and bind logs; each on its own, so that nothing is differentiated across a seam.
-
-        Args:
-            paths: log files.
-            required: sensors that must have been recorded.
-            on_read: called after each file.
-        """
-        logs = []
-        for path in paths:
-            limit = GIGABYTE * self.config.preprocessing.memory_gb
-            size = size_of(path, limit)
-            logs.append(self._read(path, required) if size <= limit else self._read_large(path, required, size))
-            if on_read is not None:
-                on_read(path)
-        return logs
-
-    def _read(self, path: Path, required: SensorSet | None) -> Samples:
-        """A log that fits into memory."""
-        settings, files = self.config.preprocessing, self.config.logs
-        recorded = read_log(path, None if files is None else files.topics)
-        checked = self._checked(recorded)
-        clean = recorded if checked is None else checked.repaired
-        log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
-        samples = bind(log, self.robot, self.contacts, required)
-        if checked is not None:
-            count = len(samples)
-            samples = without_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
-            self.excluded[str(path)] = count - len(samples)
-        if settings.contact_margin_s is None:
-            return samples
-        kept = away_from_changes(recorded, samples.time.numpy(), settings.contact_margin_s)
-        return samples if kept is None else samples[torch.from_numpy(np.flatnonzero(kept))]
-
-    def _read_large(self, path: Path, required: SensorSet | None, size: int) -> Samples:
-        """A log that does not."""
-        settings = self.config.preprocessing
-        if settings.exclude_condemned:
-            found = f"set for arrays of {size / GIGABYTE:.2g} GB, which are not in memory at once"
-            accepted = (
-                f"a preprocessing.memory_gb above {size / GIGABYTE:.2g}, or parts of the log that torchid check passes"
-            )
-            raise LogError(path, "preprocessing.exclude_condemned", found, accepted)
-        folder = folder_beside(self.config.output)
-        return LargeLog(path, settings, self.robot, self.contacts, required, folder).samples()
-
-    def _checked(self, log: Log) -> Checked | None:
-        """What the checks of a log say, if condemned samples are to be left out."""
-        settings = self.config.preprocessing
-        return check(log, self.robot, self.contacts, settings.cutoff_hz) if settings.exclude_condemned else None
-
 
 @dataclass(frozen=True)
 class Experiment(Scene):
@@ -129,12 +64,6 @@ class Experiment(Scene):
 
     config: ExperimentConfig
     sensors: SensorSet
-
-    def read(
-        self, paths: Sequence[Path], required: bool, on_read: Callable[[Path], None] | None = None
-    ) -> list[Samples]:
-        """As `read_logs`; `required` says whether every sensor of the set must have been recorded."""
-        return self.read_logs(paths, self.sensors if required else None, on_read)
 
 
 def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "experiment") -> Scene:

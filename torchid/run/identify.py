@@ -31,6 +31,7 @@ from torchid.run.experiment import Experiment, set_up
 from torchid.run.fit import Fit, fitted
 from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
+from torchid.run.reading import LogReader
 from torchid.run.results import Identification, candidates, write_run
 from torchid.run.robust import RobustSummary, loss_of, robust_fit
 from torchid.run.training import Training, check_training, training_folder
@@ -77,7 +78,8 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             conditions = stated_conditions(config.estimator, experiment.robot, source)
             training = Training(config, experiment.robot, source) if config.estimator.name == "sgd" else None
             estimator = training or batch_estimator(config.estimator, conditions)
-            logs = _read(experiment, bars)
+            reader = LogReader(experiment)
+            logs = _read(reader, experiment, bars)
         with clock("compress"):
             scene = experiment.robot, experiment.contacts, experiment.sensors, experiment.terms
             builder = RowBuilder(*scene).to(config.device)
@@ -119,6 +121,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             broken,
             clock.seconds,
             samples,
+            reader.excluded,
             total_mass(fit.assembly, estimate, config.estimator.rank_tolerance),
         )
         bars.add_task("writing", total=None)
@@ -127,12 +130,14 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
     return run
 
 
-def _read(experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
+def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
     """Logs by use; those that are trained on, or decide when to stop, have every sensor of the set."""
     files = experiment.config.logs
     reading = bars.add_task("reading logs", total=len(files.train) + len(files.validation) + len(files.test))
     return {
-        name: experiment.read(getattr(files, name), name != "test", lambda _: bars.advance(reading))
+        name: reader.read(
+            getattr(files, name), None if name == "test" else experiment.sensors, lambda _: bars.advance(reading)
+        )
         for name in ("train", "validation", "test")
     }
 

@@ -39,7 +39,8 @@ class Identification:
     """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
 
     `extras`: unknowns beside the bodies' parameters. `robust`: how outliers were weighed down, if so. `mass`: how well
-    the total mass is known. `adds`: what each training log, contact state and sensor adds.
+    the total mass is known. `excluded`: condemned samples left out, by log. `adds`: what each training log, contact
+    state and sensor adds.
     """
 
     experiment: Experiment
@@ -53,6 +54,7 @@ class Identification:
     violations: list[Violation]
     seconds: dict[str, float]
     samples: int
+    excluded: Mapping[str, int]
     mass: TotalMass
 
     def violations_by_name(self) -> list[dict[str, object]]:
@@ -138,7 +140,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "parameters": int(estimate.phi.size),
         "condition_number": estimate.condition_number if estimate.rank else None,
         "samples": run.samples,
-        "excluded_samples": run.experiment.excluded,
+        "excluded_samples": run.excluded,
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
         "total_mass": float(run.phi[:, 0].sum()),

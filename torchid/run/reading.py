@@ -1,0 +1,94 @@
+"""Logs on their way from files to a robot's samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchid.errors import LogError
+from torchid.hygiene import Checked, check, without_condemned
+from torchid.logs import Log, preprocess, read_log
+from torchid.logs.blocks import size_of
+from torchid.problem import Samples, bind
+from torchid.run.experiment import Scene
+from torchid.run.large_logs import GIGABYTE, LargeLog, away_from_changes, folder_beside
+from torchid.sensing import SensorSet
+
+
+class LogReader:
+    """Reads, preprocesses and binds logs; each on its own, so that nothing is differentiated across a seam.
+
+    Logs whose arrays together take more than the memory they may take are kept on the disk from then on.
+
+    Attributes:
+        scene: robot, contacts and settings.
+        excluded: how many samples of each log were left out because they are condemned, by path.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.excluded: dict[str, int] = {}
+        self._held = 0  # bytes of the arrays of logs in memory
+
+    def read(
+        self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
+    ) -> list[Samples]:
+        """The samples of log files.
+
+        Args:
+            paths: log files.
+            required: sensors that must have been recorded.
+            on_read: called after each file.
+
+        Raises:
+            LogError: a file that cannot be read, or does not fit the robot.
+        """
+        limit, logs = GIGABYTE * self.scene.config.preprocessing.memory_gb, []
+        for path in paths:
+            size = size_of(path, limit - self._held)
+            if self._held + size <= limit:
+                self._held += size
+                logs.append(self._small(path, required))
+            else:
+                logs.append(self._large(path, required, size))
+            if on_read is not None:
+                on_read(path)
+        return logs
+
+    def _small(self, path: Path, required: SensorSet | None) -> Samples:
+        """A log that fits into memory."""
+        settings, files = self.scene.config.preprocessing, self.scene.config.logs
+        recorded = read_log(path, None if files is None else files.topics)
+        checked = self._checked(recorded)
+        clean = recorded if checked is None else checked.repaired
+        log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
+        samples = bind(log, self.scene.robot, self.scene.contacts, required)
+        if checked is not None:
+            count = len(samples)
+            samples = without_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
+            self.excluded[str(path)] = count - len(samples)
+        if settings.contact_margin_s is None:
+            return samples
+        kept = away_from_changes(recorded, samples.time.numpy(), settings.contact_margin_s)
+        return samples if kept is None else samples[torch.from_numpy(np.flatnonzero(kept))]
+
+    def _large(self, path: Path, required: SensorSet | None, size: int) -> Samples:
+        """A log that does not."""
+        settings = self.scene.config.preprocessing
+        if settings.exclude_condemned:
+            together = (self._held + size) / GIGABYTE
+            found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
+            accepted = f"a preprocessing.memory_gb above {together:.2g}, or parts of the logs that torchid check passes"
+            raise LogError(path, "preprocessing.exclude_condemned", found, accepted)
+        folder = folder_beside(self.scene.config.output)
+        return LargeLog(path, settings, self.scene.robot, self.scene.contacts, required, folder).samples()
+
+    def _checked(self, log: Log) -> Checked | None:
+        """What the checks of a log say, if condemned samples are to be left out."""
+        settings = self.scene.config.preprocessing
+        if not settings.exclude_condemned:
+            return None
+        return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz)
