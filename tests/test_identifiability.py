@@ -16,7 +16,9 @@ from torchid.analysis.information import Knowledge, prior_directions
 from torchid.analysis.sensor_information import sensor_information
 from torchid.estimators import LeastSquares
 from torchid.estimators.result import VERDICTS
-from torchid.problem import LinearProblem, RowBuilder, Samples, bind, linear_problem
+from torchid.problem import LinearProblem, RowBuilder, Samples, bind
+from torchid.problem.elimination import assemble
+from torchid.problem.extras import ExtraTerms
 from torchid.problem.streaming import Part, compress, compress_parts, merged
 from torchid.report.tables import contribution_table, table_text, verdict_table
 from torchid.robot import Robot
@@ -97,10 +99,11 @@ class World:
     contacts: tuple[Contact, ...]
     sensors: SensorSet
     logs: list[Samples]
+    terms: ExtraTerms = ExtraTerms()
 
     @property
     def builder(self) -> RowBuilder:
-        return RowBuilder(self.robot, self.contacts, self.sensors)
+        return RowBuilder(self.robot, self.contacts, self.sensors, self.terms)
 
 
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
@@ -204,8 +207,7 @@ def test_some_samples_stand_for_all() -> None:
 def identified(w: World, logs: Sequence[Samples] | None = None) -> tuple[list[Part], LinearProblem, RowBuilder]:
     builder = w.builder
     parts = compress_parts(w.logs if logs is None else logs, builder)
-    factor = merged((part.factor for part in parts), builder)
-    return parts, linear_problem(factor, builder, w.robot), builder
+    return parts, assemble(parts, builder, w.robot).problem, builder
 
 
 def adds(w: World) -> Contributions:
@@ -223,11 +225,22 @@ def knowledge(w: World, logs: Sequence[Samples]) -> tuple[Knowledge, int]:
     return Knowledge(bits, np.trace(np.linalg.solve(unit + H, H))), LeastSquares().solve(problem).rank
 
 
-@pytest.fixture(scope="module")
-def three_logs() -> World:
-    """Logs of 4, 9 and 5 samples, cycling through the contact states, joint torques alone."""
-    w = quadruped(named_sensors("joints", 12, 4, NOISE), samples=(4, 9, 5))
-    return replace(w, logs=[replace(log, oversampling=2.5) for log in w.logs])
+UNKNOWN = {
+    "no more": ExtraTerms(),
+    "offsets of logs": ExtraTerms(offsets={"joint_torque": "log"}),
+    "offsets and armatures of all": ExtraTerms(offsets={"joint_torque": "all"}, armature=True),
+    "some of logs and some of all": ExtraTerms(
+        {"joint_torque": "log", "contact_force": "all"}, scales={"contact_force": "log"}, armature=True
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=UNKNOWN)
+def three_logs(request: pytest.FixtureRequest) -> World:
+    """Logs of 4, 9 and 5 samples, cycling through the contact states."""
+    terms = UNKNOWN[request.param]
+    w = quadruped(named_sensors("full" if terms.scales else "joints", 12, 4, NOISE), samples=(4, 9, 5))
+    return replace(w, logs=[replace(log, oversampling=2.5) for log in w.logs], terms=terms)
 
 
 def test_what_a_log_adds_is_what_a_fit_without_it_lacks(three_logs: World) -> None:
@@ -275,8 +288,9 @@ def test_a_log_that_repeats_another_loses_no_rank_and_fewer_bits_than_it_holds(t
     assert first.bits <= 0.5 * alone.logs[0].rank  # twice the samples: half a bit for every combination, at most
 
 
-def test_sensors_are_ranked_by_what_a_fit_without_them_lacks() -> None:
-    w = quadruped(named_sensors("full", 12, 4, NOISE), samples=(60,))
+@pytest.mark.parametrize("unknown", UNKNOWN)
+def test_sensors_are_ranked_by_what_a_fit_without_them_lacks(unknown: str) -> None:
+    w = replace(quadruped(named_sensors("full", 12, 4, NOISE), samples=(60, 40)), terms=UNKNOWN[unknown])
     whole, _ = knowledge(w, w.logs)
     found = adds(w).sensors
     assert [s.bits for s in found] == sorted((s.bits for s in found), reverse=True)

@@ -2,36 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from torchid.analysis.information import Knowledge, prior_directions, triangle
-from torchid.analysis.sensor_information import SensorInformation, sensor_information
+from torchid.analysis.information import Knowledge, prior_directions
+from torchid.analysis.left_out import Contribution, PartContribution, ScaledParts, Unknowns, left_out
+from torchid.analysis.sensor_information import SAMPLES, SensorInformation, sensor_information, sum_of
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.plan import state_name
 from torchid.problem.streaming import Part
 from torchid.problem.threads import one_thread
-
-
-@dataclass(frozen=True)
-class Contribution:
-    """Bits and combinations, as in `Knowledge`, that are lost without a part of the data."""
-
-    name: str
-    bits: float
-    determined: float
-
-
-@dataclass(frozen=True)
-class PartContribution(Contribution):
-    """Of a log or a contact state: its samples, the rank of its rows alone, and how far that of all falls without."""
-
-    samples: int
-    rank: int
-    rank_lost: int
 
 
 @dataclass(frozen=True)
@@ -63,6 +46,7 @@ def contributions(
 ) -> Contributions:
     """Leave every log, contact state and sensor out in turn.
 
+    Only the bodies' parameters are asked for: offsets and the like count as unknown, those of a log in every log anew.
     Logs and contact states are exact, sensors as in `sensor_information`.
 
     Args:
@@ -75,85 +59,38 @@ def contributions(
         done: called with the number of samples worked through.
     """
     directions = prior_directions(builder, problem.scale * problem.free)
-    factors = [_information_factor(part, directions) for part in parts]
-    states = _groups(parts, factors, [state_name(builder.contacts, part.state) for part in parts])
-    states.sort(key=lambda group: -group.samples)
-    everything = _singular_values(np.concatenate([group.factor for group in states]))
-    by_log, by_contact_state = (
-        _left_out(groups, everything, rank_tolerance)
-        for groups in (_groups(parts, factors, [part.source for part in parts]), states)
-    )
-    information = sensor_information(logs, builder, done=done)
-    sensors = _sensors(information, directions, builder, dof_names)
-    return Contributions(Knowledge.of(everything**2), by_log, by_contact_state, sensors)
+    unknowns = Unknowns.of(builder, directions)
+    data = ScaledParts(parts, directions, unknowns)
+    by_log = left_out(data, [part.source for part in parts], rank_tolerance)
+    by_state = left_out(data, [state_name(builder.contacts, part.state) for part in parts], rank_tolerance)
+    by_state.sort(key=lambda state: -state.samples)
+    information = _sensor_information(logs, builder, directions, unknowns, done)
+    sensors = _sensors(information.without(unknowns.of_all), builder, dof_names)
+    return Contributions(Knowledge.of(data.everything**2), by_log, by_state, sensors)
 
 
-def _information_factor(part: Part, directions: Array) -> Array:
-    """X with `X^T X` the information of a part, correlated noise taken into account."""
-    R = part.factor.triangle().numpy()[:-1, :-1]
-    return np.asarray(R @ directions / np.sqrt(part.factor.oversampling))
+def _sensor_information(
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    directions: Array,
+    unknowns: Unknowns,
+    done: Callable[[int], None] | None,
+) -> SensorInformation:
+    """As `sensor_information` has it, in scaled columns, without what is unknown in each log."""
+
+    def scaled(H: Array) -> Array:
+        return np.asarray(directions.T @ H @ directions)
+
+    if not unknowns.of_log:
+        return sensor_information(logs, builder, done=done).changed(scaled)
+    sources = {samples.source: [other for other in logs if other.source == samples.source] for samples in logs}
+    most = max(SAMPLES // len(sources), 1)
+    found = (sensor_information(same, builder, most, done).changed(scaled) for same in sources.values())
+    return sum_of([information.without(unknowns.of_log) for information in found])
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Parts that are left out together, and X with `X^T X` their information."""
-
-    name: str
-    samples: int
-    factor: Array
-
-
-def _groups(parts: Sequence[Part], factors: Sequence[Array], names: Sequence[str]) -> list[_Group]:
-    """Parts of one name together."""
-    members = {name: [i for i, other in enumerate(names) if other == name] for name in dict.fromkeys(names)}
-    return [
-        _Group(name, sum(parts[i].samples for i in chosen), triangle(np.concatenate([factors[i] for i in chosen])))
-        for name, chosen in members.items()
-    ]
-
-
-def _left_out(groups: Sequence[_Group], everything: Array, rank_tolerance: float) -> list[PartContribution]:
-    """What is lost without each group, with the singular values of all together."""
-    out = []
-    for group, others in zip(groups, _without_each([group.factor for group in groups]), strict=True):
-        rest = _singular_values(others)
-        lost = Knowledge.of(everything**2) - Knowledge.of(rest**2)
-        rank = _rank(_singular_values(group.factor), rank_tolerance)
-        rank_lost = _rank(everything, rank_tolerance) - _rank(rest, rank_tolerance)
-        out.append(PartContribution(group.name, lost.bits, lost.determined, group.samples, rank, rank_lost))
-    return out
-
-
-def _without_each(factors: Sequence[Array]) -> Iterator[Array]:
-    """For every factor, one of all others, from those of the ones before and after it: no pair is merged twice."""
-    nothing = factors[0][:0]
-    after = [nothing]
-    for factor in reversed(factors[1:]):
-        after.append(triangle(np.concatenate([factor, after[-1]])))
-    before = nothing
-    for factor in factors:
-        yield np.concatenate([before, after.pop()])
-        before = triangle(np.concatenate([before, factor]))
-
-
-def _singular_values(X: Array) -> Array:
-    """Of a matrix, descending."""
-    return np.asarray(np.linalg.svd(X, compute_uv=False))
-
-
-def _rank(values: Array, tolerance: float) -> int:
-    """As `LeastSquares` counts it."""
-    least = max(tolerance, np.finfo(float).eps * len(values)) * values.max(initial=0.0)
-    return int((values > least).sum())
-
-
-def _sensors(
-    information: SensorInformation, directions: Array, builder: RowBuilder, dof_names: Sequence[str]
-) -> list[SensorContribution]:
-    def known(H: Array) -> Knowledge:
-        return Knowledge.of(np.asarray(np.linalg.eigvalsh(directions.T @ H @ directions)))
-
-    everything, out = known(information.total), []
+def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Sequence[str]) -> list[SensorContribution]:
+    everything, out = _known(information.total), []
     frames = [contact.frame for contact in builder.contacts]
     limbs = [name.rpartition(".")[0] for name in dof_names[builder.tree.n :: 6]]
     for kind, names, lost in (
@@ -162,6 +99,10 @@ def _sensors(
         ("contact wrench", frames, information.wrenches),
     ):
         for place, H in lost.items():
-            gone = everything - known(information.total - H)
+            gone = everything - _known(information.total - H)
             out.append(SensorContribution(names[place], gone.bits, gone.determined, kind))
     return sorted(out, key=lambda found: -found.bits)
+
+
+def _known(H: Array) -> Knowledge:
+    return Knowledge.of(np.asarray(np.linalg.eigvalsh(H)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,31 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
 def triangle(X: Array) -> Array:
     """Triangular R, (min(M, N), N), with `R^T R = X^T X`."""
     return np.asarray(np.linalg.qr(X, mode="r"))
+
+
+def without(X: Array, unknown: Sequence[int]) -> Array:
+    """Rows of the other columns that say the same of them as X, (R, N), does where some columns are unknown."""
+    if not unknown:
+        return X
+    rest = np.delete(X, unknown, axis=1)
+    columns = X[:, list(unknown)]
+    size = np.linalg.norm(columns, axis=0)
+    U, values, _ = np.linalg.svd(columns / np.where(size > 0.0, size, 1.0), full_matrices=True)
+    left = U[:, int((values > DEPENDENT).sum()) :].T @ rest
+    left[:, np.linalg.norm(left, axis=0) < DEPENDENT * np.linalg.norm(rest, axis=0)] = 0.0
+    return np.asarray(left)
+
+
+def information_without(H: Array, unknown: Sequence[int], size: Array) -> Array:
+    """As `without`, of H = X^T X; what is below the share `DEPENDENT` of `size`, (M,), of an unknown is rounding."""
+    if not unknown:
+        return H
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
+    crossed = np.delete(H[list(unknown)], unknown, axis=1) * scale[:, None]
+    values, V = np.linalg.eigh(H[np.ix_(unknown, unknown)] * scale * scale[:, None])
+    along = V[:, values > DEPENDENT].T @ crossed
+    rest = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
+    return np.asarray(rest - along.T @ (along / values[values > DEPENDENT, None]))
 
 
 def information_in(rows: Tensor, weight: float) -> Tensor:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.analysis.information import DEPENDENT, information_in, unit_readings
+from torchid.analysis.information import DEPENDENT, information_in, information_without, unit_readings
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import by_state, spread_by_state
@@ -17,7 +17,9 @@ from torchid.problem.measured import measured_components
 from torchid.problem.plan import State
 from torchid.problem.threads import one_thread
 
-_SAMPLES = 2000  # whose rows stand for those of all
+SAMPLES = 2000
+"""Whose rows stand for those of all, about."""
+
 _CHUNK = 256  # samples whose rows are computed together
 
 
@@ -34,11 +36,39 @@ class SensorInformation:
     limbs: Mapping[int, Array]
     wrenches: Mapping[int, Array]
 
+    def changed(self, change: Callable[[Array], Array]) -> SensorInformation:
+        """With every matrix changed by a linear map."""
+        return SensorInformation(
+            change(self.total),
+            *({place: change(H) for place, H in of.items()} for of in (self.torques, self.limbs, self.wrenches)),
+        )
+
+    def without(self, unknown: Sequence[int]) -> SensorInformation:
+        """What is told of the other columns, where some are unknown."""
+        size = np.diag(self.total)[list(unknown)]
+        total = information_without(self.total, unknown, size)
+        found = self.changed(lambda H: total - information_without(self.total - H, unknown, size))
+        return replace(found, total=total)
+
+
+def sum_of(found: Sequence[SensorInformation]) -> SensorInformation:
+    """Of logs together that have nothing unknown in common but the columns."""
+
+    def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
+        return {place: np.asarray(sum(one[place] for one in matrices)) for place in matrices[0]}
+
+    return SensorInformation(
+        np.asarray(sum(one.total for one in found)),
+        added([one.torques for one in found]),
+        added([one.limbs for one in found]),
+        added([one.wrenches for one in found]),
+    )
+
 
 @one_thread()
 @torch.no_grad()
 def sensor_information(
-    logs: Sequence[Samples], builder: RowBuilder, most: int = _SAMPLES, done: Callable[[int], None] | None = None
+    logs: Sequence[Samples], builder: RowBuilder, most: int = SAMPLES, done: Callable[[int], None] | None = None
 ) -> SensorInformation:
     """Information of some logs in the builder's columns, and what of it hangs on each sensor.
 

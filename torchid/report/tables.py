@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from torchid.analysis.contributions import Contribution, Contributions, PartContribution
+from torchid.analysis.contributions import Contributions
+from torchid.analysis.left_out import Contribution, PartContribution
 from torchid.estimators import Estimate
 from torchid.estimators.result import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
 from torchid.parameters import PARAMETERS, PER_BODY
