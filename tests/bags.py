@@ -100,7 +100,7 @@ def imu(stamp: int, force: Any, turn: Any, frame: str = "imu_link") -> dict[str,
 
 
 def odometry(stamp: int, position: Any, quat_xyzw: Any, linear: Any = (0, 0, 0), angular: Any = (0, 0, 0)) -> Any:
-    """Pose in the world, twist in the child frame."""
+    """Pose of `base` in the world, twist in that child frame."""
     pose = {"position": vector(position), "orientation": vector(quat_xyzw, "xyzw")}
     twist = {"linear": vector(linear), "angular": vector(angular)}
     return {
@@ -143,7 +143,7 @@ def topics_of(log: Log) -> dict[str, Any]:
     """The topics of `entries_of`, as an experiment file would name them."""
     topics: dict[str, Any] = {"joint_states": "/joint_states"}
     if log.base_quat_xyzw is not None:
-        topics["odometry"] = {"topic": "/odom", "twist": "none"}
+        topics["odometry"] = {"topic": "/odom", "twist": "none", "frame": "base"}
     if log.imu_frame:
         topics["imu"] = "/imu"
     if log.contact_wrench_local is not None:

@@ -101,7 +101,7 @@ def values(folder: Path, suffix: str) -> Cases:
     for samples in (0, 1):
         yield _named(folder, f"{samples} samples", suffix, fields(samples))
     for name, array in fields().items():
-        for value in (np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324):
+        for value in (np.nan, np.inf, -np.inf, 1e308, -1e160, 1e31, 5e-324):
             changed = array.astype(np.float64) if array.dtype.kind != "U" else np.full(array.shape, value)
             changed[(-1,) * changed.ndim] = value
             yield _named(folder, f"{value} in {name}", suffix, fields() | {name: changed})

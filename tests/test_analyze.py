@@ -230,7 +230,8 @@ def test_a_frozen_body_that_does_not_exist_is_looked_for_in_the_file(
 
 
 def test_an_output_without_a_name_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "no name for a file or folder" in refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
+    message = refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
+    assert "no name for a file or folder" in message
 
 
 def test_a_robot_that_cannot_move_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:

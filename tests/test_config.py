@@ -206,6 +206,16 @@ def test_a_mapping_given_empty_clears_that_of_the_file_and_any_other_adds_to_it(
     assert load(file, ALL, "sensors.contact_wrenches={r_sole: []}").sensors.contact_wrenches["l_sole"] == ["fx", "mz"]
 
 
+def test_overrides_apply_one_after_the_other(file: Path) -> None:
+    """The second does not make the first undone, be it a name that stands for a mapping."""
+    sensors = load(file, LEAST | {"sensors": "joints"}, "sensors=full", "sensors.offsets={joint_torque: log}").sensors
+    assert sensors.set == "full"
+    assert list(map(str, sensors.offsets)) == ["joint_torque"]
+    assert load(file, LEAST, "estimator.ridge=2", "estimator.ridge=3").estimator.ridge == 3.0
+    again = load(file, ALL, "sensors.offsets={}", "sensors.offsets.ft_force=all").sensors
+    assert list(map(str, again.offsets)) == ["ft_force"]
+
+
 def test_an_override_may_add_what_the_file_leaves_out(file: Path) -> None:
     config = load(file, LEAST, "preprocessing.cutoff_hz=8", "contacts=[{frame: sole, type: flat}]", "overwrite=true")
     assert config.preprocessing.cutoff_hz == 8.0

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from synthetic import G1, SOLO12, Array, Oracle, load, make_log, random_states
+from true_robots import true_parameters
 
 import torchid
 from torchid import parameters
@@ -106,14 +107,10 @@ def world(name: str, samples: int) -> World:
     size = 3 if kind.foot == "point" else 6
     feet = [(frame, size) for frame in kind.feet]
     log, other = (make_log(oracle, feet, kind.states, count, rng) for count in (samples, 100))
-    truth = np.zeros(robot.nominal.shape)
-    truth[:, parameters.INERTIAL] = oracle.inertial_parameters(robot)
-    order = [oracle.moving.index(body.joint.name) for body in robot.bodies if body.joint]
-    truth[1:, parameters.FRICTION] = oracle.friction[order]
     unseen = random_states(np.random.default_rng(99), robot.n, 100)
     K = Regressor(robot)(*map(torch.from_numpy, unseen)).numpy()
     contacts = tuple(Contact(frame, kind.foot) for frame in kind.feet)
-    return World(robot, contacts, truth, log, other, K, oracle.forces(*unseen))
+    return World(robot, contacts, true_parameters(oracle, robot), log, other, K, oracle.forces(*unseen))
 
 
 # ---------------------------------------------------------------------------------------------------- exact sensors

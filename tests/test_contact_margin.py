@@ -10,7 +10,7 @@ import yaml
 from demo import shortened_demo
 from refusals import refusal
 from synthetic import SOLO12, Array, Oracle, load, make_log
-from test_standard_errors import truth
+from true_robots import true_parameters
 
 from torchid.config import load_config
 from torchid.estimators import LeastSquares
@@ -40,7 +40,7 @@ def slipping(folder: Path, slip: float) -> tuple[Path, Array]:
     contacts = [{"frame": foot, "type": "point"} for foot in FEET]
     settings = {"robot": {"urdf": str(SOLO12)}, "contacts": contacts, "sensors": "joints", "output": "run"}
     (folder / "experiment.yaml").write_text(yaml.safe_dump(settings | {"logs": {"train": ["steps.h5"]}}))
-    return folder / "experiment.yaml", truth(oracle, robot)
+    return folder / "experiment.yaml", true_parameters(oracle, robot).ravel()
 
 
 def read(file: Path, *overrides: str) -> tuple[Samples, RowBuilder]:

@@ -11,7 +11,7 @@ import torch
 from regressors import base_kinds, tensors
 from synthetic import Array, Oracle, load, make_log, random_states
 from test_robot_base_link import by_joints_of, seen_from
-from true_robots import hide, worst
+from true_robots import hide, true_parameters, worst
 from urdfs import BASE, inertial, joint, link, write
 from welded import REAL, SENSORS, machine
 
@@ -218,12 +218,7 @@ def test_measured_and_predicted_series_hold_the_limbs_wrenches(urdf: Path, fixed
     robot = load(urdf, None, fixed_base, SENSORS)
     oracle, samples = recorded(robot, 6, 60)
     builder = RowBuilder(robot, CONTACTS, sensors_of(robot, "everything"))
-    true = np.zeros(robot.nominal.shape)
-    true[:, parameters.INERTIAL] = oracle.inertial_parameters(robot)
-    for index, body in enumerate(robot.bodies):
-        if body.joint is not None and body.joint.kind != "fixed":
-            true[index, parameters.FRICTION] = oracle.friction[oracle.moving.index(body.joint.name)]
-    measured, (predicted,) = force_series(builder, samples, true.reshape(1, -1))
+    measured, (predicted,) = force_series(builder, samples, true_parameters(oracle, robot).reshape(1, -1))
     assert measured.shape == (60, robot.nv + 6 * len(SENSORS))
     np.testing.assert_allclose(predicted, measured, rtol=0.0, atol=1e-12 * np.abs(measured).max())
 

@@ -44,6 +44,18 @@ def test_the_logs_of_an_experiment_file_are_checked_one_by_one(
     assert max(map(len, printed.splitlines())) <= 100
 
 
+def test_frames_that_are_sent_again_are_one_row_of_the_table(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = read_log(folder / "sway_train.npz")
+    again = np.arange(400)
+    again[150:156] = 149
+    write_log(replace(log.select(again), time=log.time), folder / "sway_train.npz")
+    assert main(["check", str(folder / "sway_train.npz")]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("condemned") == 1
+    assert "likewise" in printed
+    assert "usable without 6 of 400 samples" in printed
+
+
 def test_a_log_alone_says_what_needs_a_robot(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, urdf = str(folder / "sway_test.npz"), str(folder / "quadruped.urdf")
     assert main(["check", log]) == 0

@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import CONTACTS, CUTOFF, changed, demo_log, demo_robot, found, of_demo, only, scaled
-from motions import value
+from motions import DATA, value
 from recordings import in_world
 from scipy.spatial.transform import Rotation
 from synthetic import PANDA, Oracle, load
 
 from torchid.hygiene import CONDEMNED, SUSPICIOUS, Checked, check
-from torchid.logs import Log, preprocess
-from torchid.robot import Robot
+from torchid.logs import Log, preprocess, read_log
+from torchid.robot import Robot, load_robot
+from torchid.sensing import Contact
 
 EXPLAINED = "unit, sign or frame"
+ELSEWHERE = pytest.mark.skipif(not DATA.is_dir(), reason=f"recorded logs are not in {DATA}")
 
 
 @cache
@@ -130,6 +132,42 @@ def test_positions_in_degrees_are_named_even_where_no_joint_turns_far() -> None:
     checked = check(scaled(log, "joint_position", 180.0 / np.pi), robot, (), 5.0)
     explained = only(checked, EXPLAINED)
     assert (explained.field, explained.found[:10]) == ("joint_position", "in degrees")
+
+
+def test_one_joint_in_degrees_is_named() -> None:
+    checked = of_demo(changed(demo_log(), "joint_position", lambda q: q[:, 11].__imul__(180.0 / np.pi)))
+    assert only(checked, EXPLAINED).found.startswith("rear_right_knee in degrees")
+    assert not found(checked, "forces")
+
+
+def test_one_torque_in_another_unit_is_condemned_by_name() -> None:
+    robot, log = arm()
+    finding = only(check(rescaled(log, [1], 1e3), robot, (), 5.0), "unit")
+    assert (finding.severity, finding.channels) == (CONDEMNED, (robot.joint_names[1],))
+    assert "in mN m" in finding.found
+
+
+def test_forces_that_are_far_too_large_are_not_explained_by_what_makes_them_small() -> None:
+    swapped = of_demo(replace(demo_log(), contact_wrench_local=value(demo_log().contact_wrench_local)[:, ::-1]))
+    assert "no usual mistake" in only(swapped, "forces").found
+    assert not found(swapped, EXPLAINED)
+
+
+@ELSEWHERE
+def test_moments_of_a_force_plate_in_newton_millimetres_are_named() -> None:
+    folder = DATA / "human_squats"
+    log, robot = read_log(folder / "static1.npz"), load_robot(folder / "human.urdf")
+    wrench = value(log.contact_wrench_world) * [1.0, 1.0, 1.0, 1e3, 1e3, 1e3]
+    contacts = [Contact(name, "flat") for name in log.contact_names]
+    checked = check(replace(log, contact_wrench_world=wrench), robot, contacts, 6.0)
+    assert only(checked, EXPLAINED).found.startswith("moments in N mm")
+
+
+def test_a_bolted_robot_is_not_asked_for_its_base_nor_for_contacts() -> None:
+    robot, log = arm()
+    assert not {"weight at rest", "contact flags against forces", "angular velocity against orientation"} & {
+        skip.name for skip in check(log, robot, (), 5.0).skipped
+    }
 
 
 def test_what_no_usual_mistake_explains_is_only_suspicious() -> None:

@@ -155,6 +155,27 @@ def test_a_quantised_encoder_that_rests_is_not_frozen() -> None:
     assert not found(check(replace(moving(), joint_position=flicker)), "frozen")
 
 
+def test_a_velocity_of_zero_is_frozen_only_while_the_joint_moves() -> None:
+    at_stop = with_rates(moving(noise=0.0))
+    stopped = np.maximum(at_stop.joint_position[:, 0], np.percentile(at_stop.joint_position[:, 0], 40.0))
+    stands = np.append(np.diff(stopped) == 0.0, False)
+    at_stop = changed(at_stop, "joint_position", lambda q: q.__setitem__((slice(None), 0), stopped))
+    at_stop = changed(at_stop, "joint_velocity", lambda v: v.__setitem__((stands, 0), 0.0))
+    assert not found(check(at_stop), "frozen", "joint_velocity")
+    lost = changed(with_rates(moving()), "joint_velocity", lambda v: v.__setitem__((slice(900, 1000), 0), 0.0))
+    assert places(only(check(lost), "frozen", "joint_velocity")) == {(901, 999)}
+
+
+@pytest.mark.parametrize("field", ["joint_torque", "joint_velocity"])
+def test_a_driver_that_reads_nothing_below_some_size_is_not_frozen(field: str) -> None:
+    log = demo_log() if field == "joint_torque" else with_rates(moving())
+    dead = changed(log, field, lambda x: x.__setitem__(np.abs(x) < 0.1, 0.0))
+    finding = only(check(dead), "dead band")
+    assert (finding.severity, finding.field) == (SUSPICIOUS, field)
+    assert "below 0.1" in finding.found
+    assert not check(dead).condemned.any()
+
+
 def test_a_torque_that_was_recorded_at_a_lower_rate_and_held_is_named_but_not_condemned() -> None:
     held = replace(demo_log(), joint_torque=value(demo_log().joint_torque)[np.arange(1300) // 4 * 4])
     checked = check(held)
@@ -170,6 +191,8 @@ def test_a_saturated_torque_is_condemned_where_it_is_saturated() -> None:
     )
     assert only(checked, "saturated").channels == ("front_left_knee",)
     at_limit = torque[:, 2] >= limit
+    first = np.flatnonzero(at_limit)[0]
+    assert checked.condemned[first], "the first sample at the limit is as wrong as those that repeat it"
     assert np.mean(checked.condemned[at_limit]) > 0.9
     assert not checked.condemned[~at_limit].any()
 

@@ -16,6 +16,7 @@ from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, Checked, check
 from torchid.hygiene.rates import compare
 from torchid.hygiene.weight import weight
 from torchid.logs import Log, read_log, write_log
+from torchid.logs.quaternion import angular_velocity_base
 
 RATES = (
     "joint_velocity", "joint_acceleration", "base_linear_velocity_world", "base_linear_acceleration_world",
@@ -178,6 +179,13 @@ def test_an_orientation_that_rotates_world_to_base_is_named() -> None:
     assert "world to base" in finding.found
 
 
+def test_an_angular_velocity_of_the_wrong_sign_is_not_blamed_on_the_orientation() -> None:
+    quat = value(demo_log().base_quat_xyzw)  # of a base that turns little: there the inverse fits nearly as well
+    omega = angular_velocity_base(quat, np.gradient(quat, demo_log().time, axis=0))
+    finding = only(check(replace(demo_log(), base_angular_velocity_base=-omega)), "frame or order")
+    assert (finding.field, finding.found) == ("base_angular_velocity_base", "the sign is reversed")
+
+
 def test_a_joint_that_turns_more_than_twice_is_in_degrees_unless_it_can() -> None:
     log = scaled(demo_log(), "joint_position", 180.0 / np.pi)
     for checked in (check(log), of_demo(log)):
@@ -185,6 +193,14 @@ def test_a_joint_that_turns_more_than_twice_is_in_degrees_unless_it_can() -> Non
         assert not checked.usable
     one = changed(demo_log(), "joint_position", lambda q: q[:, 2].__iadd__(20.0))
     assert only(check(one), "unit").severity == SUSPICIOUS
+
+
+def test_a_slip_of_a_marker_in_degrees_is_no_step_in_radians() -> None:
+    slipped = changed(moving(), "joint_position", lambda q: q[1000:, 0].__iadd__(0.009))
+    assert only(check(slipped), "step").severity == NOTE
+    one = check(changed(slipped, "joint_position", lambda q: q[:, 0].__imul__(180.0 / np.pi)))
+    assert only(one, "unit").severity == SUSPICIOUS
+    assert not found(one, "step")
 
 
 def test_an_accelerometer_at_rest_reads_gravity() -> None:

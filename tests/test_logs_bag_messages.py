@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import bags
 import numpy as np
 import pytest
 from bags import (
@@ -28,6 +29,7 @@ from bags import (
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import TorchidWarning
+from torchid.logs import Log
 
 
 def test_joints_are_told_by_name_in_whatever_order_they_come(tmp_path: Path) -> None:
@@ -83,9 +85,10 @@ def test_an_odometrys_twist_is_that_of_the_child_frame(tmp_path: Path) -> None:
     linear, angular, position = rng.standard_normal((3, 3))
     content = [odometry(s, position, world_base.as_quat(), linear, angular) for s in map(int, STAMPS)]
     entries = joints_at(STAMPS) + [("/odom", int(s), ODOMETRY, x) for s, x in zip(STAMPS, content, strict=True)]
-    child = read_messages(tmp_path / "x.bag", entries, odometry="/odom")
-    world = read_messages(tmp_path / "y.bag", entries, odometry={"topic": "/odom", "twist": "world"})
-    pose = read_messages(tmp_path / "z.bag", entries, odometry={"topic": "/odom", "twist": "none"})
+    base = {"topic": "/odom", "frame": "base"}
+    child = read_messages(tmp_path / "x.bag", entries, odometry=base)
+    world = read_messages(tmp_path / "y.bag", entries, odometry=base | {"twist": "world"})
+    pose = read_messages(tmp_path / "z.bag", entries, odometry=base | {"twist": "none"})
     for log, linear_world, angular_base in (
         (child, world_base.apply(linear), angular),
         (world, linear, world_base.inv().apply(angular)),
@@ -99,6 +102,23 @@ def test_an_odometrys_twist_is_that_of_the_child_frame(tmp_path: Path) -> None:
     content[2]["child_frame_id"] = "wheel"
     entries = joints_at(STAMPS) + [("/odom", int(s), ODOMETRY, x) for s, x in zip(STAMPS, content, strict=True)]
     assert "/odom: child_frame_id 'base', then 'wheel'" in refusal(tmp_path / "x.bag", entries, odometry="/odom")
+
+
+def test_an_odometry_is_that_of_the_base_link_if_the_map_names_its_frame_and_else_warned_of(tmp_path: Path) -> None:
+    """Of a tracking camera, or of the point of the ground below the base, it would pass for the base's own pose."""
+
+    def read(child: str, frame: str | None) -> Log:
+        said = [odometry(s, np.zeros(3), [0, 0, 0, 1]) | {"child_frame_id": child} for s in map(int, STAMPS)]
+        entries = joints_at(STAMPS) + [("/odom", int(s), ODOMETRY, x) for s, x in zip(STAMPS, said, strict=True)]
+        return read_messages(tmp_path / "x.mcap", entries, odometry={"topic": "/odom", "frame": frame})
+
+    meant = r"; logs\.topics\.odometry\.frame says that this is meant$"
+    with pytest.warns(TorchidWarning, match=f"/odom: frame 'camera', taken to be the robot's base link{meant}"):
+        read("camera", None)
+    with pytest.warns(TorchidWarning, match=f"/odom: frame '/camera', taken to be 'pelvis'{meant}"):
+        read("/camera", "pelvis")
+    for child, frame in (("hip", "hip"), ("/hip", "hip"), ("hip", "/hip"), ("", None), ("", "hip")):
+        assert read(child, frame).base_position_world is not None
 
 
 def test_an_imu_at_rest_reads_g_upwards_in_its_own_frame(tmp_path: Path) -> None:
@@ -120,7 +140,8 @@ def test_an_imu_at_rest_reads_g_upwards_in_its_own_frame(tmp_path: Path) -> None
 def test_wrenches_are_the_environments_and_the_parents_action_unless_a_sign_says_otherwise(tmp_path: Path) -> None:
     values = np.arange(1.0, 7.0)
     entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, values, "sole")) for s in map(int, STAMPS)]
-    topics = {"contact_wrenches": {"sole": {"topic": "/w", "sign": -1}}, "ft_wrenches": {"ft": "/w"}}
+    limb = {"topic": "/w", "frame": "sole"}
+    topics = {"contact_wrenches": {"sole": {"topic": "/w", "sign": -1}}, "ft_wrenches": {"ft": limb}}
     log = read_messages(tmp_path / "x.bag", entries, **topics, contact_force_threshold=1.0)
     assert log.contact_wrench_local is not None
     assert log.ft_wrench is not None
@@ -130,13 +151,26 @@ def test_wrenches_are_the_environments_and_the_parents_action_unless_a_sign_says
 
 def test_wrenches_in_a_frame_of_another_name_are_warned_of_unless_that_is_meant(tmp_path: Path) -> None:
     entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, np.ones(6), "/sensor")) for s in map(int, STAMPS)]
-    with pytest.warns(TorchidWarning, match=r"/w: in frame '/sensor', taken to be in 'sole'; logs.topics.contact_wren"):
+    with pytest.warns(TorchidWarning, match=r"/w: frame '/sensor', taken to be 'sole'; logs.topics.contact_wrenches"):
         read_messages(tmp_path / "x.mcap", entries, contact_wrenches={"sole": "/w"}, contact_force_threshold=1.0)
     meant = {"sole": {"topic": "/w", "frame": "sensor"}}
     read_messages(tmp_path / "x.mcap", entries, contact_wrenches=meant, contact_force_threshold=1.0)
-    read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": "/w"})
-    with pytest.warns(TorchidWarning, match="taken to be in 'other'"):
+    read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": {"topic": "/w", "frame": "/sensor"}})
+    with pytest.warns(TorchidWarning, match="/w: frame '/sensor', taken to be 'other'"):
         read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": {"topic": "/w", "frame": "other"}})
+
+
+def test_a_limbs_wrench_is_in_the_child_frame_if_the_map_names_it_and_else_warned_of(tmp_path: Path) -> None:
+    """Which link the fixed joint carries a bag does not know: the sensor may read along the parent's axes."""
+    entries = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, np.ones(6), "shin")) for s in map(int, STAMPS)]
+    taken = r"/w: frame 'shin', taken to be the child frame of joint 'ft'; logs\.topics\.ft_wrenches\.ft\.frame says"
+    with pytest.warns(TorchidWarning, match=taken) as caught:
+        read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": "/w"})
+    assert len(caught) == 1
+    assert caught[0].filename == bags.__file__, "whoever reads the log is shown, not the reader itself"
+    read_messages(tmp_path / "x.mcap", entries, ft_wrenches={"ft": {"topic": "/w", "frame": "shin"}})
+    nameless = joints_at(STAMPS) + [("/w", s, WRENCH, wrench(s, np.ones(6))) for s in map(int, STAMPS)]
+    read_messages(tmp_path / "x.mcap", nameless, ft_wrenches={"ft": "/w"})
 
 
 def test_wrenches_without_a_header_come_when_they_are_received(tmp_path: Path) -> None:

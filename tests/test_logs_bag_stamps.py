@@ -98,7 +98,7 @@ def test_topics_at_other_rates_follow_a_smooth_motion_as_closely_as_a_spline_doe
         tmp_path / "x.mcap",
         entries,
         imu="/imu",
-        odometry={"topic": "/odom", "twist": "none"},
+        odometry={"topic": "/odom", "twist": "none", "frame": "base"},
         contact_wrenches={"sole": "/wrench"},
         contact_force_threshold=0.1,
     )

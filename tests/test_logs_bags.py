@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +67,19 @@ def test_files_of_one_folder_are_one_recording(tmp_path: Path) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------ topics
+
+
+def test_a_map_of_topics_is_built_without_the_readers_of_bags() -> None:
+    script = """
+import sys, torchid
+heavy = {"torch", "numpy", "pydantic", "rosbags", "mcap", "zstandard"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+topics = torchid.Topics(joint_states="/joint_states", odometry={"topic": "/odom", "frame": "pelvis"})
+assert topics.by_role["odometry"].frame == "pelvis"
+assert torchid.Topics is torchid.logs.Topics
+assert not {"rosbags", "mcap", "zstandard"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
 
 
 def test_a_bag_without_a_topic_map_says_what_it_has(tmp_path: Path) -> None:

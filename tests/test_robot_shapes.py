@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from synthetic import G1, PANDA, ROBOTS, SOLO12, TALOS, Array, load
-from urdfs import INERTIAL, inertial, joint, link, table, write
+from urdfs import INERTIAL, ball, inertial, joint, link, table, words, write
 
 from torchid.errors import TorchidWarning, UrdfError
 from torchid.parameters import mass_com_inertia
@@ -44,10 +44,6 @@ class Placed:
     def points(self) -> Array:
         """The surface in the link's frame."""
         return pose(self.xyz, self.rpy).apply(self.surface) + self.xyz
-
-
-def words(numbers: Array) -> str:
-    return " ".join(repr(float(x)) for x in numbers)
 
 
 def pose(xyz: Array, rpy: Array) -> Rotation:
@@ -165,10 +161,6 @@ def test_a_plate_keeps_an_interior_and_a_point_is_no_shape(tmp_path: Path) -> No
     np.testing.assert_allclose(extent.half, [0.2, 0.1, 0.0002])
     with pytest.warns(TorchidWarning, match="no shapes at base: where their matter lies is not known"):
         body_extents(load(write(tmp_path, link("base", INERTIAL + ball(0.0)))))
-
-
-def ball(radius: float, tag: str = "visual") -> str:
-    return f'<{tag}><geometry><sphere radius="{radius}"/></geometry></{tag}>'
 
 
 # ------------------------------------------------------------------------------------------------------ many shapes

@@ -10,7 +10,7 @@ import torch
 from physical import of_points
 from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, G1, ROBOTS, ROMEO, SOLO8, SOLO12, TALOS, Array, load
-from urdfs import joint, link, table, write
+from urdfs import joint, link, table, words, write
 
 import torchid
 from torchid.errors import ConfigError
@@ -98,10 +98,6 @@ def mirrored_robot(folder: Path, rng: np.random.Generator, normal: int = 1, **sh
     robot = load(write(folder, *elements))
     assert robot.body_names == ("trunk", "left_upper", "left_lower", "right_upper", "right_lower")
     return robot
-
-
-def words(numbers: Array) -> str:
-    return " ".join(repr(float(x)) for x in numbers)
 
 
 @pytest.mark.parametrize("normal", ["x", "y", "z"])

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from refusals import refusal
 from scipy.optimize import least_squares
 from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
-from test_standard_errors import FEET, REPETITIONS, STATES, covered, noisy_torques, truth
+from test_standard_errors import FEET, REPETITIONS, STATES, covered, noisy_torques
+from true_robots import true_parameters
 from urdfs import inertial, joint, link, write
 
 from torchid import parameters
@@ -165,7 +166,9 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     rng, oracle = np.random.default_rng(0), Oracle.of(robot)
     oracle.perturb(rng, 0.2)
     builder = StillRows(robot, (), named_sensors("full", robot.n, 0, SensorNoise(NOISE)))
-    return Bench(robot, builder, bind(make_log(oracle, [], [[]], 100, rng), robot, ()), truth(oracle, robot))
+    return Bench(
+        robot, builder, bind(make_log(oracle, [], [[]], 100, rng), robot, ()), true_parameters(oracle, robot).ravel()
+    )
 
 
 def industrial_arm(samples: int = 400, terms: ExtraTerms | None = None) -> Bench:
@@ -175,7 +178,7 @@ def industrial_arm(samples: int = 400, terms: ExtraTerms | None = None) -> Bench
     oracle.perturb(rng, 0.2)
     log = make_log(oracle, [], [[]], samples, rng)
     builder = RowBuilder(robot, (), named_sensors("full", robot.n, 0, SensorNoise(NOISE)), terms)
-    return Bench(robot, builder, bind(log, robot, ()), truth(oracle, robot))
+    return Bench(robot, builder, bind(log, robot, ()), true_parameters(oracle, robot).ravel())
 
 
 def quadruped(samples: int = 400) -> Bench:
@@ -187,7 +190,7 @@ def quadruped(samples: int = 400) -> Bench:
     builder = RowBuilder(robot, FEET, named_sensors("joints", robot.n, 4, SensorNoise(NOISE, 1.0, 0.1)))
     clean = bind(log, robot, FEET)
     pushed = next(noisy_torques(clean, builder, rng))  # on the base too; torques become noisier below
-    return Bench(robot, builder, pushed, truth(oracle, robot))
+    return Bench(robot, builder, pushed, true_parameters(oracle, robot).ravel())
 
 
 # --------------------------------------------------------------------------------------------------------- repetitions

@@ -15,7 +15,7 @@ from refusals import assert_wrong_value
 from refusals import refusal as command_refusal
 from synthetic import G1, SOLO12, Oracle, load, make_log
 from test_config import LEAST
-from urdfs import INERTIAL, inertial, joint, link, table, write
+from urdfs import INERTIAL, ball, inertial, joint, link, table, write
 
 import torchid
 from torchid.config import dump_config, load_config
@@ -108,10 +108,6 @@ def test_visual_shapes_are_the_ones_asked_if_none_are_named(tmp_path: Path) -> N
     elements = link("base", f"{INERTIAL}{ball(0.1, 'collision')}{ball(0.2, 'visual')}")
     (enclosure,) = conditions(tmp_path, load(write(tmp_path, elements)), com_inside="box").enclosures
     np.testing.assert_allclose(enclosure.half, 0.2)
-
-
-def ball(radius: float, tag: str = "visual") -> str:
-    return f'<{tag}><geometry><sphere radius="{radius}"/></geometry></{tag}>'
 
 
 def test_frozen_bodies_and_bodies_without_mass_are_not_enclosed_nor_complained_of(tmp_path: Path) -> None:

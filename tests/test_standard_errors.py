@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from scipy import signal, stats
 from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
+from true_robots import true_parameters
 
-from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
 from torchid.logs import Log, preprocess, read_log, write_log
 from torchid.logs.plan import FILTER_ORDER
@@ -23,17 +23,6 @@ from torchid.sensing import Contact, SensorNoise, named_sensors
 
 REPETITIONS = 200
 NORMAL = 1.959964
-
-
-def truth(oracle: Oracle, robot: Robot) -> Array:
-    """The oracle's parameters, (12 L,)."""
-    phi = np.zeros((len(robot.bodies), parameters.PER_BODY))
-    phi[:, parameters.INERTIAL] = oracle.inertial_parameters(robot)
-    moving = [body for body in range(len(robot.bodies)) if robot.bodies[body].joint]
-    phi[moving, parameters.FRICTION] = oracle.friction[
-        [oracle.moving.index(robot.bodies[b].joint.name) for b in moving]  # type: ignore[union-attr]
-    ]
-    return phi.flatten()
 
 
 def covered(estimates: list[Estimate], true: Array) -> NDArray[np.bool_]:
@@ -101,7 +90,7 @@ def test_intervals_from_noisy_joint_torques_of_a_robot_on_its_feet_hold_the_trut
     estimates = []
     for _, samples in zip(range(REPETITIONS), noisy_torques(bind(log, robot, FEET), builder, rng), strict=False):
         estimates.append(LeastSquares().solve(linear_problem(compress([samples], builder, threads=1), builder, robot)))
-    holds = covered(estimates, truth(oracle, robot))
+    holds = covered(estimates, true_parameters(oracle, robot).ravel())
     assert holds.shape[1] > 60
     assert_honest(holds)
     spread = np.mean([estimate.residual_std for estimate in estimates])
@@ -142,7 +131,7 @@ def filtered() -> tuple[list[Estimate], list[Estimate], Array]:
         factor = compress([samples], builder, threads=1)
         for kappa, estimates in ((samples.oversampling, corrected), (1.0, counted)):
             estimates.append(LeastSquares().solve(replace(linear_problem(factor, builder, robot), oversampling=kappa)))
-    return corrected, counted, truth(oracle, robot)
+    return corrected, counted, true_parameters(oracle, robot).ravel()
 
 
 def test_intervals_from_a_filtered_log_hold_the_truth(filtered: tuple[list[Estimate], list[Estimate], Array]) -> None:

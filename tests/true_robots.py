@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from synthetic import G1, ROBOTS, Array, Oracle, load, make_log, random_states
 
+from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
 from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
 from torchid.regressor import Regressor
@@ -106,6 +107,16 @@ def unseen(name: str) -> tuple[Array, Array, Array]:
 def predicted(robot: Robot, phi: Array, q: Array, v: Array, a: Array) -> Array:
     """K phi, (B, nv), by the dense regressor."""
     return (Regressor(robot)(*map(torch.from_numpy, (q, v, a))) @ torch.from_numpy(phi)).numpy()
+
+
+def true_parameters(oracle: Oracle, robot: Robot) -> Array:
+    """All parameters of the oracle by the robot's bodies, (L, 12); without friction where no joint moves."""
+    phi = np.zeros(robot.nominal.shape)
+    phi[:, parameters.INERTIAL] = oracle.inertial_parameters(robot)
+    for index, body in enumerate(robot.bodies):
+        if body.joint is not None and body.joint.name in oracle.moving:
+            phi[index, parameters.FRICTION] = oracle.friction[oracle.moving.index(body.joint.name)]
+    return phi
 
 
 def driving(robot: Robot) -> set[str]:

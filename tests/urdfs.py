@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,16 @@ def inertial(mass: str = "1", origin: str = "", **numbers: str) -> str:
     values = {"ixx": "0.1", "ixy": "0", "ixz": "0", "iyy": "0.1", "iyz": "0", "izz": "0.1"} | numbers
     attributes = " ".join(f'{name}="{value}"' for name, value in values.items())
     return f'<inertial>{origin}<mass value="{mass}"/><inertia {attributes}/></inertial>'
+
+
+def words(numbers: Iterable[float]) -> str:
+    """Numbers as an attribute holds them, to the last bit."""
+    return " ".join(repr(float(x)) for x in numbers)
+
+
+def ball(radius: float, tag: str = "visual") -> str:
+    """A sphere about a link's origin, one of its shapes."""
+    return f'<{tag}><geometry><sphere radius="{radius}"/></geometry></{tag}>'
 
 
 def mimic(master: str, extra: str = "") -> str:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
         project,
         violations,
     )
-    from torchid.logs import Log, preprocess, read_log, write_log
+    from torchid.logs import Log, Topics, preprocess, read_log, write_log
     from torchid.problem import (
         ExtraTerms,
         LinearProblem,
@@ -63,7 +63,7 @@ _HOMES = {
         "project",
         "violations",
     ),
-    "torchid.logs": ("Log", "preprocess", "read_log", "write_log"),
+    "torchid.logs": ("Log", "Topics", "preprocess", "read_log", "write_log"),
     "torchid.problem": (
         "ExtraTerms",
         "LinearProblem",
@@ -111,6 +111,7 @@ __all__ = [
     "SensorNoise",
     "SensorSet",
     "Sgd",
+    "Topics",
     "TorchidError",
     "TorchidWarning",
     "Trainer",

@@ -46,12 +46,14 @@ class SensorError(InputError):
 class UnknownNameError(InputError, KeyError):
     """A name that nothing answers to; the message lists the nearest valid names."""
 
-    def __init__(self, source: object, field: str, name: str, valid: Iterable[str]) -> None:
-        self.name, self.valid = name, tuple(valid)
-        super().__init__(source, field, f"unknown name '{name}'", nearest(name, self.valid))
+    def __init__(self, source: object, field: str, name: str, valid: Iterable[str], what: str = "") -> None:
+        """Take the name and those that are valid; `what` the name stands for elsewhere, if it is not unknown."""
+        self.name, self.valid, self.what = name, tuple(valid), what
+        found = f"'{name}', {what}" if what else f"unknown name '{name}'"
+        super().__init__(source, field, found, nearest(name, self.valid))
 
     def __reduce__(self) -> tuple[object, ...]:
-        return type(self), (self.source, self.field, self.name, self.valid)
+        return type(self), (self.source, self.field, self.name, self.valid, self.what)
 
     __str__ = Exception.__str__  # KeyError would show the repr of the message
 

@@ -34,6 +34,7 @@ class ExtraEstimate:
         extra: which.
         log: whose, "" of all.
         value: in its unit.
+        nominal_value: the one that would fit best if the bodies' parameters were the nominal ones.
         standard_error: without the pull to nominal parameters, infinite where the data do not determine it.
         inflation: of the standard error by not knowing all other unknowns and parameters, at least 1.
         mixed_with: what it cannot be told from, most first; empty if it can.
@@ -42,6 +43,7 @@ class ExtraEstimate:
     extra: Extra
     log: str
     value: float
+    nominal_value: float
     standard_error: float
     inflation: float
     mixed_with: tuple[str, ...]
@@ -145,36 +147,29 @@ def estimate_extras(
     known, names = _Known.of(assembly.problem, rank_tolerance), _names(assembly.problem.free, body_names)
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     shared = next((found for found in assembly.eliminations if not found.log), None)
-    of_all = None if shared is None else shared.inverse @ (shared.z - shared.C @ estimate.phi)
+    values = zip(assembly.unknowns(estimate.phi), assembly.unknowns(assembly.problem.nominal), strict=True)
     out = []
-    for found in assembly.eliminations:
-        P = len(estimate.phi)
-        left = found.C[:, :P] @ estimate.phi
-        through = None
-        if found is not shared and shared is not None and of_all is not None:
-            left = left + found.C[:, P:] @ of_all
-            through = found.inverse @ found.C[:, P:]
-        value = found.inverse @ (found.z - left)
-        out += _found(found, value, noise, known, names, None if through is None else (through, shared))
+    for found, pair in zip(assembly.eliminations, values, strict=True):
+        out += _found(found, pair, noise, known, names, shared if found.log else None)
     return out
 
 
 def _found(
     found: Elimination,
-    value: Array,
+    values: tuple[Array, Array],
     noise: float,
     known: _Known,
     names: Sequence[str],
-    through: tuple[Array, Elimination | None] | None,
+    shared: Elimination | None,
 ) -> list[ExtraEstimate]:
-    """The unknowns of one elimination; `through`: how they depend on those of all logs, and these."""
+    """The unknowns of one elimination, at identified and nominal parameters; `shared`: those they depend on."""
     P = len(known.free)
     sensitivity, own, hidden = found.inverse @ found.C[:, :P], [found.inverse], [found.hidden]
-    if through is not None and through[1] is not None:
-        shared = through[1]
-        sensitivity = sensitivity - through[0] @ shared.inverse @ shared.C[:, :P]
-        own.append(through[0] @ shared.inverse)
-        hidden.append(through[0] @ shared.hidden)
+    if shared is not None:
+        through = found.inverse @ found.C[:, P:]
+        sensitivity = sensitivity - through @ shared.inverse @ shared.C[:, :P]
+        own.append(through @ shared.inverse)
+        hidden.append(through @ shared.hidden)
     G = known.reached(sensitivity)
     unseen = G @ known.hidden
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
@@ -195,7 +190,8 @@ def _found(
             others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.hidden[k]), _labels(found))
             mixed = (*mixed, *others)
         error = noise * float(deviation[k]) if np.isfinite(deviation[k]) else np.inf
-        out.append(ExtraEstimate(extra, found.log, float(value[k]), error, inflation, mixed))
+        value, nominal = (float(x[k]) for x in values)
+        out.append(ExtraEstimate(extra, found.log, value, nominal, error, inflation, mixed))
     return out
 
 

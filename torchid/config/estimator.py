@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.dataclasses import dataclass
@@ -68,6 +68,9 @@ class TrainingConfig:
     checkpoint_seconds: NotNegative = 5.0
 
 
+Loss = Literal["huber", "tukey"]
+
+
 @dataclass(config=STRICT, frozen=True)
 class RobustConfig:
     """Rows that fit badly count less, in re-weighted passes.
@@ -76,15 +79,18 @@ class RobustConfig:
     `passes` at most.
     """
 
-    loss: Literal["huber", "tukey"]
+    loss: Loss
     tuning: Positive | None = None
     passes: Count = 50
 
 
 def _by_loss(value: object) -> object:
     """A robust fit as a mapping, where it may be a loss alone."""
-    return {"loss": value} if isinstance(value, str) else value
+    return {"loss": value} if value in get_args(Loss) else value
 
+
+ROBUST_ACCEPTED = f"{', '.join(get_args(Loss))}, or a mapping with loss, tuning and passes"
+"""What a message says of a robust fit."""
 
 Robust = Annotated[RobustConfig, BeforeValidator(_by_loss)]
 

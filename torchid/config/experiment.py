@@ -12,9 +12,17 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.analysis import AnalysisConfig
-from torchid.config.estimator import EstimatorConfig, check_keys
+from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, check_keys
 from torchid.config.reading import FileKind, Settings, dump, load
-from torchid.config.sensors import Sensors, SensorsConfig, check_choice, spelled_out
+from torchid.config.sensors import (
+    CHOICE_ACCEPTED,
+    SCOPES_ACCEPTED,
+    Sensors,
+    SensorsConfig,
+    check_choice,
+    spelled_out,
+)
+from torchid.config.topics import JOINTS_ACCEPTED
 from torchid.config.types import STRICT, Device, NotNegative, Positive
 from torchid.errors import ConfigError, TorchidWarning
 from torchid.logs.kinds import bag_files
@@ -130,6 +138,14 @@ _EXPERIMENT = FileKind(
     list_example="contacts=[{frame: l_sole, type: flat}]",
     paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*", "output"),
     prepare=_with_sensors_spelled_out,
+    accepted={
+        "sensors": CHOICE_ACCEPTED,
+        "sensors.offsets": SCOPES_ACCEPTED,
+        "sensors.scales": SCOPES_ACCEPTED,
+        "analysis.compare.*": CHOICE_ACCEPTED,
+        "estimator.robust": ROBUST_ACCEPTED,
+        "logs.topics.joint_states": JOINTS_ACCEPTED,
+    },
 )
 _ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": "robot, contacts, output"}))
 
@@ -162,6 +178,7 @@ def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeCon
     config = load(_ANALYSIS, path, overrides)
     check_choice(path, "sensors", config.sensors, may_be_empty=True)
     check_keys(config.estimator, path)
+    _check_extras(path, config)
     for name, choice in config.analysis.compare.items():
         check_choice(path, f"analysis.compare.{name}", choice)
     if config.logs is None:

@@ -6,11 +6,12 @@ import dataclasses
 import errno
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from fnmatch import fnmatch
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 from omegaconf import OmegaConf
@@ -19,6 +20,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from torchid.config.scan import MAX_BYTES, MAX_DEPTH, check_yaml
 from torchid.errors import ConfigError, UnknownNameError
+from torchid.logs.kinds import READABLE
 from torchid.text import is_plain, shown
 
 _NO_YAML = (OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, AssertionError)
@@ -44,10 +46,10 @@ class FileKind(Generic[T]):
         keys: the chief keys, as in "a mapping with robot, logs, ...".
         list_example: an override that gives a list as a whole.
         paths: places that hold a path, such as `robot.urdf`; `logs.train.*` is every item of the list `logs.train`.
-        prepare: takes the settings and those that will override them, and returns the settings to merge; it is called
-            for the file and the overrides, then for the overrides and nothing.
-        refusals: what a message says was found and is accepted, by place (`*` for a name that the file gives), where
-            the type alone says too little.
+        prepare: takes settings and those that will override them, and returns the settings to merge; it is called for
+            the file and nothing, then, for each override, for all before and it, and for it and nothing.
+        accepted: what a message says is accepted, by place (`*` for a name that the file gives), where the type alone
+            says too little.
     """
 
     settings: type[T]
@@ -56,7 +58,15 @@ class FileKind(Generic[T]):
     list_example: str
     paths: Sequence[str] = ()
     prepare: Callable[[Settings, Settings], Settings] = _as_is
-    refusals: Mapping[str, tuple[str, str]] = dataclasses.field(default_factory=dict)
+    accepted: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def accepted_at(self, place: Sequence[str], otherwise: str) -> str:
+        """What is accepted at a place."""
+        for pattern, accepted in self.accepted.items():
+            parts = pattern.split(".")
+            if len(parts) == len(place) and all(map(fnmatch, place, parts)):
+                return accepted
+        return otherwise
 
 
 def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
@@ -65,24 +75,24 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
     Args:
         kind: of the file.
         path: the YAML file; paths in it are relative to it.
-        overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory. A mapping
-            adds to that of the file, unless it is empty: `key={}` clears it.
+        overrides: `key.subkey=value`, the value in YAML, one after the other; paths in them are relative to the working
+            directory. A mapping adds to what is there, unless it is empty: `key={}` clears it.
 
     Raises:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
         UnknownNameError: a key that does not exist; the message names the nearest that do.
     """
-    settings = _absolute(path, _read(kind, path), kind.paths, path.resolve().parent)
-    given = _absolute("command line", _parsed(overrides), kind.paths, Path.cwd())
-    layers = [_cleared(kind.prepare(settings, given), given), kind.prepare(given, {})]
+    settings = kind.prepare(_absolute(path, _read(kind, path), kind.paths, path.resolve().parent), {})
+    for text in overrides:
+        given = _absolute("command line", _parsed(text), kind.paths, Path.cwd())
+        try:
+            layers = _cleared(kind.prepare(settings, given), given), kind.prepare(given, {})
+            settings = _container(OmegaConf.merge(*layers))
+        except (OmegaConfBaseException, TypeError) as error:
+            accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
+            raise ConfigError("command line", shown(text), "does not fit the file", accepted) from error
     try:
-        merged = _container(OmegaConf.merge(*layers))
-    except (OmegaConfBaseException, TypeError) as error:
-        accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
-        field = shown(" ".join(overrides))
-        raise ConfigError("command line", field, "does not fit the file", accepted) from error
-    try:
-        return TypeAdapter(kind.settings).validate_python(merged)
+        return TypeAdapter(kind.settings).validate_python(settings)
     except ValidationError as error:
         raise _in_one_line(kind, path, error) from error
 
@@ -100,10 +110,17 @@ def _read(kind: FileKind[T], path: Path) -> Settings:
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
     except _NO_YAML as error:
-        raise ConfigError(path, "YAML", f"not readable: {shown(str(error), _LONGEST)}", "a YAML mapping") from error
+        why = "no text" if isinstance(error, UnicodeDecodeError) else shown(str(error), _LONGEST)
+        raise _no_settings(kind, path, f"not readable: {why}", "a YAML mapping") from error
     if not isinstance(loaded, dict):
-        raise ConfigError(path, "YAML", f"a {type(loaded).__name__}", f"a mapping with {kind.keys}")
+        raise _no_settings(kind, path, f"a {type(loaded).__name__}", f"a mapping with {kind.keys}")
     return loaded
+
+
+def _no_settings(kind: FileKind[T], path: Path, found: str, accepted: str) -> ConfigError:
+    if path.suffix.lower() in READABLE:
+        return ConfigError(path, "file", f"a log, not a file of settings ({kind.keys})", f"a YAML {kind.name} file")
+    return ConfigError(path, "YAML", found, accepted)
 
 
 def _text(path: Path) -> str:
@@ -114,21 +131,19 @@ def _text(path: Path) -> str:
         return stream.read(MAX_BYTES + 1).decode()
 
 
-def _parsed(overrides: Sequence[str]) -> Settings:
-    for text in overrides:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise ConfigError("command line", shown(text), "not an override", "key.subkey=value")
-        try:
-            check_yaml(key)
-            check_yaml(value)
-            if key.count(".") + key.count("[") > MAX_DEPTH:
-                raise ValueError(f"nested more than {MAX_DEPTH} deep")
-            OmegaConf.from_dotlist([text])
-        except _NO_YAML as error:
-            found = shown(str(error), _LONGEST)
-            raise ConfigError("command line", shown(text), found, "key.subkey=value, in YAML") from error
-    return _container(OmegaConf.from_dotlist(list(overrides)))
+def _parsed(text: str) -> Settings:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise ConfigError("command line", shown(text), "not an override", "key.subkey=value")
+    try:
+        check_yaml(key)
+        check_yaml(value)
+        if key.count(".") + key.count("[") > MAX_DEPTH:
+            raise ValueError(f"nested more than {MAX_DEPTH} deep")
+        return _container(OmegaConf.from_dotlist([text]))
+    except _NO_YAML as error:
+        found = shown(str(error), _LONGEST)
+        raise ConfigError("command line", shown(text), found, "key.subkey=value, in YAML") from error
 
 
 def _cleared(settings: Settings, given: Settings) -> Settings:
@@ -185,13 +200,14 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
     field = ".".join(place)
     if first["type"] == "unexpected_keyword_argument":
         keys = _keys_at(kind.settings, place[:-1])
-        return UnknownNameError(path, ".".join(place[:-1]) or "key", place[-1], keys)
-    missing = [".".join(map(str, e["loc"])) for e in complaints if e["type"] == "missing"]
+        elsewhere = list(_places_of(place[-1], kind.settings))
+        valid = [*get_close_matches(place[-1], keys, cutoff=0.5), *elsewhere] if elsewhere else keys
+        return UnknownNameError(path, ".".join(place[:-1]) or "key", place[-1], valid)
+    missing = [list(map(str, e["loc"])) for e in complaints if e["type"] == "missing"]
     if missing:
-        return ConfigError(path, ", ".join(missing), "missing", "a value")
-    for pattern, refusal in kind.refusals.items():
-        if fnmatch(field, pattern):
-            return ConfigError(path, field, *refusal)
+        wanted = {".".join(x): kind.accepted_at(x, _described(_hint_at(kind.settings, x))) for x in missing}
+        named = wanted.values() if len(wanted) == 1 else map(": ".join, wanted.items())
+        return ConfigError(path, ", ".join(wanted), "missing", "; ".join(named))
     if first["type"] == "too_short" and not first["input"]:
         empty = "an empty mapping" if isinstance(first["input"], Mapping) else "an empty list"
         return ConfigError(path, field, empty, "at least one item")
@@ -202,6 +218,14 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
     else:
         count = first.get("ctx", {}).get("min_length", 1)
         plain = {
+            "float_parsing": "a number",
+            "float_type": "a number",
+            "int_parsing": "a whole number",
+            "int_type": "a whole number",
+            "int_from_float": "a whole number",
+            "bool_parsing": "true or false",
+            "bool_type": "true or false",
+            "string_type": "a text",
             "path_type": "a path",
             "list_type": "a list",
             "dict_type": "a mapping",
@@ -210,7 +234,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
         }
         described = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
         accepted = plain.get(first["type"], described)
-    return ConfigError(path, field, f"found {shown}", accepted)
+    return ConfigError(path, field, f"found {shown}", kind.accepted_at(place, accepted))
 
 
 def _repr(value: object) -> str:
@@ -221,11 +245,35 @@ def _repr(value: object) -> str:
 
 
 def _keys_at(settings: Any, place: Sequence[str]) -> list[str]:
-    """Names of the keys accepted at a place in a dataclass, through `list[X]`, `dict[str, X]` and `X | None`."""
+    """Names of the keys accepted at a place in a dataclass."""
+    return [field.name for field in dataclasses.fields(_hint_at(settings, place))]
+
+
+def _hint_at(settings: Any, place: Sequence[str]) -> Any:
+    """The type of a place in a dataclass, through `list[X]`, `dict[str, X]` and `X | None`."""
     hint = settings
     for part in place:
         hint = _not_none(get_type_hints(hint)[part] if dataclasses.is_dataclass(hint) else get_args(hint)[-1])
-    return [field.name for field in dataclasses.fields(hint)]
+    return hint
+
+
+def _places_of(name: str, settings: Any, place: str = "") -> Iterator[str]:
+    """Where else in a dataclass there is a key of a name, for one that is written in the wrong place."""
+    for key, hint in get_type_hints(settings).items():
+        if key == name:
+            yield place + key
+        if dataclasses.is_dataclass(inner := _not_none(hint)):
+            yield from _places_of(name, inner, f"{place}{key}.")
+
+
+def _described(hint: Any) -> str:
+    """What a type accepts, in words."""
+    if dataclasses.is_dataclass(hint):
+        return f"a mapping with {', '.join(_keys_at(hint, ()))}"
+    if get_origin(hint) is Literal:
+        return ", ".join(map(str, get_args(hint)))
+    plain = {str: "a name", Path: "a path", float: "a number", int: "a whole number", list: "a list", dict: "a mapping"}
+    return plain.get(get_origin(hint) or hint, "a value")
 
 
 def _not_none(hint: Any) -> Any:

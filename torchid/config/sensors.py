@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
@@ -53,11 +53,14 @@ class ChoiceConfig:
 
 def _every_channel(value: object) -> object:
     """A scope for every kind of channel, where it is a name alone."""
-    return dict.fromkeys(CHANNELS, value) if isinstance(value, str) else value
+    return dict.fromkeys(CHANNELS, value) if value in get_args(Scope) else value
 
 
 Channel = Literal["joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment"]
-Scopes = Annotated[dict[Channel, Literal["log", "all"]], BeforeValidator(_every_channel)]
+Scope = Literal["log", "all"]
+Scopes = Annotated[dict[Channel, Scope], BeforeValidator(_every_channel)]
+SCOPES_ACCEPTED = f"log, all, or a mapping from kinds of channels ({', '.join(CHANNELS)}) to log or all"
+"""What a message says of `Scopes`."""
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -78,6 +81,9 @@ def spelled_out(value: object) -> object:
     """A choice as a mapping, where it may be a name alone."""
     return {"set": value} if isinstance(value, str) else value
 
+
+CHOICE_ACCEPTED = "full, contacts, joints, or a mapping with sensors by name"
+"""What a message says of a choice of sensors."""
 
 Choice = Annotated[ChoiceConfig, BeforeValidator(spelled_out)]
 Sensors = Annotated[SensorsConfig, BeforeValidator(spelled_out)]

@@ -27,12 +27,16 @@ def _topics_alone(settings: Settings, _: Settings) -> Settings:
     return {"logs": {key: x for key, x in logs.items() if key == "topics"} if isinstance(logs, dict) else {}}
 
 
+JOINTS_ACCEPTED = "the name of a topic, or a mapping with topic and joints"
+"""What a message says of the one topic that every bag needs."""
+
 _KIND = FileKind(
     settings=_TopicsFile,
     name="experiment",
     keys="logs.topics",
     list_example="logs.topics.joint_states.joints=[l_knee]",
     prepare=_topics_alone,
+    accepted={"logs.topics.joint_states": JOINTS_ACCEPTED},
 )
 
 

@@ -82,6 +82,14 @@ def channel_names(log: Log, field: str) -> tuple[str, ...]:
     return labels or tuple(AXES[: array.shape[1]] if array.ndim == 2 else ("",))
 
 
+def unit(field: str, name: str) -> str:
+    """Unit of a channel, "" for a number without one."""
+    component = name.rpartition(" ")[2]
+    if field in UNITS or component not in COMPONENTS:
+        return UNITS.get(field, "")
+    return "N" if component.startswith("f") else "N m"
+
+
 def groups(log: Log) -> Iterator[Group]:
     """All groups of a log that hold anything."""
     for field in log.arrays():

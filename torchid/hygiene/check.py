@@ -93,7 +93,9 @@ def check(
     mended = repaired(log, _findings(found))
     found += spikes(mended, groups(mended))
     mended = repaired(log, _findings(found))
-    found += [*angles(mended, robot), *touching(mended)]
+    if units := list(angles(mended, robot)):  # what a step of a position is worth is told in radians
+        found = [one for one in found if not (isinstance(one, Finding) and one.name == "step" and one.whole)]
+    found += [*units, *touching(mended)]
     mended = repaired(log, _findings(found))
     if (lost := _lost(found)) is None or lost.field != "time":
         found += [*derivatives(mended), *turning(mended, robot), *accelerometer(mended, robot)]

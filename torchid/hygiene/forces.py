@@ -102,7 +102,7 @@ def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
         yield Finding("sign", CONDEMNED, "joint_torque", text, "reverse these torques", tuple(chosen))
     other_unit = np.zeros(len(names), bool)
     for factor, unit in UNITS.items():
-        here = fit.wrong & ~reversed_ & (np.abs(np.log(np.abs(fit.gain) / factor)) < np.log(_UNIT_WITHIN))
+        here = fit.wrong & (fit.gain > factor / _UNIT_WITHIN) & (fit.gain < factor * _UNIT_WITHIN)
         if here.any():
             other_unit |= here
             chosen = [str(name) for name in names[here]]

@@ -12,13 +12,15 @@ import numpy as np
 
 from torchid.hygiene.channels import Group
 from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, counted, listed
-from torchid.hygiene.repeats import Runs, held_for, implausible
+from torchid.hygiene.repeats import Runs, held_for, implausible, in_dead_band
 from torchid.logs.fields import WRENCHES, BoolArray, FloatArray
 
 #: Samples at the very same extreme value from which on it is a limit and no coincidence.
 AT_LIMIT = 5
 #: Fields that are zero while a joint rests.
 RATES = ("joint_velocity", "joint_acceleration")
+#: Fields in which a driver may set small readings to zero.
+DEAD_BANDS = (*RATES, "joint_torque", "ft_wrench", *WRENCHES)
 
 _Stuck = list[tuple[str, Runs]]
 
@@ -39,7 +41,10 @@ def frozen(groups: Iterable[Group]) -> Iterator[Finding]:
         if every := held_for(together):
             yield _held(group, every)
             continue
-        runs = implausible(group.values[:, ~constant], together)
+        moving = group.values[:, ~constant]
+        runs = implausible(moving, together)
+        if group.field in DEAD_BANDS:
+            runs = runs.where(~in_dead_band(moving, runs))
         if len(runs):
             what = f"all {len(group.names)} channels" if len(group.names) > 1 else group.names[0]
             yield _frozen(group, what, [(name, runs) for name in group.names], len(runs))
@@ -60,6 +65,7 @@ def _at_rest(group: Group, steps: FloatArray, positions: Group | None) -> BoolAr
 def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> Iterator[Finding]:
     """Channels that repeat by themselves, of steps (M - 1, c)."""
     stuck: _Stuck = []
+    dead: list[tuple[str, float, float]] = []
     limits: list[tuple[str, Runs, float]] = []
     for column in columns:
         repeated = all_repeated[:, column]
@@ -67,6 +73,11 @@ def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> I
             continue
         name, values = group.names[column], group.values[:, column]
         runs = implausible(values[:, None], repeated)
+        zeros = values[runs.first] == 0.0
+        quiet = in_dead_band(values[:, None], runs)
+        if group.field in DEAD_BANDS and quiet.any() and 2 * quiet.sum() >= zeros.sum():
+            dead.append((name, float(np.abs(values[values != 0.0]).min()), 100.0 * float(np.mean(values == 0.0))))
+            runs = runs.where(~zeros)
         for extreme in (values.min(), values.max()):
             at_limit = Runs.of(repeated & (values[1:] == extreme))
             if (values[runs.first] == extreme).any() and at_limit.lengths.sum() >= AT_LIMIT:
@@ -76,6 +87,11 @@ def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> I
             stuck.append((name, runs))
     if stuck:
         yield _frozen(group, listed([name for name, _ in stuck]), stuck, sum(len(runs) for _, runs in stuck))
+    if dead:
+        each = [f"{name} below {least:.3g} {group.unit} ({share:.2g} % of it)" for name, least, share in dead]
+        advice = "switch the dead band off; a velocity may be left out, and is derived then"
+        names = tuple(name for name, _, _ in dead)
+        yield Finding("dead band", SUSPICIOUS, group.field, f"reads 0: {listed(each)}", advice, names)
     if limits:
         yield _saturated(group, limits)
 

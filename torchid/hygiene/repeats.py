@@ -98,6 +98,20 @@ def implausible(values: FloatArray, repeated: BoolArray) -> Runs:
     return runs.where((chance < CHANCE) & moving)
 
 
+def in_dead_band(values: FloatArray, runs: Runs) -> BoolArray:
+    """Which runs (R,) of values (M, c) are of zeros amid the smallest readings that there are.
+
+    A driver that reads 0 below some size goes to 0 and leaves it there; a sensor that is lost does so from any reading.
+    """
+    size = np.abs(values)
+    least = np.where(size > 0.0, size, np.inf).min(axis=0)
+    inside = (size[runs.first] == 0.0).all(axis=1)
+    for neighbour in (runs.first - 1, runs.last + 2):
+        beyond = (neighbour < 0) | (neighbour >= len(size))
+        inside &= beyond | (size[np.clip(neighbour, 0, len(size) - 1)] <= 2.0 * least).all(axis=1)
+    return np.asarray(inside)
+
+
 def _pace(side: FloatArray) -> FloatArray:
     """Speed next to runs over that on the same side of them, (R,), of sizes of steps (R, k, c)."""
     usual = median_known(side)

@@ -10,7 +10,8 @@ from torchid.hygiene.channels import LONG_STEP
 from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, counted
 from torchid.logs import Log
 from torchid.logs.fields import BoolArray, FloatArray
-from torchid.logs.plan import LONGEST_STEP, SHORTEST_STEP
+from torchid.logs.plan import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_STEP
+from torchid.logs.preprocess import differentiates
 
 #: A median step [s] above which no acceleration can be seen: robots move at 0.5 to 5 Hz.
 SLOWEST_STEP = 0.5
@@ -26,6 +27,10 @@ _BETTER = 0.5
 
 def stamps(log: Log) -> Iterator[Finding]:
     """Findings about `time`."""
+    if len(log) < FEWEST_DIFFERENTIATED and differentiates(log):
+        text = f"{counted(len(log), 'sample')}: velocities and accelerations cannot be derived"
+        advice = f"record {FEWEST_DIFFERENTIATED} samples or more, or give every velocity and acceleration"
+        yield Finding("too short", CONDEMNED, "time", text, advice)
     if len(log) < 3:
         return
     steps = np.diff(log.time)

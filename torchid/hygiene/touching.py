@@ -34,15 +34,20 @@ _NAME = "contact flags against forces"
 class _Contact:
     name: str
     active: BoolArray
-    force: FloatArray
+    force: FloatArray  # (N, 3) [N], NaN where it was not read
 
 
 def touching(log: Log) -> Iterator[Finding | Skipped]:
     """Findings about contacts, by what they carry together: forces may be in any unit."""
+    if not log.contact_names:
+        return
     contacts = list(_contacts(log))
     if not contacts:
-        yield Skipped(_NAME, "no contact whose force was measured")
+        yield Skipped(_NAME, "no contact whose force was measured whenever it touches")
         return
+    judged = {contact.name for contact in contacts}
+    for name in (name for name in log.contact_names if name not in judged):
+        yield Skipped(_NAME, f"{name}: its force was not measured whenever it touches")
     weight = _largest_load(contacts)
     if not weight > 0.0:
         yield Skipped(_NAME, "all contact forces are zero")
@@ -59,18 +64,21 @@ def touching(log: Log) -> Iterator[Finding | Skipped]:
 
 
 def _contacts(log: Log) -> Iterator[_Contact]:
+    """Those whose force can be judged: NaN stands for no reading, which a contact may lack while it is in the air."""
     wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
     if wrench is None or log.contact_active is None:
         return
     for index, name in enumerate(log.contact_names):
-        force = wrench[:, index, :3]
-        if np.isfinite(force).all():
-            yield _Contact(name, log.contact_active[:, index], force)
+        force, active = wrench[:, index, :3], log.contact_active[:, index]
+        read = np.isfinite(force).all(axis=1)
+        if read.any() and read[active].all():
+            yield _Contact(name, active, np.where(read[:, None], force, np.nan))
 
 
 def _largest_load(contacts: list[_Contact]) -> float:
     """What all contacts carry together when they carry much [N]: about the weight of a robot that stands."""
-    total = np.sum([np.linalg.norm(contact.force, axis=1) * contact.active for contact in contacts], axis=0)
+    sizes = [np.where(contact.active, np.linalg.norm(contact.force, axis=1), 0.0) for contact in contacts]
+    total = np.sum(sizes, axis=0)
     return float(np.percentile(total, 90.0))
 
 
@@ -88,8 +96,8 @@ def without_offsets(log: Log) -> Log:
 
 def _offset(contact: _Contact) -> FloatArray:
     """What the sensor reads steadily in the air, (3,) [N]; 0 where it does not."""
-    air = contact.force[~contact.active]
-    if len(air) < _FEW or len(air) == len(contact.force):
+    air = contact.force[~contact.active & np.isfinite(contact.force[:, 0])]
+    if len(air) < _FEW or not contact.active.any():
         return np.zeros(3)
     offset = np.median(air, axis=0)
     spread = NORMAL * float(np.median(np.linalg.norm(air - offset, axis=1)))

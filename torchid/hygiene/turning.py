@@ -21,6 +21,8 @@ _NAME = "angular velocity against orientation"
 def turning(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about angular velocities and the orientation."""
     quat = log.base_quat_xyzw
+    if quat is None and robot is not None and robot.fixed_base:
+        return  # it does not turn
     if quat is None or len(log) < 3:
         yield Skipped(_NAME, "no orientation of the base" if quat is None else "the log is too short")
         return

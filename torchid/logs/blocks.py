@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from torchid.logs.read import check_fields_given, checked_log
 from torchid.logs.spill import Sliced, Spill
 from torchid.logs.table import table_blocks, table_size
 
+GIGABYTE = 1e9
 _ACCEPTED = "a plain array of numbers, truth values or text"
 _SAMPLE = re.compile(r"\bsample (\d+)")
 _SMALL = 4  # a cell of a table takes two characters at least, a number eight bytes
@@ -142,14 +145,14 @@ def _of_container(source: str, container: Container, folder: Path) -> tuple[dict
 def _of_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Sliced]]:
     """Text and arrays of a table, which is read once, from its beginning to its end."""
     names: dict[str, NDArray[Any]] = {}
-    spills: dict[str, Spill] = {}
+    spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
     for number, block in enumerate(table_blocks(path)):
         if not number:
             check_fields_given(str(path), block)
             continue
         for name, array in block.items():
             if not _is_text(name):
-                spills.setdefault(name, Spill(path, folder)).append(array)
+                spills[name].append(array)
             elif names.setdefault(name, array).tolist() != array.tolist():
                 found = f"'{names[name]}' and '{array}'"
                 raise LogError(path, f"column '{name}'", found, "one name, the same in every row")

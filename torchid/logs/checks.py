@@ -16,6 +16,8 @@ from torchid.wrenches import COMPONENTS
 QUATERNION_TOLERANCE = 1e-3
 #: How far the norm of a quaternion that was normalised may be from 1.
 ROUNDING = 4.0 * np.finfo(np.float64).eps
+#: Size of a number in any unit, beyond all that anyone measures: products of several stay what float64 can hold.
+LARGEST = 1e30
 
 
 def check_shape(source: str, name: str, array: NDArray[Any], letters: Shape, sizes: Mapping[str, int]) -> None:
@@ -54,11 +56,14 @@ def place(index: tuple[int, ...], labels: tuple[str, ...]) -> str:
 def check_finite(
     source: str, name: str, values: FloatArray, *, allow_nan: bool = False, labels: tuple[str, ...] = ()
 ) -> None:
-    """Raise LogError at the first infinite value, or at the first NaN unless `allow_nan`."""
-    bad = np.isinf(values) if allow_nan else ~np.isfinite(values)
+    """Raise LogError at the first value beyond `LARGEST`, infinite or, unless `allow_nan`, NaN."""
+    bad = (values > LARGEST) | (values < -LARGEST)
+    if not allow_nan:
+        bad |= np.isnan(values)
     if bad.any():
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
-        accepted = "finite numbers, or NaN where nothing was measured" if allow_nan else "finite numbers"
+        accepted = f"numbers of at most {LARGEST:g}" if np.isfinite(values[index]) else "finite numbers"
+        accepted += ", or NaN where nothing was measured" if allow_nan else ""
         raise LogError(source, name, f"{values[index]} at {place(index, labels)}", accepted)
 
 

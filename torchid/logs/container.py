@@ -20,6 +20,7 @@ from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.limits import check_growth
 from torchid.logs.npz import Npz, open_archive
 from torchid.logs.spill import Sliced
+from torchid.text import shown
 
 SUFFIXES = (".npz", ".h5", ".hdf5")
 
@@ -58,12 +59,8 @@ def translated(source: str, field: str, accepted: str, also: tuple[type[Exceptio
     except LogError:
         raise
     except failures as error:
-        text = _shown(str(error)[:_LONGEST_TEXT])  # some readers quote the file
+        text = shown(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
         raise LogError(source, field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
-
-
-def _shown(text: str) -> str:
-    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def _suffix(path: Path) -> str:

@@ -26,6 +26,8 @@ REACH_PERIODS = 1.0
 #: Samples dropped at each end where an unfiltered log is differentiated: the spline multiplies noise 8.5 times more at
 #: the first sample than inside the log, 2.4 times more at the second and 1.3 times at the third.
 DROPPED_SAMPLES = 2
+#: Fewest samples that can be filtered, or differentiated so that some are left.
+FEWEST_FILTERED, FEWEST_DIFFERENTIATED = 2, 2 * DROPPED_SAMPLES + 1
 #: Longest step, in median steps, across which a spline is drawn.
 LONGEST_STEP = 10.0
 #: A step shorter than this, in median steps, is worth a warning.
@@ -51,7 +53,7 @@ def plan(
         LogError: the time stamps cannot be filtered, resampled or differentiated.
     """
     check_time(source, time)
-    fewest = 2 * DROPPED_SAMPLES + 1 if differentiates else 2
+    fewest = FEWEST_DIFFERENTIATED if differentiates else FEWEST_FILTERED
     if len(time) < fewest:
         accepted = f"at least {fewest} to filter, resample or differentiate"
         raise LogError(source, "time", f"{len(time)} samples", accepted)

@@ -27,9 +27,14 @@ def rotate(quat_xyzw: FloatArray, vector_base: FloatArray) -> FloatArray:
     return vector_base + w * turn + np.cross(axis, turn)
 
 
+def inverse(quat_xyzw: FloatArray) -> FloatArray:
+    """The rotations back, (N, 4), of unit quaternions (N, 4)."""
+    return quat_xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
 def rotate_back(quat_xyzw: FloatArray, vector_world: FloatArray) -> FloatArray:
     """Components (N, 3) in the base frame of vectors (N, 3) given in the world, for unit quaternions (N, 4)."""
-    return rotate(quat_xyzw * np.array([-1.0, -1.0, -1.0, 1.0]), vector_world)
+    return rotate(inverse(quat_xyzw), vector_world)
 
 
 def _divide(quat: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:

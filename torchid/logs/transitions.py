@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchid.errors import LogError
 from torchid.logs.fields import BoolArray, FloatArray
 from torchid.logs.log import Log
 from torchid.logs.timeline import JITTER
@@ -28,3 +29,16 @@ def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray
     for start, stop in zip(first, last, strict=True):
         near[start:stop] = True
     return near
+
+
+def away_from_changes(log: Log, time: FloatArray, margin: float) -> BoolArray | None:
+    """Which of some stamps are not `near_contact_changes`, None for all.
+
+    Raises:
+        LogError: none is.
+    """
+    near = near_contact_changes(log, time, margin)
+    if near.all():
+        found = f"no sample further than {margin:g} s from a change of contact"
+        raise LogError(log.source, "contact_active", found, "a smaller preprocessing.contact_margin_s")
+    return ~near if near.any() else None

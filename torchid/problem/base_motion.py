@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from torchid.errors import LogError
+from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
 from torchid.parameters import Array
 from torchid.regressor.motion import GRAVITY_WORLD, motion_from_state, rotation_matrix
@@ -87,14 +87,25 @@ def base_motion(log: Log, robot: Robot) -> BaseMotion:
     return BaseMotion(quat, (rotation_matrix(quat).mT @ force[..., None])[..., 0], omega, alpha)
 
 
+def _on_base(robot: Robot) -> list[str]:
+    """Frames that do not move in the base, whatever sensors are in between."""
+    still = [0]
+    for index, body in enumerate(robot.bodies):  # parents come first
+        if body.joint is not None and body.joint.kind == "fixed" and body.parent in still:
+            still.append(index)
+    return [name for index in still for name in robot.bodies[index].links]
+
+
 def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
     """The base's motion from that of a frame that is rigidly on it: rigid-body kinematics with the lever arm."""
-    body, T_base_imu = robot.link(log.imu_frame, "imu_frame", log.source)
+    if log.imu_frame not in robot.links:
+        raise UnknownNameError(log.source, "imu_frame", log.imu_frame, _on_base(robot))
+    body, T_base_imu = robot.links[log.imu_frame]
     while (joint := robot.bodies[body].joint) is not None and joint.kind == "fixed":  # a sensor's weld does not move
         body, T_base_imu = joint.parent, joint.T_parent_joint @ joint.T_joint_link @ T_base_imu
     if body != 0:
         found = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
-        raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(robot.bodies[0].links[:8])}")
+        raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(_on_base(robot)[:8])}")
     for name in _IMU_FIELDS:
         if getattr(log, name) is None:
             raise LogError(log.source, name, "missing", f"{name}, or a log passed through preprocess()")

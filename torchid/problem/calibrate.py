@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,35 +18,47 @@ from torchid.problem.extras import Extra
 from torchid.problem.samples import Samples
 from torchid.regressor.tree import KinematicTree
 
-_IN_MEMORY, _ROWS = 2**30, 2**16  # bytes of a copy; rows that are copied at a time
+_ROWS = 2**16  # of a log on the disk that are in memory at a time
 
 
 def calibrated(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
     """Samples whose readings are the forces they stand for: s y - o for an offset o and a scale s of the reading y.
+
+    Readings without unknowns are shared with `samples`; those that change lie on the disk if `samples` do.
 
     Args:
         samples: as recorded.
         extras: unknowns; those of actuators do not matter here.
         values: of each, (E,).
         tree: of the robot.
+
+    Raises:
+        SpillError: the disk is full.
     """
-    torque, wrench = (None if x is None else _copied(x, samples.source) for x in (samples.torque, samples.wrench))
-    for extra, value in zip(extras, values.tolist(), strict=True):
-        if extra.what not in ("offset", "scale"):
+    known = [(x, value) for x, value in zip(extras, values.tolist(), strict=True) if x.what in ("offset", "scale")]
+    if samples.folder is None:
+        return replace(samples, **_readings(samples, known, tree))
+    spills: defaultdict[str, Spill] = defaultdict(partial(Spill, samples.source, samples.folder))
+    for start in range(0, len(samples), _ROWS):
+        for name, rows in _readings(samples[start : start + _ROWS], known, tree).items():
+            spills[name].append(rows.numpy())
+    stored: dict[str, Any] = {name: torch.from_numpy(spill.array()) for name, spill in spills.items()}
+    return replace(samples, **stored)
+
+
+def _readings(samples: Samples, known: Sequence[tuple[Extra, float]], tree: KinematicTree) -> dict[str, Any]:
+    """Calibrated copies of the fields of readings that have unknowns."""
+    copies: dict[str, Tensor] = {}
+    for extra, value in known:
+        name = "torque" if extra.contact is None else "wrench"
+        recorded: Tensor | None = getattr(samples, name)
+        if recorded is None:
             continue
-        if extra.dof is not None and torque is not None:
-            torque[:, extra.dof] -= value * dof_column(extra, samples, tree)
-        elif extra.contact is not None and wrench is not None:
+        if name not in copies:
+            copies[name] = recorded.clone()
+        if extra.contact is None:
+            copies[name][:, extra.dof] -= value * dof_column(extra, samples, tree)
+        else:
             contact, axis = extra.contact
-            wrench[:, contact, axis] -= value * reading_column(extra, samples, contact, axis)
-    return replace(samples, torque=torque, wrench=wrench)
-
-
-def _copied(x: Tensor, source: str) -> Tensor:
-    """A copy, on the disk if it is large: so are the samples of a log larger than memory."""
-    if x.nbytes <= _IN_MEMORY:
-        return x.clone()
-    spill = Spill(source, Path(tempfile.gettempdir()))
-    for rows in x.split(_ROWS):
-        spill.append(rows.numpy())
-    return torch.from_numpy(spill.array())
+            copies[name][:, contact, axis] -= value * reading_column(extra, samples, contact, axis)
+    return copies

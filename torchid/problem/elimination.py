@@ -58,6 +58,12 @@ class Assembly:
     eliminations: tuple[Elimination, ...]
     if_known: LinearProblem
 
+    def unknowns(self, phi: Array) -> list[Array]:
+        """What fits the rows best at parameters (12 L,), for each elimination."""
+        of_all = [found.inverse @ (found.z - found.C @ phi) for found in self.eliminations if not found.log]
+        left = np.concatenate([phi, *of_all])
+        return [found.inverse @ (found.z - found.C @ (left if found.log else phi)) for found in self.eliminations]
+
 
 @one_thread()
 def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction: bool = True) -> Assembly:

@@ -68,8 +68,9 @@ class Extra:
 
     @property
     def label(self) -> str:
-        """In words: "offset of l_sole fz"."""
-        channel = f"{self.name} {self.component}".strip()
+        """In words, and no two alike: "offset of l_sole fz", "offset of limb sensor l_ankle fz"."""
+        limb = "limb sensor " if self.component and self.dof is not None else ""  # a link may have its joint's name
+        channel = f"{limb}{self.name} {self.component}".strip()
         return f"{self.what.replace('_', ' ').replace('coulomb', 'Coulomb friction')} of {channel}"
 
 
@@ -90,6 +91,12 @@ def extras_of(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, ter
         if getattr(terms, what):
             found += [Extra(what, robot.joint_names[dof], "", unit, size, False, dof) for dof in measured]
     return tuple(found)
+
+
+def measured_channels(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> tuple[str, ...]:
+    """Those of `CHANNELS` that a sensor set measures."""
+    kinds = {kind for kind, *_ in _channels(robot, contacts, sensors)}
+    return tuple(kind for kind in CHANNELS if kind in kinds)
 
 
 def _channels(

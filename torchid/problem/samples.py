@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ class Samples:
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
         share: (N, C), what is left of a constant contact reading, as `Log.contact_share`; None where it is `active`.
+        folder: on whose disk the tensors of a log larger than memory lie, None for one in memory.
     """
 
     source: str
@@ -54,9 +56,16 @@ class Samples:
     active: Tensor
     oversampling: float = 1.0
     share: Tensor | None = None
+    folder: Path | None = None
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tensors."""
+        parts = (*vars(self).values(), *vars(self.base).values())
+        return sum(x.nbytes for x in parts if isinstance(x, Tensor))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Samples:
         """The samples with every tensor changed."""
@@ -148,6 +157,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
         None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
     )
     if required is not None:
+        _check_limbs(log, robot, required)
         check_forces(samples, robot, contacts, required)
     return samples
 
@@ -179,6 +189,17 @@ def _torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
         else:
             parts.append(log.ft_wrench[:, log.ft_names.index(name)])
     return torch.from_numpy(parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1))
+
+
+def _check_limbs(log: Log, robot: Robot, required: SensorSet) -> None:
+    """Make sure that the log has the required sensors in limbs at all."""
+    needed = required.torque[robot.n :].reshape(-1, 6).any(axis=1)
+    names = [name for name, here in zip(robot.ft_names, needed, strict=True) if here]
+    if names and log.ft_wrench is None:
+        raise LogError(log.source, "ft_wrench", "missing", "the field, or sensors without ft_sensors")
+    if lost := [name for name in names if name not in log.ft_names]:
+        accepted = f"every name in sensors.ft_sensors; the log has {', '.join(log.ft_names)}"
+        raise LogError(log.source, "ft_names", f"{', '.join(lost)} missing", accepted)
 
 
 def _columns(x: np.ndarray, order: list[int]) -> np.ndarray:

@@ -10,11 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, Checked
-from torchid.hygiene.channels import channel_names
+from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, Checked, Finding
+from torchid.hygiene.channels import channel_names, unit
 from torchid.logs import Log
 from torchid.logs.fields import FloatArray
 from torchid.report.figures import STYLE
@@ -28,17 +27,23 @@ _RANGE = (0.5, 99.5)  # percentiles that fill a row
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False})
 def hygiene_figure(logs: Sequence[Checked]) -> Figure:
-    """One panel per log, one row per channel, each scaled to its own range; findings are marked in their color."""
+    """One panel per log, one row per channel, each with its range beside it; findings are marked in their color."""
     rows = [len(_rows(one.log)) for one in logs]
     heights = [_ROW * count + _HEAD for count in rows]
     figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
     panels = figure.subplots(len(logs), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     for axes, one in zip(panels, logs, strict=True):
         _panel(axes, one)
-    marks = [Patch(color=color, alpha=0.6, label=severity) for severity, color in COLORS.items() if severity != NOTE]
-    handles = [*marks, Line2D([], [], color="0.35", linewidth=0.8, label="channel")]
-    panels[0].legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+    marked = {finding.severity for one in logs for finding in _marked(one)}
+    marks = [Patch(color=color, alpha=0.6, label=name) for name, color in COLORS.items() if name in marked]
+    if marks:
+        panels[0].legend(handles=marks, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(marks))
     return figure
+
+
+def _marked(checked: Checked) -> list[Finding]:
+    """Findings that concern some samples, and more than a note."""
+    return [finding for finding in checked.findings if finding.severity != NOTE and finding.spans]
 
 
 def _rows(log: Log) -> dict[tuple[str, str], FloatArray]:
@@ -64,18 +69,21 @@ def _panel(axes: Axes, checked: Checked) -> None:
         for (values, place) in zip(rows.values(), places.values(), strict=True)
     ]
     axes.add_collection(LineCollection(lines, colors="0.35", linewidths=0.6))
-    for finding in checked.findings:
-        if finding.severity != NOTE:
-            for span in finding.spans:
-                inside = [
-                    place
-                    for (field, name), place in places.items()
-                    if finding.field in (field, "time") and span.channel in ("", name)
-                ]
-                _mark(axes, float(time[span.first]), float(time[span.last]), inside, time[-1], finding.severity)
+    for finding in _marked(checked):
+        for span in finding.spans:
+            inside = [
+                place
+                for (field, name), place in places.items()
+                if finding.field in (field, "time") and span.channel in ("", name)
+            ]
+            _mark(axes, float(time[span.first]), float(time[span.last]), inside, time[-1], finding.severity)
     axes.set(xlim=(time[0], max(time[-1], 1e-9)), ylim=(-len(rows) + 0.4, 0.6), xlabel="time [s]")
     axes.set_yticks(list(places.values()), [f"{field} {name}" for field, name in places], fontsize=6)
     axes.tick_params(axis="y", length=0)
+    beside = axes.secondary_yaxis("right")
+    beside.set_yticks(list(places.values()), [_range_text(*channel, rows[channel]) for channel in places], fontsize=6)
+    beside.tick_params(axis="y", length=0)
+    beside.set_ylabel(f"range that fills a row: {_RANGE[0]:g} % to {_RANGE[1]:g} % of the values")
     axes.set_title(f"{Path(log.source).name}: {checked.verdict}", loc="left", fontsize=9, wrap=True)
 
 
@@ -86,6 +94,12 @@ def _mark(axes: Axes, start: float, end: float, places: Sequence[int], lasts: fl
         axes.broken_barh(
             [(middle - 0.5 * width, width)], (place - 0.5, 1.0), color=COLORS[severity], alpha=0.6, linewidth=0
         )
+
+
+def _range_text(field: str, name: str, values: FloatArray) -> str:
+    """What a row spans, with its unit."""
+    low, high = (f"{x:.3g}" for x in np.nanpercentile(values, _RANGE))
+    return f"{low} to {high} {unit(field, name)}".rstrip()
 
 
 def _scaled(values: FloatArray) -> FloatArray:

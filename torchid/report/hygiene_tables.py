@@ -25,7 +25,7 @@ def heading(checked: Checked) -> str:
 
 def hygiene_table(findings: Sequence[Finding]) -> Table:
     """Findings about one log, the gravest first."""
-    table = Table(show_lines=True)
+    table = Table(show_lines=True, expand=True)
     table.add_column("", no_wrap=True)
     table.add_column("samples", overflow="fold", max_width=12)
     table.add_column("found", overflow="fold", ratio=8)

@@ -78,6 +78,7 @@ def _extra(found: ExtraEstimate) -> dict[str, Any]:
         "log": found.log or None,
         "unit": extra.unit,
         "value": found.value,
+        "nominal_value": found.nominal_value,
         "standard_error": _plain(found.standard_error),
         "inflation": _plain(found.inflation),
         "told_apart": found.told_apart,
@@ -86,8 +87,12 @@ def _extra(found: ExtraEstimate) -> dict[str, Any]:
     }
 
 
-def read_shared_extras(path: Path) -> dict[str, float]:
-    """Values of the unknowns of all logs, by `Extra.label`, of a run's `parameters.json`.
+def read_shared_extras(path: Path, column: str = "value") -> dict[str, float]:
+    """Values of the unknowns of all logs, by `Extra.label`, of a run's file.
+
+    Args:
+        path: `parameters.json`.
+        column: "value" or "nominal_value".
 
     Raises:
         InputError: an entry that is none.
@@ -97,9 +102,9 @@ def read_shared_extras(path: Path) -> dict[str, float]:
     for entry in entries if isinstance(entries, list) else [None]:
         if not (isinstance(entry, dict) and isinstance(entry.get("label"), str)):
             raise InputError(path, "extras", "an entry without a label", "what torchid identify wrote")
-        value = entry.get("value")
+        value = entry.get(column)
         if not _is_usable(value):
-            raise InputError(path, f"extras, {entry['label']}, value", f"{value!r}", _ACCEPTED)
+            raise InputError(path, f"extras, {entry['label']}, {column}", f"{value!r}", _ACCEPTED)
         if entry.get("log") is None:
             out[entry["label"]] = float(value)
     return out

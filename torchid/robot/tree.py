@@ -72,10 +72,7 @@ def build_tree(
     names = [link.name for link in links]
     if base_link not in names:
         raise UnknownNameError(path, "robot.base_link", base_link, names)
-    welds = [joint.name for joint in joints if joint.type not in MOVING_TYPES]
-    for name in ft_joints:
-        if name not in welds:
-            raise UnknownNameError(path, FT_FIELD, name, welds)
+    _check_welds(path, names, joints, ft_joints)
     mimics = _resolve_mimics(path, joints)
     neighbours: dict[str, list[tuple[Joint, bool]]] = {name: [] for name in names}
     for joint in joints:  # a parent's own children come first, in the URDF's order
@@ -102,6 +99,17 @@ def build_tree(
         ]
         stack.extend(reversed(ahead))
     return tree
+
+
+def _check_welds(path: Path, links: Sequence[str], joints: Sequence[Joint], ft_joints: Sequence[str]) -> None:
+    kinds = {joint.name: joint.type for joint in joints}
+    welds = [name for name, kind in kinds.items() if kind not in MOVING_TYPES]
+    for name in ft_joints:
+        if name not in welds:
+            what = "a link" if name in links else ""
+            if name in kinds:
+                what = f"a {kinds[name]} joint"
+            raise UnknownNameError(path, FT_FIELD, name, welds, what and f"{what}, not a fixed joint")
 
 
 def _find_root(path: Path, links: list[Link], joints: list[Joint]) -> str:

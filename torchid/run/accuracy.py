@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from rich.progress import Progress
 
 from torchid.analysis.accuracy import error_directions
 from torchid.errors import LogError, TorchidWarning
+from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
+from torchid.problem.elimination import Assembly, assemble
+from torchid.problem.extras import ExtraTerms
 from torchid.problem.measured import measured_components
 from torchid.problem.samples import check_forces
 from torchid.problem.streaming import compress_parts
 from torchid.report.accuracy import SetAccuracy
 from torchid.report.expected import expected_errors
 from torchid.report.metrics import Evaluation
-from torchid.run.estimation import assembled, batch_estimator, stated_conditions
+from torchid.run.calibration import Calibration
+from torchid.run.estimation import batch_estimator, stated_conditions
 from torchid.run.experiment import Scene
-from torchid.sensing import SensorSet
+from torchid.run.fit import fitted
+from torchid.sensing import SensorSet, named_sensors, with_ft_sensors
 
 
 def accuracies(
@@ -32,12 +37,15 @@ def accuracies(
 ) -> dict[str, SetAccuracy]:
     """Fit with every sensor set that the training logs recorded; a descent is stood in for by least squares.
 
+    What is measured is compared with readings calibrated for the parameters of each fit, by all sensors if the training
+    logs have them, or else by the set's; what is expected counts offsets and the like as known in predictions.
+
     Warns:
         TorchidWarning: the training logs lack a sensor of a set, which is left out.
     """
     bar = bars.add_task("comparing sensor sets", total=len(sets))
-    evaluation = Evaluation(scene.robot, scene.contacts, scene.config.device)
-    out = {}
+    evaluation = Evaluation(scene.robot, scene.contacts, scene.config.device, scene.terms)
+    reference, out = _reference(scene, train), {}
     for name, sensors in sets.items():
         try:
             for samples in train:
@@ -46,9 +54,44 @@ def accuracies(
             message = f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'"
             warnings.warn(message, TorchidWarning, stacklevel=2)
         else:
-            out[name] = _accuracy(scene, sensors, train, test, evaluation, source)
+            out[name] = _accuracy(scene, sensors, train, test, evaluation, reference, source)
         bars.advance(bar)
     return out
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """Sensors that readings are compared with, and what the training logs say of their unknowns."""
+
+    scene: Scene
+    sensors: SensorSet
+    assembly: Assembly
+
+    def calibration(self, phi: Array) -> Calibration:
+        """For parameters (12 L,)."""
+        assembly = self.assembly
+        values = {
+            (found.log, extra.label): float(value)
+            for found, own in zip(assembly.eliminations, assembly.unknowns(phi), strict=True)
+            for extra, value in zip(found.extras, own, strict=True)
+        }
+        return Calibration(self.scene, self.sensors, phi, values)
+
+
+def _reference(scene: Scene, train: Sequence[Samples]) -> _Reference | None:
+    """All sensors, None if some log lacks one or there is nothing to calibrate."""
+    robot = scene.robot
+    sensors = named_sensors("full", robot.n, len(scene.contacts), scene.noise, len(robot.ft_names))
+    sensors = with_ft_sensors(sensors, robot, robot.ft_names)
+    builder = RowBuilder(robot, scene.contacts, sensors, scene.terms).to(scene.config.device)
+    if not builder.extras:
+        return None
+    try:
+        for samples in train:
+            check_forces(samples, robot, scene.contacts, sensors)
+    except LogError:
+        return None
+    return _Reference(scene, sensors, assemble(compress_parts(train, builder), builder, robot))
 
 
 def _accuracy(
@@ -57,21 +100,25 @@ def _accuracy(
     train: Sequence[Samples],
     test: Sequence[Samples],
     evaluation: Evaluation,
+    reference: _Reference | None,
     source: object,
 ) -> SetAccuracy:
     settings, robot = scene.config.estimator, scene.robot
     builder = RowBuilder(robot, scene.contacts, sensors, scene.terms).to(scene.config.device)
-    problem = assembled(compress_parts(train, builder), builder, robot, settings, source).problem
     if settings.name == "sgd":
         settings = replace(settings, name="least_squares")
     estimator = batch_estimator(settings, stated_conditions(settings, robot, source))
-    estimate = estimator.solve(problem)
+    fit = fitted(compress_parts(train, builder), scene, builder, estimator.solve, source)
+    estimate, problem = fit.estimate, fit.assembly.problem
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling
     prior_error = scene.config.analysis.prior_error
     directions = error_directions(problem, settings.ridge, variance, prior_error, settings.rank_tolerance)
     found = scene.noise.times(noise)
-    expected = expected_errors(evaluation.builder, test or train, directions, found)
-    measured = evaluation.metrics(test, estimate.phi[None])[0] if test else None
+    bodies = Evaluation(robot, scene.contacts, scene.config.device, ExtraTerms(sign_width=scene.terms.sign_width))
+    expected = expected_errors(bodies.builder, test or train, directions, found)
+    calibration = (reference or _Reference(scene, sensors, fit.assembly)).calibration(estimate.phi)
+    phi = calibration.parameters(evaluation)
+    measured = evaluation.metrics(calibration.logs(test), phi[None])[0] if test else None
     possible = measured_components(scene.contacts, sensors)
     return SetAccuracy(int(sensors.torque.sum() + possible.sum()), estimate.rank, expected, measured)

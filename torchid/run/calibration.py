@@ -1,47 +1,70 @@
-"""Logs as calibrated sensors would have recorded them, and what actuators add to predictions."""
+"""Logs as calibrated sensors would have recorded them, what actuators add to predictions, and the errors of both."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from torch import Tensor
 
 from torchid.analysis.calibration import ExtraEstimate
 from torchid.errors import ConfoundedWarning, LogError, TorchidWarning
+from torchid.hygiene.finding import listed
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.calibrate import calibrated
 from torchid.problem.elimination import assemble
 from torchid.problem.extras import Extra
 from torchid.problem.samples import check_forces
-from torchid.problem.streaming import compress_parts
-from torchid.report.metrics import Evaluation
-from torchid.run.experiment import Experiment
+from torchid.problem.streaming import Part, compress_parts
+from torchid.report.metrics import Evaluation, Metrics
+from torchid.run.experiment import Scene
+from torchid.run.robust import loss_of, robust_unknowns
+from torchid.sensing import SensorSet
 
 _NAMED = 6  # sensors or bodies that a warning names
 
 
+Values = Mapping[tuple[str, str], float]
+"""Unknowns beside the bodies' parameters, by log, "" for those of all, and `Extra.label`."""
+
+
 @dataclass(frozen=True)
 class Calibration:
-    """Values of the unknowns beside the bodies' parameters, by `Extra.label`.
+    """Parameters of the bodies, and the unknowns beside them that suit these.
 
-    `phi`: (12 L,), that the unknowns of a new log are fitted with. `shared`: of all logs; `by_log`: by source.
+    Attributes:
+        scene: robot, contacts and settings.
+        sensors: whose unknowns are meant.
+        phi: (12 L,), that the unknowns of a new log are fitted with.
+        values: what is known.
     """
 
-    experiment: Experiment
+    scene: Scene
+    sensors: SensorSet
     phi: Array
-    shared: Mapping[str, float]
-    by_log: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    values: Values
+    _of_new_logs: dict[str, Array | float] = field(default_factory=dict, init=False)
 
     @classmethod
-    def of(cls, experiment: Experiment, phi: Array, found: Iterable[ExtraEstimate]) -> Calibration:
-        """From a fit."""
-        by_log: dict[str, dict[str, float]] = {}
-        for x in found:
-            by_log.setdefault(x.log, {})[x.extra.label] = x.value
-        return cls(experiment, phi, by_log.pop("", {}), by_log)
+    def both(
+        cls, scene: Scene, sensors: SensorSet, phi: Array, found: Iterable[ExtraEstimate]
+    ) -> tuple[Calibration, Calibration]:
+        """Of nominal and identified parameters, from a fit."""
+        known = {(x.log, x.extra.label): (x.nominal_value, x.value) for x in found}
+        nominal, identified = ({key: pair[n] for key, pair in known.items()} for n in (0, 1))
+        return (
+            cls(scene, sensors, scene.robot.nominal.flatten(), nominal),
+            cls(scene, sensors, phi, identified),
+        )
+
+    @property
+    def changes_readings(self) -> bool:
+        """Whether readings have offsets or scales."""
+        return bool(self.scene.config.sensors.offsets or self.scene.config.sensors.scales)
 
     def logs(self, logs: Sequence[Samples]) -> list[Samples]:
         """The logs with calibrated readings; what is constant over a log is fitted on one that is new.
@@ -49,39 +72,73 @@ class Calibration:
         Warns:
             TorchidWarning: a new log lacks sensors, so that its readings are taken as they are.
         """
-        config = self.experiment.config.sensors
-        if not (config.offsets or config.scales):
+        if not self.changes_readings:
             return list(logs)
-        builder = self._builder()
-        return [calibrated(log, builder.extras, self._values(builder, log), builder.tree) for log in logs]
+        extras, tree = self._builder.extras, self._builder.tree
+        return [calibrated(log, extras, self._values_for(log), tree) for log in logs]
 
     def parameters(self, evaluation: Evaluation) -> Array:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""
-        return np.append(self.phi, _values_of(evaluation.builder.extras, self.shared))
+        return np.append(self.phi, self._known(evaluation.builder.extras, ""))
 
+    @cached_property
     def _builder(self) -> RowBuilder:
-        experiment = self.experiment
-        return RowBuilder(experiment.robot, experiment.contacts, experiment.sensors, experiment.terms)
+        scene = self.scene
+        return RowBuilder(scene.robot, scene.contacts, self.sensors, scene.terms)
 
-    def _values(self, builder: RowBuilder, log: Samples) -> Array:
-        values = _values_of(builder.extras, self.shared)
-        if any(extra.per_log for extra in builder.extras):
-            own = self.by_log[log.source] if log.source in self.by_log else self._fitted(builder, log, values)
-            values += _values_of(builder.extras, own)
+    def _known(self, extras: Sequence[Extra], log: str) -> Array:
+        """Values of some unknowns, those of a log and of all, 0 where none is known."""
+        return np.array([self.values.get((log if x.per_log else "", x.label), 0.0) for x in extras])
+
+    def _values_for(self, log: Samples) -> Array:
+        extras = self._builder.extras
+        values, own = self._known(extras, log.source), np.array([x.per_log for x in extras])
+        if own.any() and not any(source == log.source for source, _ in self.values):
+            if log.source not in self._of_new_logs:
+                self._of_new_logs[log.source] = self._fitted(log, values[~own])
+            values[own] = self._of_new_logs[log.source]
         return values
 
-    def _fitted(self, builder: RowBuilder, log: Samples, shared: Array) -> dict[str, float]:
+    def _fitted(self, log: Samples, shared: Array) -> Array | float:
         """Unknowns of a log, with everything else known."""
+        scene = self.scene
         try:
-            check_forces(log, self.experiment.robot, self.experiment.contacts, self.experiment.sensors)
+            check_forces(log, scene.robot, scene.contacts, self.sensors)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
             warnings.warn(message, TorchidWarning, stacklevel=2)
-            return {}
-        elimination = assemble(compress_parts([log], builder), builder, self.experiment.robot).eliminations[0]
-        of_all = [value for extra, value in zip(builder.extras, shared, strict=True) if not extra.per_log]
-        values = elimination.inverse @ (elimination.z - elimination.C @ np.append(self.phi, of_all))
-        return dict(zip((extra.label for extra in elimination.extras), values.tolist(), strict=True))
+            return 0.0
+        builder, own = self._builder, np.array([x.per_log for x in self._builder.extras])
+
+        def solve(parts: list[Part]) -> Array:
+            elimination = assemble(parts, builder, scene.robot).eliminations[0]
+            return elimination.inverse @ (elimination.z - elimination.C @ np.append(self.phi, shared))
+
+        def columns(values: Array) -> Tensor:
+            extras = np.empty(len(own))
+            extras[own], extras[~own] = values, shared
+            return builder.columns_of(np.append(self.phi, extras)[None])[0]
+
+        robust = scene.config.estimator.robust
+        if robust is None:
+            return solve(compress_parts([log], builder))
+        return robust_unknowns(log, builder, solve, columns, loss_of(robust.loss, robust.tuning), robust.passes)
+
+
+def errors(
+    evaluation: Evaluation,
+    logs: Sequence[Samples],
+    both: tuple[Calibration, Calibration],
+    progress: Callable[[int], None] | None = None,
+) -> tuple[Metrics, Metrics]:
+    """Of nominal and identified parameters on logs as recorded, each with the unknowns that suit them."""
+    nominal, identified = both
+    if not nominal.changes_readings:
+        before, after = evaluation.metrics(logs, np.stack([one.parameters(evaluation) for one in both]), progress)
+    else:
+        (before,) = evaluation.metrics(nominal.logs(logs), nominal.parameters(evaluation)[None])
+        (after,) = evaluation.metrics(identified.logs(logs), identified.parameters(evaluation)[None], progress)
+    return before, after
 
 
 def warn_of_confounded(found: Sequence[ExtraEstimate], source: object) -> None:
@@ -101,16 +158,12 @@ def warn_of_confounded(found: Sequence[ExtraEstimate], source: object) -> None:
 
 
 def _grouped(labels: Iterable[str]) -> str:
-    """Labels by their beginnings, the most frequent first: "pelvis m mcx, torso m"."""
+    """Labels by sensor or body, the most frequent first: "scale of l_hip, r_hip and 8 more; m, mcx of pelvis"."""
     groups: dict[str, dict[str, None]] = {}
     for label in labels:
         first, _, last = label.rpartition(" ")
         groups.setdefault(first, {})[last] = None
     order = sorted(groups, key=lambda first: -len(groups[first]))
-    more = f" and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
-    return ", ".join(" ".join([first, *groups[first]]) for first in order[:_NAMED]) + more
-
-
-def _values_of(extras: Sequence[Extra], named: Mapping[str, float]) -> Array:
-    """Values by label in the order of some unknowns, 0 where none is given."""
-    return np.array([named.get(extra.label, 0.0) for extra in extras])
+    more = f"; and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
+    named = ((first, listed(list(groups[first]))) for first in order[:_NAMED])
+    return "; ".join(f"{first} {names}" if " of" in first else f"{names} of {first}" for first, names in named) + more

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from torchid.config import load_analysis
+from torchid.config.experiment import PreprocessingConfig
 from torchid.config.topics import load_topics
 from torchid.errors import ConfigError, LogError
 from torchid.hygiene import Checked, check
 from torchid.logs import Log, read_log
-from torchid.logs.blocks import size_of
+from torchid.logs.container import appearing_whole
+from torchid.logs.ros.topics import Topics
 from torchid.report.hygiene_figure import hygiene_figure
 from torchid.report.hygiene_tables import hygiene_document
 from torchid.robot import load_robot
 from torchid.run.experiment import set_up_scene
-from torchid.run.large_logs import GIGABYTE
 from torchid.run.progress import progress_bars
+from torchid.run.reading import gigabytes
 from torchid.sensing import Contact
 
 EXPERIMENTS = (".yaml", ".yml")
@@ -70,18 +71,9 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     found = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
-            _check_size(file, config.preprocessing.memory_gb)
-            log = read_log(file, config.logs.topics)
+            log = _read(file, config.logs.topics, config.preprocessing)
             found.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
     return found
-
-
-def _check_size(path: Path, memory_gb: float) -> None:
-    """Refuse a log that is not in memory at once."""
-    size = size_of(path, GIGABYTE * memory_gb) / GIGABYTE
-    if size > memory_gb:
-        accepted = f"parts of the log, or a preprocessing.memory_gb above {size:.2g}"
-        raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
 
 
 def check_log(
@@ -101,15 +93,24 @@ def check_log(
         topics: experiment file whose `logs.topics` says what the topics of a bag hold.
 
     Raises:
-        InputError: the log or the URDF cannot be read.
+        InputError: the log or the URDF cannot be read, or the log is larger than an experiment's may be by default.
     """
-    log = read_log(path, None if topics is None else load_topics(topics))
+    log = _read(Path(path), None if topics is None else load_topics(topics), PreprocessingConfig())
     if urdf is None:
         return check(log)
     robot = load_robot(urdf, base_link, fixed_base, log.ft_names)
     for name in log.contact_names:
         robot.link(name, "contact_names", log.source)
     return check(log, robot, [_contact(log, index) for index in range(len(log.contact_names))])
+
+
+def _read(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Log:
+    """A log, unless it is larger than what may be in memory at once."""
+    size = gigabytes(path, settings.memory_gb)
+    if size > settings.memory_gb:
+        accepted = f"parts of the log, or an experiment file with a preprocessing.memory_gb above {size:.2g}"
+        raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
+    return read_log(path, topics)
 
 
 def _contact(log: Log, index: int) -> Contact:
@@ -138,22 +139,8 @@ def check_outputs(document: str | None, figure: str | None) -> None:
 def write_outputs(checked: Sequence[Checked], document: str | None, figure: str | None) -> None:
     """Write all findings as JSON and an overview as a figure, each complete or not at all."""
     if document is not None:
-        with _new_file(Path(document)) as new:
+        with appearing_whole(Path(document)) as new:
             new.write_text(json.dumps(hygiene_document(checked), indent=1, allow_nan=False) + "\n")
     if figure is not None:
-        with _new_file(Path(figure)) as new:
+        with appearing_whole(Path(figure)) as new:
             hygiene_figure(checked).savefig(new, dpi=130, format=Path(figure).suffix[1:].lower())
-
-
-@contextmanager
-def _new_file(path: Path) -> Iterator[Path]:
-    """A temporary file that takes the place of `path` when the block ends without an error."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        temporary.replace(path)
-    except OSError as error:
-        raise ConfigError(path, "file", f"cannot be written ({error.strerror})", "a writable folder") from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink()

@@ -11,12 +11,12 @@ from torchid.errors import ConfigError, TorchidWarning
 from torchid.report.figures import error_figure
 from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.parameters_json import read_parameters, read_shared_extras
-from torchid.run.calibration import Calibration
-from torchid.run.experiment import set_up
+from torchid.run.calibration import Calibration, errors
+from torchid.run.experiment import Experiment, set_up
 from torchid.run.folder import check_free, new_folder, write_json
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
-from torchid.run.results import candidates, forces_of
+from torchid.run.results import forces_of
 
 
 def evaluate(
@@ -50,20 +50,17 @@ def evaluate(
     with progress_bars() as bars:
         experiment = set_up(config, folder / "config.yaml")
         robot = experiment.robot
-        phi = read_parameters(folder / "parameters.json", robot).flatten()
-        calibration = Calibration(experiment, phi, read_shared_extras(folder / "parameters.json"))
+        both = _calibrations(experiment, folder / "parameters.json")
         reading = bars.add_task("reading logs", total=len(logs))
-        reader = LogReader(experiment)
+        reader = LogReader(experiment, folder)
         samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
-        samples = calibration.logs(samples)
         evaluation = Evaluation(robot, experiment.contacts, config.device, experiment.terms)
-        both = candidates(robot, calibration.parameters(evaluation))
         evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
         metrics = {}
         for log in samples:
-            nominal, identified = evaluation.metrics([log], both, lambda n: bars.advance(evaluating, n))
-            metrics[Path(log.source).stem] = (nominal, identified)
-            if not any(x is not None for x in identified.rms.values()):
+            pair = errors(evaluation, [log], both, lambda n: bars.advance(evaluating, n))
+            metrics[Path(log.source).stem] = pair
+            if not any(x is not None for x in pair[1].rms.values()):
                 message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
                 warnings.warn(message, TorchidWarning, stacklevel=2)
         document: dict[str, dict[str, object]] = {
@@ -75,6 +72,20 @@ def evaluate(
         with new_folder(output, overwrite=True) as new:
             (new / "config.yaml").write_text((folder / "config.yaml").read_text())
             write_json(new / "metrics.json", document)
-            forces_of(evaluation, samples[0], both, robot).savefig(new / "forces.png", dpi=130)
+            forces_of(evaluation, samples[0], both).savefig(new / "forces.png", dpi=130)
             error_figure(metrics).savefig(new / "errors.png", dpi=130)
     return metrics, output
+
+
+def _calibrations(experiment: Experiment, path: Path) -> tuple[Calibration, Calibration]:
+    """Nominal and identified parameters of a `parameters.json`, each with the unknowns of all logs that suit them."""
+    robot, sensors = experiment.robot, experiment.sensors
+    phi = read_parameters(path, robot).flatten()
+    nominal, identified = (
+        {("", label): value for label, value in read_shared_extras(path, column).items()}
+        for column in ("nominal_value", "value")
+    )
+    return (
+        Calibration(experiment, sensors, robot.nominal.flatten(), nominal),
+        Calibration(experiment, sensors, phi, identified),
+    )

@@ -9,7 +9,7 @@ import torch
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.sensors import ChoiceConfig
 from torchid.errors import ConfigError, UnknownNameError
-from torchid.problem.extras import ExtraTerms
+from torchid.problem.extras import CHANNELS, ExtraTerms, measured_channels
 from torchid.robot import Robot, load_robot
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import (
@@ -83,7 +83,8 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "exp
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise
-        raise UnknownNameError(source, _ft_field(config, error.name), error.name, error.valid) from error
+        field = _ft_field(config, error.name)
+        raise UnknownNameError(source, field, error.name, error.valid, error.what) from error
     if not robot.nv:
         raise ConfigError(source, "robot", "a bolted base without a joint, which never moves", "a robot that can move")
     contacts = check_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
@@ -108,7 +109,24 @@ def set_up(config: ExperimentConfig, source: object = "experiment") -> Experimen
     """As `set_up_scene`, with sensors resolved by name.
 
     Raises:
-        InputError: whatever in the file does not fit the robot.
+        InputError: whatever in the file does not fit the robot, or unknowns of sensors that are not among the measured.
     """
     scene = set_up_scene(config, source)
-    return Experiment(config, scene.robot, scene.contacts, scene.sensors_of(config.sensors, source))
+    experiment = Experiment(config, scene.robot, scene.contacts, scene.sensors_of(config.sensors, source))
+    _check_terms(experiment, source)
+    return experiment
+
+
+def _check_terms(experiment: Experiment, source: object) -> None:
+    """Refuse unknowns of kinds of channels that nothing measures; all kinds together mean those that are measured."""
+    terms = experiment.terms
+    measured = measured_channels(experiment.robot, experiment.contacts, experiment.sensors)
+    for field, scopes in (("offsets", terms.offsets), ("scales", terms.scales)):
+        for channel in scopes:
+            if channel not in measured and len(scopes) < len(CHANNELS):
+                accepted = f"{', '.join(measured)}, or log or all for every kind that is measured"
+                raise ConfigError(source, f"sensors.{field}.{channel}", "no such sensor is measured", accepted)
+    for name, wanted in vars(experiment.config.actuators).items():
+        if wanted and "joint_torque" not in measured:
+            accepted = "joint torques among the sensors, or no such key"
+            raise ConfigError(source, f"actuators.{name}", "set, but no joint torque is measured", accepted)

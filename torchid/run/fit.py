@@ -14,7 +14,7 @@ from torchid.problem import LinearProblem, RowBuilder
 from torchid.problem.elimination import Assembly
 from torchid.problem.streaming import Part
 from torchid.run.estimation import assembled
-from torchid.run.experiment import Experiment
+from torchid.run.experiment import Scene
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Fit:
 
 def fitted(
     parts: list[Part],
-    experiment: Experiment,
+    scene: Scene,
     builder: RowBuilder,
     solve: Callable[[LinearProblem], Estimate],
     source: object = "experiment",
@@ -44,12 +44,12 @@ def fitted(
 
     Args:
         parts: of the logs.
-        experiment: robot and settings.
+        scene: robot and settings.
         builder: of the rows.
         solve: an estimator.
         source: named in errors.
     """
-    settings, robot = experiment.config.estimator, experiment.robot
+    settings, robot = scene.config.estimator, scene.robot
     assembly = assembled(parts, builder, robot, settings, source)
     estimate = solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, robot.body_names, settings.rank_tolerance)

@@ -24,7 +24,7 @@ from torchid.problem.plan import State, state_name
 from torchid.problem.states import check_base, state_reports
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
-from torchid.run.calibration import Calibration, warn_of_confounded
+from torchid.run.calibration import Calibration, errors, warn_of_confounded
 from torchid.run.claim import claimed
 from torchid.run.estimation import assembled, batch_estimator, stated_conditions
 from torchid.run.experiment import Experiment, set_up
@@ -32,7 +32,7 @@ from torchid.run.fit import Fit, fitted
 from torchid.run.folder import check_free
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
-from torchid.run.results import Identification, candidates, write_run
+from torchid.run.results import Identification, write_run
 from torchid.run.robust import RobustSummary, loss_of, robust_fit
 from torchid.run.training import Training, check_training, training_folder
 
@@ -104,9 +104,8 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             alone = _by_state(experiment, builder, fit.parts, source)
             adds = _contributions(experiment, builder, fit.parts, logs["train"], problem, bars)
         with clock("evaluate"):
-            calibration = Calibration.of(experiment, estimate.phi, fit.extras)
-            logs = {name: calibration.logs(same) for name, same in logs.items()}
-            metrics = _metrics(evaluation, logs, calibration.parameters(evaluation), bars)
+            both = Calibration.both(experiment, experiment.sensors, estimate.phi, fit.extras)
+            metrics = _metrics(evaluation, logs, both, bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
         samples = sum(map(len, logs["train"]))
         run = Identification(
@@ -125,8 +124,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             total_mass(fit.assembly, estimate, config.estimator.rank_tolerance),
         )
         bars.add_task("writing", total=None)
-        shown = (logs["test"] or logs["train"])[0]
-        write_run(run, evaluation, shown, calibration.parameters(evaluation), training)
+        write_run(run, evaluation, (logs["test"] or logs["train"])[0], both, training)
     return run
 
 
@@ -213,16 +211,15 @@ def _contributions(
 
 
 def _metrics(
-    evaluation: Evaluation, logs: Mapping[str, Sequence[Samples]], phi: Array, bars: Progress
+    evaluation: Evaluation,
+    logs: Mapping[str, Sequence[Samples]],
+    both: tuple[Calibration, Calibration],
+    bars: Progress,
 ) -> dict[str, tuple[Metrics, Metrics]]:
     """Nominal and identified metrics by set of logs."""
     sets = {name: logs[name] for name in SETS if logs[name]}
     bar = bars.add_task("evaluating", total=sum(len(log) for same in sets.values() for log in same))
-    both, out = candidates(evaluation.robot, phi), {}
-    for name, same in sets.items():
-        nominal, identified = evaluation.metrics(same, both, lambda n: bars.advance(bar, n))
-        out[name] = (nominal, identified)
-    return out
+    return {name: errors(evaluation, same, both, lambda n: bars.advance(bar, n)) for name, same in sets.items()}
 
 
 def _identified_metrics(

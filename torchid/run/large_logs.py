@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +16,21 @@ from torch import Tensor
 from torchid.config.experiment import PreprocessingConfig
 from torchid.errors import LogError
 from torchid.logs import Log
-from torchid.logs.blocks import Blocks, counted_from, open_blocks
+from torchid.logs.blocks import GIGABYTE, Blocks, counted_from, open_blocks
 from torchid.logs.fields import WRENCHES, BoolArray, FloatArray
 from torchid.logs.measured import Coverage, check_coverage
 from torchid.logs.preprocess import differentiates, gapless_fields, on_timeline, timeline_of
 from torchid.logs.spill import Spill
 from torchid.logs.spline import BLOCK
 from torchid.logs.timeline import Timeline
-from torchid.logs.transitions import near_contact_changes
+from torchid.logs.transitions import away_from_changes
 from torchid.problem import Samples, bind
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.samples import check_forces, oversampling
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
-GIGABYTE = 1e9
 _COPIES = 16  # a block takes so many times the memory of its recorded arrays: derivatives, splines, bound tensors
-
-
-def folder_beside(output: Path) -> Path:
-    """The folder that a run goes to, or the nearest above it that exists already."""
-    return next((folder for folder in output.absolute().parents if folder.is_dir()), Path.cwd())
 
 
 @dataclass(frozen=True)
@@ -122,19 +118,6 @@ class LargeLog:
         return samples
 
 
-def away_from_changes(recorded: Log, time: FloatArray, margin: float) -> BoolArray | None:
-    """Which of some stamps are further than a margin [s] from the changes of contact in a log, None for all.
-
-    Raises:
-        LogError: none is.
-    """
-    near = near_contact_changes(recorded, time, margin)
-    if near.all():
-        found = f"no sample further than {margin:g} s from a change of contact"
-        raise LogError(recorded.source, "contact_active", found, "a smaller preprocessing.contact_margin_s")
-    return ~near if near.any() else None
-
-
 def _preprocessed(blocks: Blocks, piece: slice, timeline: Timeline | None, coverage: Mapping[str, Coverage]) -> Log:
     """A part of the preprocessed log."""
     if timeline is None:
@@ -147,16 +130,14 @@ class _Stored:
     """Tensors of the samples of one log, by name and whether they are the base's, that grow part by part."""
 
     def __init__(self, source: str, folder: Path) -> None:
-        self._source, self._folder = source, folder
-        self._spills: dict[tuple[str, bool], Spill] = {}
+        self._folder = folder
+        self._spills: defaultdict[tuple[str, bool], Spill] = defaultdict(partial(Spill, source, folder))
 
     def add(self, samples: Samples, kept: np.ndarray | None) -> None:
         """Add samples, or those of some numbers."""
         for part, of_base in ((samples, False), (samples.base, True)):
             for name, x in vars(part).items():
                 if isinstance(x, Tensor):
-                    if (name, of_base) not in self._spills:
-                        self._spills[name, of_base] = Spill(self._source, self._folder)
                     values = x.numpy()
                     self._spills[name, of_base].append(values if kept is None else values[kept])
 
@@ -166,4 +147,4 @@ class _Stored:
         base: dict[str, Tensor] = {}
         for (name, of_base), spill in self._spills.items():
             (base if of_base else own)[name] = torch.from_numpy(spill.array())
-        return replace(like, base=BaseMotion(**base), oversampling=oversampling, **own)
+        return replace(like, base=BaseMotion(**base), oversampling=oversampling, folder=self._folder, **own)

@@ -25,7 +25,7 @@ from torchid.report.parameters_json import parameters_document
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.report.tensorboard import RunEvents
 from torchid.report.urdf_export import identified_urdf
-from torchid.robot import Robot
+from torchid.run.calibration import Calibration
 from torchid.run.experiment import Experiment
 from torchid.run.folder import new_folder, write_json
 from torchid.run.robust import RobustSummary
@@ -73,27 +73,25 @@ class Identification:
         return self.estimate.phi.reshape(-1, PER_BODY)
 
 
-def candidates(robot: Robot, phi: Array) -> Array:
-    """Nominal and identified parameters, (2, 12 L + E), from the latter, of which E belong to actuators."""
-    nominal = robot.nominal.flatten()
-    return np.stack([np.pad(nominal, (0, len(phi) - len(nominal))), phi])
-
-
 def write_run(
-    run: Identification, evaluation: Evaluation, shown: Samples, phi: Array, training: Training | None
+    run: Identification,
+    evaluation: Evaluation,
+    shown: Samples,
+    both: tuple[Calibration, Calibration],
+    training: Training | None,
 ) -> None:
     """Write the run folder.
 
     Args:
         run: what to write.
         evaluation: for the predicted forces.
-        shown: log of the figure of forces, calibrated.
-        phi: (12 L + E,), identified parameters with those of actuators.
+        shown: log of the figure of forces, as recorded.
+        both: nominal and identified parameters, with the unknowns that suit them.
         training: whose curves go into the folder, and whose checkpoint is then no longer needed.
     """
     config, robot = run.experiment.config, run.experiment.robot
     figures = {
-        "forces": forces_of(evaluation, shown, candidates(robot, phi), robot),
+        "forces": forces_of(evaluation, shown, both),
         "errors": error_figure(run.metrics),
         "parameters": parameter_figure(
             robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
@@ -117,9 +115,11 @@ def write_run(
         training.forget()
 
 
-def forces_of(evaluation: Evaluation, samples: Samples, phi: Array, robot: Robot) -> Figure:
-    """The figure of measured forces of a log's first samples, and those of nominal and identified phi, (2, ...)."""
-    part = samples[:_PLOTTED_SAMPLES]
+def forces_of(evaluation: Evaluation, samples: Samples, both: tuple[Calibration, Calibration]) -> Figure:
+    """The figure of forces of a log's first samples: nominal, identified, and measured as the latter calibrates it."""
+    (samples,) = both[1].logs([samples])
+    part, robot = samples[:_PLOTTED_SAMPLES], evaluation.robot
+    phi = np.stack([one.parameters(evaluation) for one in both])
     measured, (nominal, identified) = force_series(evaluation.builder, part, phi)
     series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured, nominal, identified)
     return force_figure(series, robot.dof_names, robot.base_rows)
@@ -194,7 +194,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figur
     last = 1 if epochs is None else epochs
     with RunEvents(folder, robot.body_names, epochs is not None) as events:
         if epochs is None:
-            for step, phi in enumerate(candidates(robot, estimate.phi)):
+            for step, phi in enumerate((robot.nominal.flatten(), estimate.phi)):
                 events.errors(step, {name: pair[step] for name, pair in run.metrics.items()})
                 events.eigenvalues(step, body_eigenvalues(robot, phi))
             events.solution(estimate, run.samples / run.seconds["compress"])

@@ -7,18 +7,22 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchid.estimators import BoundEstimate
+from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.robust import TUNING, Reweighting, RobustLoss
-from torchid.problem.streaming import Part, compress_parts
+from torchid.problem.streaming import Part, compress_parts, merged
 from torchid.run.fit import Fit
 
 _CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
 _STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
 _EXACT = 1e-11  # of the predicted rows: what is left below is rounding
 _TINY = float(np.finfo(float).tiny)
-_START = 3  # passes with Huber's loss, which is convex, before Tukey's
+_START = 3  # passes with Huber's loss before Tukey's
+_SAME = 1e-3  # change of the unknowns of one log
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ def robust_fit(
     fit, scale, converged, done = first, first.estimate.residual_std, False, 0
     sources = {samples.source for samples in logs}
     while done < passes and not converged:
-        current = loss if loss.kind == "huber" or done >= _START else RobustLoss("huber", TUNING["huber"])
+        current = _loss_of_pass(loss, done)
         by_log = {source: fit.columns(builder, source) for source in sources}
         reweighting = Reweighting(current, by_log, max(scale, _TINY))
         before, done = fit, done + 1
@@ -67,6 +71,45 @@ def robust_fit(
         scale = reweighting.median_scale
     found = RobustSummary(loss.kind, loss.tuning, scale, reweighting.mean_weight, done, converged)
     return _with_errors(fit, reweighting), found
+
+
+def robust_unknowns(
+    log: Samples,
+    builder: RowBuilder,
+    solve: Callable[[list[Part]], Array],
+    columns: Callable[[Array], Tensor],
+    loss: RobustLoss,
+    passes: int,
+) -> Array:
+    """Unknowns of a log, (M,), with outliers weighed down and everything else known, as in `robust_fit`.
+
+    Args:
+        log: a bound log.
+        builder: of its rows.
+        solve: the unknowns that suit compressed parts of the log best.
+        columns: all parameters in the builder's columns for given unknowns, (width,).
+        loss: what residuals cost.
+        passes: at most.
+    """
+    parts = compress_parts([log], builder)
+    values = solve(parts)
+    factor = merged((part.factor for part in parts), builder)
+    left = factor.triangle() @ torch.cat([columns(values), torch.tensor([-1.0], dtype=torch.float64)])
+    scale = float(left.norm()) / np.sqrt(max(factor.rows, 1))
+    for done in range(passes):
+        current = _loss_of_pass(loss, done)
+        reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
+        before, values = values, solve(compress_parts([log], builder, weigh=reweighting))
+        steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
+        scale = reweighting.median_scale
+        if current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME):
+            break
+    return values
+
+
+def _loss_of_pass(loss: RobustLoss, done: int) -> RobustLoss:
+    """Huber's, which is convex, at first."""
+    return loss if loss.kind == "huber" or done >= _START else RobustLoss("huber", TUNING["huber"])
 
 
 def _settled(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:

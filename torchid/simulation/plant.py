@@ -6,17 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-try:
-    import mujoco
-except ImportError as error:
-    raise ImportError("torchid simulate needs MuJoCo: pip install 'torchid[sim]'") from error
 import numpy as np
 from lxml import etree
 
-from torchid.errors import UrdfError
+from torchid.errors import InputError, UrdfError
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
 from torchid.simulation.feet import Foot
+
+try:
+    import mujoco
+except ImportError as error:
+    found = "needs MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
+    raise InputError("torchid", "simulate", found, "pip install 'torchid[sim]'") from error
 
 _WORLD = "world link"
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")

@@ -81,6 +81,12 @@ class JointStates:
         self._parts: tuple[str, ...] = ()
         self._orders: dict[tuple[str, ...], list[int] | slice | None] = {}
 
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Joints of messages that were left out."""
+        left_out = (names for names, order in self._orders.items() if order is None)
+        return tuple(dict.fromkeys(name for names in left_out for name in names))
+
     def row(self, message: Any) -> FloatArray | None:
         """Position, then velocity and effort where there are any, of every joint; None for other joints' messages."""
         names = tuple(message.name)
@@ -153,11 +159,11 @@ class Odometry:
 
     def __init__(self, source: str, topic: str, twist: str) -> None:
         """With the twist in the frame `child` or `world`, or `none`."""
-        self._child, self._twist = _Constant(source, topic, "child_frame_id"), twist
+        self.frame, self._twist = _Constant(source, topic, "child_frame_id"), twist
 
     def row(self, message: Any) -> FloatArray:
         """Position, orientation (xyzw), linear and angular velocity."""
-        self._child.check(message.child_frame_id)
+        self.frame.check(message.child_frame_id)
         pose, twist, turn = message.pose.pose, message.twist.twist, message.pose.pose.orientation
         quat = (turn.x, turn.y, turn.z, turn.w)
         return np.array([*_vector(pose.position), *quat, *_vector(twist.linear), *_vector(twist.angular)])

@@ -64,7 +64,8 @@ def read_bag(
         UnknownNameError: it has no such topic.
 
     Warns:
-        TorchidWarning: messages without stamps, messages that come twice, channels that are NaN in part.
+        TorchidWarning: messages without stamps, messages that come twice, channels that are NaN in part, a frame that
+            is not the one expected or that nothing says to expect.
     """
     source, files = str(path), bag_files(path)
     if topics is not None:
@@ -138,6 +139,8 @@ def _motion(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, 
         decoder = bag.decoders.get(role)
         if isinstance(decoder, JointStates):
             out["joint_names"] = np.array(decoder.names, dtype=np.str_)
+        elif isinstance(decoder, Odometry) and bag.topics.odometry is not None:
+            _check_frame(bag, role, bag.topics.odometry.frame, "the robot's base link")
         elif isinstance(decoder, Imu) and bag.topics.imu is not None:
             frame = bag.topics.imu.frame or decoder.frame.value.removeprefix("/")
             if not frame:
@@ -191,15 +194,22 @@ def _ft_sensors(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[s
         return {}
     wrenches = [_wrench(bag, clock, series, f"ft_wrenches.{name}") for name in names]
     for name, topic in bag.topics.ft_wrenches.items():
-        if topic.frame is not None:
-            _check_frame(bag, f"ft_wrenches.{name}", topic.frame)
+        _check_frame(bag, f"ft_wrenches.{name}", topic.frame, f"the child frame of joint '{name}'")
     return {"ft_names": np.array(names), "ft_wrench": np.stack(wrenches, axis=1)}
 
 
-def _check_frame(bag: _Bag, role: str, expected: str) -> None:
-    """Warn of wrenches in another frame than they are taken to be in: nothing here could transform them."""
+def _check_frame(bag: _Bag, role: str, expected: str | None, otherwise: str = "") -> None:
+    """Warn of a pose or wrench of another frame than it is taken for: nothing here could transform it.
+
+    Which link is the base, and which one a fixed joint carries, the URDF says, and that is not known here: where the
+    map of topics expects nothing, `otherwise` names what the frame is taken for, and the user has to compare.
+    """
     decoder = bag.decoders[role]
-    if isinstance(decoder, Wrench) and decoder.frame.value.removeprefix("/") not in ("", expected):
-        what = f"in frame '{decoder.frame.value}', taken to be in '{expected}'"
-        message = f"{bag.source}: {bag.rows[role].topic}: {what}; logs.topics.{role}.frame says that this is meant"
+    if not isinstance(decoder, (Odometry, Wrench)):
+        return
+    found = decoder.frame.value
+    if found and (expected is None or found.removeprefix("/") != expected.removeprefix("/")):
+        taken_for = otherwise if expected is None else f"'{expected}'"
+        what = f"frame '{found}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
+        message = f"{bag.source}: {bag.rows[role].topic}: {what}"
         warnings.warn(message, TorchidWarning, stacklevel=5)

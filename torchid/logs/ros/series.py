@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, TorchidWarning
+from torchid.errors import LogError, TorchidWarning, UnknownNameError
 from torchid.logs import container
 from torchid.logs.fields import FloatArray
-from torchid.logs.ros.messages import Decoder
+from torchid.logs.ros.messages import Decoder, JointStates
 
 Stamps = NDArray[np.int64]
 
@@ -56,10 +56,14 @@ class Rows:
 
         Raises:
             LogError: there are none, or some have the same stamp and say different things.
+            UnknownNameError: there are none of the joints asked for.
 
         Warns:
             TorchidWarning: messages come twice.
         """
+        if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.others:
+            place, (name, *_) = "logs.topics.joint_states.joints", self._decoder.names
+            raise UnknownNameError(self._source, place, name, self._decoder.others)
         if not self._stamps:
             raise LogError(self._source, self.topic, "no messages", "at least one")
         stamps: Stamps = np.array(self._stamps, dtype=np.int64)

@@ -6,6 +6,7 @@ import contextlib
 import sqlite3
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 
@@ -16,6 +17,8 @@ from torchid.text import is_plain, shown
 
 #: Most bytes of one record. A camera's image has a few million, the chunk of messages around it hardly more.
 MAX_RECORD = 2**28
+#: What bags of any kind are read with.
+_PACKAGES = ("rosbags", "mcap", "zstandard")
 
 
 def plain(text: str) -> str:
@@ -76,7 +79,8 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
         import rosbags.serde
         import zstandard
     except ImportError as error:
-        found = f"a bag, but {error.name} is not installed"
+        absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
+        found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
         raise LogError(path, "file", found, "pip install 'torchid[ros]'") from error
     from torchid.logs.ros.mcap_file import McapFile
     from torchid.logs.ros.ros1_file import Ros1File

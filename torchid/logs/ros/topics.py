@@ -33,10 +33,15 @@ class ImuTopic:
 
 @dataclass(config=_STRICT, frozen=True)
 class OdometryTopic:
-    """`nav_msgs/Odometry` of the base link: the frame its twist is expressed in, `none` to derive it from the pose."""
+    """`nav_msgs/Odometry` of the base link.
+
+    `twist` is the frame its twist is expressed in, `none` to derive it from the pose. `frame` is the `child_frame_id`
+    to expect: it says that this is the base link.
+    """
 
     topic: _Name
     twist: Literal["child", "world", "none"] = "child"
+    frame: _Name | None = None
 
 
 @dataclass(config=_STRICT, frozen=True)
@@ -44,7 +49,8 @@ class WrenchTopic:
     """`geometry_msgs/WrenchStamped` or `Wrench`.
 
     `sign` is -1 where it is the robot's action on the environment, or the child side's on the parent side. `frame` is
-    the `header.frame_id` to expect, by default the contact's frame.
+    the `header.frame_id` to expect, by default the contact's frame; in a limb it says that this is the fixed joint's
+    child frame.
     """
 
     topic: _Name

@@ -1,0 +1,88 @@
+"""Offsets and terms of actuators, as the terminal and the figure show them: no log is left out without a word."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from matplotlib.collections import PathCollection
+from matplotlib.colors import to_rgba
+from rich.console import Console
+
+from torchid.analysis.calibration import ExtraEstimate
+from torchid.problem.extras import Extra
+from torchid.report.extra_figure import extra_figure
+from torchid.report.extra_table import extra_table
+
+
+def found(what: str, joint: str, log: str, unit: str = "N m") -> ExtraEstimate:
+    """An unknown of one log, or of all if it has no name."""
+    return ExtraEstimate(Extra(what, joint, "", unit, 1.0, bool(log), 0), log, 1.5, 1.4, 0.1, 1.0, ())
+
+
+def of_logs(count: int, joints: int = 1) -> list[ExtraEstimate]:
+    return [found("offset", f"j{j}", f"walks/{log}.npz") for j in range(joints) for log in range(count)]
+
+
+def printed(extras: list[ExtraEstimate]) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    console.print(extra_table(extras))
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+ARMATURE = found("armature", "j0", "", "kg m^2")
+
+
+@pytest.mark.parametrize(
+    ("extras", "columns", "rest"),
+    [
+        (of_logs(3), ["0.npz", "1.npz", "2.npz"], None),
+        (of_logs(4), ["0.npz", "1.npz", "2.npz", "3.npz"], None),
+        (of_logs(5), ["0.npz", "1.npz", "2.npz", "3.npz"], "and 1 log more: "),
+        (of_logs(6), ["0.npz", "1.npz", "2.npz", "3.npz"], "and 2 logs more: "),
+        ([*of_logs(3), ARMATURE], ["all logs", "0.npz", "1.npz", "2.npz"], None),
+        ([*of_logs(4), ARMATURE], ["all logs", "0.npz", "1.npz", "2.npz"], "and 1 log more: "),
+        ([*of_logs(5, 31)], ["0.npz", "1.npz", "2.npz", "3.npz"], "and 1 row and 1 log more: "),
+        ([*of_logs(1, 32)], ["0.npz"], "and 2 rows more: "),
+        ([ARMATURE], ["all logs"], None),
+    ],
+)
+def test_the_table_shows_four_columns_and_counts_what_it_leaves_out(
+    extras: list[ExtraEstimate], columns: list[str], rest: str | None
+) -> None:
+    assert [str(column.header) for column in extra_table(extras).columns][2:] == columns
+    text = printed(extras)
+    assert ("more" in text) == (rest is not None)
+    assert rest is None or rest in text
+
+
+def test_the_figures_legend_names_every_log_whichever_panel_it_is_in() -> None:
+    """Offsets have a panel of their own in front of the armature, which is that of all logs."""
+    figure = extra_figure([*of_logs(2, 3), ARMATURE, found("armature", "j1", "", "kg m^2")])
+    assert len(figure.axes) == 2
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["0.npz", "1.npz", "all logs"]
+    drawn = [
+        {to_rgba(color) for points in axis.collections for color in points.get_edgecolor()} for axis in figure.axes
+    ]
+    keys = [to_rgba(key.get_color()) for key in legend.legend_handles]
+    assert drawn == [set(keys[:2]), set(keys[2:])]
+    assert len(set(keys)) == 3
+
+
+def test_every_point_is_in_the_row_of_its_unknown() -> None:
+    """Also of the last of many logs, and of what only holds for all of them."""
+    figure = extra_figure([*of_logs(7, 2), ARMATURE])
+    for axis, rows in zip(figure.axes, (2, 1), strict=True):
+        assert sorted(axis.get_ylim()) == [-0.5, rows - 0.5]
+        for points in axis.collections:
+            if isinstance(points, PathCollection):
+                places = np.asarray(points.get_offsets())[:, 1]
+                assert np.round(places).tolist() == list(range(rows))
+                assert np.abs(places - np.round(places)).max() < 0.4
+
+
+def test_logs_of_one_name_in_two_folders_are_both_in_the_legend() -> None:
+    figure = extra_figure([found("offset", "j0", f"{day}/walk.npz") for day in ("monday", "friday")])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["walk.npz", "walk.npz"]
