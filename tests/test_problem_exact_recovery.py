@@ -9,7 +9,20 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from true_robots import EXACT, KINDS, SAMPLES, World, driving, fit, hide, predicted, unseen, world, worst
+from true_robots import (
+    EXACT,
+    KINDS,
+    SAMPLES,
+    World,
+    driving,
+    fit,
+    hide,
+    predicted,
+    true_parameters,
+    unseen,
+    world,
+    worst,
+)
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
@@ -104,10 +117,7 @@ def test_the_result_says_that_it_is_exact_and_that_the_urdf_was_not(name: str, s
 def test_base_parameters_are_the_true_ones_and_the_identifiable_among_all_too(name: str) -> None:
     w = world(name)
     estimate = found(name, "joints")
-    true = np.zeros((len(w.robot.bodies), parameters.PER_BODY))
-    true[:, parameters.INERTIAL] = w.oracle.inertial_parameters(w.robot)
-    order = [w.oracle.moving.index(body.joint.name) for body in w.robot.bodies if body.joint]
-    true[1:, parameters.FRICTION] = w.oracle.friction[order]
+    true = true_parameters(w.oracle, w.robot)
     scale = parameter_scale(w.robot.nominal).flatten()
     known = estimate.identifiable
     assert known.sum() > 2 * w.robot.n

@@ -15,13 +15,12 @@ from torchid.hygiene.finding import listed
 from torchid.hygiene.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES
-from torchid.logs.quaternion import sign_continuous
+from torchid.logs.quaternion import inverse, sign_continuous
 
 #: What follows from positions and orientation, whoever gives it.
 _JOINT_RATES = ("joint_velocity", "joint_acceleration")
 _BASE_RATES = ("base_angular_velocity_base", "base_angular_acceleration_base")
 _MOMENTS_IN_MILLI = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
-_INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,7 @@ def mistakes(log: Log) -> Iterator[Mistake]:
         order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, -1, axis=1)))
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, 1, axis=1)))
-        inverse = _quaternions(lambda quat: quat * _INVERSE)
-        yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", inverse)
+        yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _quaternions(inverse))
     if log.joint_torque is not None:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
         yield Mistake("joint_torque", "all reversed", reverse, _scaled("joint_torque", -1.0))

@@ -12,7 +12,7 @@ from torchid.hygiene.finding import CONDEMNED, Finding, Skipped
 from torchid.hygiene.rates import compare, integral
 from torchid.logs import Log
 from torchid.logs.fields import FloatArray
-from torchid.logs.quaternion import angular_velocity_base, rotate, rotate_back, sign_continuous
+from torchid.logs.quaternion import angular_velocity_base, inverse, rotate, rotate_back, sign_continuous
 from torchid.robot import Robot
 
 _NAME = "angular velocity against orientation"
@@ -79,8 +79,8 @@ def _mistakes(quat: FloatArray, omega: FloatArray) -> Iterator[_Mistake]:
         for value in (omega, rotate_back(other, rotate(quat, omega))):  # as it is, or as it was given in the world
             yield _Mistake(order, "rename base_quat_wxyz and base_quat_xyzw", "base_quat_xyzw", other, value)
     yield _Mistake("the sign is reversed", "reverse it", "", quat, -omega)
-    inverse = quat * np.array([-1.0, -1.0, -1.0, 1.0])
-    yield _Mistake("rotates world to base, not base to world", "give the inverse", "base_quat_xyzw", inverse, omega)
+    name = "rotates world to base, not base to world"
+    yield _Mistake(name, "give the inverse", "base_quat_xyzw", inverse(quat), omega)
 
 
 def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> _Mistake | None:
