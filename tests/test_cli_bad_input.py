@@ -14,6 +14,9 @@ from demo import shortened_demo
 from refusals import files_in, refusal
 
 from torchid.cli import _interrupt_held_back, main
+from torchid.config import load_config
+from torchid.problem.extras import extras_of
+from torchid.run.experiment import set_up
 
 Edit = Callable[[Path], None]
 
@@ -168,6 +171,34 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
         edit_config(sensors={"joint_torques": ["front_left_hop"]}),
         ("front_left_hop", "front_left_hip"),
     ),
+    "offset of sensors that are not there": (
+        edit_config(sensors={"set": "joints", "offsets": {"joint_torque": "all", "ft_force": "log"}}),
+        ("sensors.offsets.ft_force: no such sensor is measured; accepted: joint_torque, or",),
+    ),
+    "scale of sensors that are not there": (
+        edit_config(sensors={"set": "contacts", "scales": {"joint_torque": "all"}}),
+        ("sensors.scales.joint_torque: no such sensor is measured; accepted: contact_force, or",),
+    ),
+    "actuators without joint torques": (
+        edit_config(sensors="contacts", actuators={"sign_width": 0.1}),
+        ("actuators.sign_width: set, but no joint torque is measured",),
+    ),
+    "limb sensor at a moving joint": (
+        edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_hip"]}),
+        ("sensors.ft_sensors: 'front_left_hip', a revolute joint, not a fixed joint; accepted: front_left_sole",),
+    ),
+    "limb sensor at a link": (
+        edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_foot"]}),
+        ("sensors.ft_sensors: 'front_left_foot', a link, not a fixed joint; accepted: front_left_sole",),
+    ),
+    "limb sensor at nothing": (
+        edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_sol"]}),
+        ("sensors.ft_sensors: unknown name 'front_left_sol'; accepted: front_left_sole",),
+    ),
+    "limb sensor that the log lacks": (
+        edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_sole"]}),
+        ("sway_train.npz: ft_wrench: missing; accepted: the field",),
+    ),
     "component a point cannot exert": (
         edit_config(sensors={"contact_wrenches": {"rear_left_foot": ["mx"]}}),
         ("rear_left_foot", "mx", "fx"),
@@ -233,6 +264,38 @@ def test_bad_input_exits_2_with_one_line_and_writes_nothing(
     line = refusal(["identify", str(experiment / "quadruped.yaml")], experiment.parent, capsys)
     for part in expected:
         assert part in line
+
+
+def test_a_limb_sensor_is_planned_at_a_fixed_joint_only(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    override = "analysis.candidates.ft_sensors=[front_left_knee]"
+    line = refusal(["analyze", str(experiment / "quadruped.yaml"), override], experiment.parent, capsys)
+    assert "analysis.candidates.ft_sensors: 'front_left_knee', a revolute joint, not a fixed joint" in line
+
+
+@pytest.mark.parametrize("scope", ["log", "all"])
+def test_a_scope_alone_is_that_of_the_channels_that_are_measured(experiment: Path, scope: str) -> None:
+    scene = set_up(load_config(experiment / "quadruped.yaml", [f"sensors.offsets={scope}", f"sensors.scales={scope}"]))
+    extras = extras_of(scene.robot, scene.contacts, scene.sensors, scene.terms)
+    assert {x.name for x in extras} == set(scene.robot.joint_names)
+
+
+@pytest.mark.parametrize("command", ["identify", "analyze", "simulate"])
+def test_a_log_in_place_of_an_experiment_file_is_told_for_what_it_is(
+    experiment: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    line = refusal([command, str(experiment / "sway_train.npz")], experiment.parent, capsys)
+    assert "sway_train.npz: file: a log, not a file of settings" in line
+    kind = "simulation" if command == "simulate" else "experiment"
+    assert line.endswith(f"accepted: a YAML {kind} file")
+
+
+@pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "check"])
+def test_a_command_without_arguments_asks_for_a_file_and_not_for_overrides(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command])
+    assert capsys.readouterr().err.endswith("the following arguments are required: file\n")
 
 
 def test_unknown_override_names_the_nearest_key(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:

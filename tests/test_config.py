@@ -12,7 +12,7 @@ from refusals import assert_unknown_key, assert_wrong_value
 
 from torchid.config import ExperimentConfig, dump_config, load_config
 from torchid.config.experiment import EstimatorConfig, PreprocessingConfig
-from torchid.errors import ConfigError, TorchidWarning
+from torchid.errors import ConfigError, InputError, TorchidWarning
 from torchid.estimators import Sgd
 from torchid.run.training import descent_settings
 
@@ -305,6 +305,33 @@ def test_an_unknown_key_is_refused_by_its_place_and_the_nearest_that_exists(
 )
 def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings: Any, place: str, found: str) -> None:
     assert_wrong_value(lambda: load(file, settings), file, place, found)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("sensors.offsets=true", "sensors.offsets: found True; accepted: log, all, or a mapping"),
+        ("sensors.scales=every", "sensors.scales: found 'every'; accepted: log, all, or a mapping"),
+        ("estimator.robust=true", "estimator.robust: found True; accepted: huber, tukey, or a mapping"),
+        ("estimator.robust=cauchy", "estimator.robust: found 'cauchy'; accepted: huber, tukey, or a mapping"),
+        ("analysis.compare.a=3", "analysis.compare.a: found 3; accepted: full, contacts, joints, or a mapping"),
+        ("preprocessing.contact_margin_s=50ms", "contact_margin_s: found '50ms'; accepted: a number"),
+        ("actuators.sign_width=wide", "actuators.sign_width: found 'wide'; accepted: a number"),
+        ("estimator.training.epochs=2.5", "estimator.training.epochs: found 2.5; accepted: a whole number"),
+        ("overwrite=perhaps", "overwrite: found 'perhaps'; accepted: true or false"),
+        ("logs.topics={}", "logs.topics.joint_states: missing; accepted: the name of a topic, or a mapping with topic"),
+        ("estimator.symmetry={left: l}", "estimator.symmetry.right: missing; accepted: a name"),
+        ("contacts=[{frame: a}]", "contacts.0.type: missing; accepted: point, line, flat"),
+        ("estimator.symmetry={}", "symmetry.left, estimator.symmetry.right: missing; accepted: estimator.symmetry.l"),
+        ("memory_gb=4", "key: unknown name 'memory_gb'; accepted: preprocessing.memory_gb"),
+        ("seed=4", "key: unknown name 'seed'; accepted: estimator.training.seed, analysis.seed"),
+        ("preprocessing.armature=true", "preprocessing: unknown name 'armature'; accepted: actuators.armature"),
+    ],
+)
+def test_a_refusal_says_all_that_is_accepted(file: Path, override: str, message: str) -> None:
+    with pytest.raises(InputError) as raised:
+        load(file, LEAST, override)
+    assert message in str(raised.value)
 
 
 @pytest.mark.parametrize("key", LEAST)

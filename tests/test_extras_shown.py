@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from matplotlib.colors import to_rgba
 from rich.console import Console
 
 from torchid.analysis.calibration import ExtraEstimate
+from torchid.errors import ConfoundedWarning
 from torchid.problem.extras import Extra
 from torchid.report.extra_figure import extra_figure
 from torchid.report.extra_table import extra_table
+from torchid.run.calibration import warn_of_confounded
 
 
 def found(what: str, joint: str, log: str, unit: str = "N m") -> ExtraEstimate:
@@ -55,6 +58,33 @@ def test_the_table_shows_four_columns_and_counts_what_it_leaves_out(
     text = printed(extras)
     assert ("more" in text) == (rest is not None)
     assert rest is None or rest in text
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "expected"),
+    [
+        (0.15, 0.1, "0.15 ± 0.10"), (-0.98, 0.28, "-0.98 ± 0.28"), (1.0, 0.0998, "1.00 ± 0.10"),
+        (1234.4, 123.4, "1234 ± 120"), (2.0, 3e-4, "2.00000 ± 0.00030"), (2.0, 0.0, "2.000000 ± 0.000000"),
+    ],
+)  # fmt: skip
+def test_a_value_has_as_many_decimals_as_its_error_and_that_two_digits(
+    value: float, error: float, expected: str
+) -> None:
+    assert expected in printed([replace(ARMATURE, value=value, standard_error=error)])
+
+
+def test_a_warning_of_what_cannot_be_told_apart_lists_sensors_and_parameters_by_their_commas() -> None:
+    mixed = ("trunk m", "trunk Izz", "thigh mcy", "scale of hip0")
+    joints = [replace(found("scale", f"hip{j}", ""), inflation=1e9, mixed_with=mixed) for j in range(8)]
+    foot = Extra("offset", "sole", "fz", "N", 1.0, False, contact=(0, 2))
+    off = ExtraEstimate(foot, "", 1.5, 1.4, 0.1, 1e9, mixed)
+    with pytest.warns(ConfoundedWarning) as caught:
+        warn_of_confounded([*joints, off], "a.yaml")
+    message = str(caught.list[0].message)
+    assert message.startswith(
+        "a.yaml: scale of hip0, hip1, hip2, hip3, hip4, hip5 and 2 more; offset of sole fz cannot"
+    )
+    assert "told from m, Izz of trunk; mcy of thigh; do not trust" in message
 
 
 def test_the_figures_legend_names_every_log_whichever_panel_it_is_in() -> None:

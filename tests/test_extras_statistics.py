@@ -16,7 +16,7 @@ from unknowns import Fit, fit
 from urdfs import BASE, inertial, joint, link, write
 from welded import SENSORS, machine
 
-from torchid.analysis.calibration import APART, total_mass
+from torchid.analysis.known import APART, total_mass
 from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.logs import Log, preprocess

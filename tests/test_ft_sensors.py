@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -239,23 +240,33 @@ def test_the_bodies_on_both_sides_of_a_sensor_are_found_apart(urdf: Path) -> Non
 # ----------------------------------------------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize("name", ["hip", "sole", "ankle"])
-def test_a_sensor_can_sit_at_a_fixed_joint_only(urdf: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "what"), [("hip", "a revolute joint, not"), ("sole", "a link, not"), ("ankle", "a"), ("ankl", "unknown")]
+)
+def test_a_sensor_can_sit_at_a_fixed_joint_only(urdf: Path, name: str, what: str) -> None:
     with pytest.raises(UnknownNameError, match=f"'{name}'.*accepted: .*ankle_ft") as caught:
         load_robot(urdf, ft_joints=[name])
+    assert what in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
 @pytest.mark.parametrize(
-    "change", [{"ft_names": (), "ft_wrench": None}, {"ft_wrench": None}], ids=["not in the log", "no readings"]
+    ("change", "found"),
+    [
+        ({"ft_names": (), "ft_wrench": None}, "ft_wrench: missing; accepted: the field, or "),
+        ({"ft_wrench": None}, "ft_wrench: missing; accepted: the field, or "),
+        ({"ft_names": ("x", "y", *SENSORS[2:])}, f"ft_names: {SENSORS[0]}, {SENSORS[1]} missing; accepted: "),
+    ],
+    ids=["not in the log", "no readings", "other names"],
 )
-def test_a_sensor_that_was_not_recorded_is_refused_where_it_is_needed(urdf: Path, change: dict) -> None:
+def test_a_sensor_that_was_not_recorded_is_refused_where_it_is_needed(urdf: Path, change: dict, found: str) -> None:
     robot = load(urdf, None, False, SENSORS)
     log = make_log(Oracle.of(robot), [], [[]], 5, np.random.default_rng(8))
     sensors = with_ft_sensors(named_sensors("joints", robot.n, 0, ft=len(SENSORS)), robot, SENSORS)
     with pytest.raises(LogError) as caught:
         bind(replace(log, **change), robot, (), sensors)
-    assert str(caught.value).startswith("synthetic.npz: ft_wrench 'mount_ft.fx': ")
+    assert str(caught.value).startswith(f"synthetic.npz: {found}")
 
 
 def test_one_reading_that_is_not_a_number_is_named_with_its_sensor_and_sample(urdf: Path) -> None:

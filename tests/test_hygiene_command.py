@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ from motions import DATA, value
 from refusals import files_in, refusal
 
 from torchid.cli import main
-from torchid.logs import read_log, write_log
+from torchid.hygiene import check
+from torchid.logs import Log, read_log, write_log
+from torchid.report.hygiene_figure import hygiene_figure
 
 HUMAN, ARM = DATA / "human_squats", DATA / "kuka_lwr4"
 ELSEWHERE = pytest.mark.skipif(not DATA.is_dir(), reason=f"recorded logs are not in {DATA}")
@@ -71,6 +75,49 @@ def test_a_log_that_is_not_usable_ends_with_status_one(folder: Path, capsys: pyt
     write_log(replace(log, joint_position=np.degrees(log.joint_position)), folder / "sway_train.npz")
     assert main(["check", str(folder / "quadruped.yaml")]) == 1
     assert "verdict       not usable: joint_position: unit" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_a_log_too_short_to_differentiate_is_not_usable(
+    folder: Path, capsys: pytest.CaptureFixture[str], samples: int
+) -> None:
+    log, path = read_log(folder / "sway_train.npz"), str(folder / "sway_train.npz")
+    write_log(log.select(np.arange(samples)), path)
+    assert main(["check", path, "--urdf", str(folder / "quadruped.urdf")]) == 1
+    assert "verdict       not usable: time: too short" in capsys.readouterr().out
+
+
+def test_one_sample_of_an_arm_with_its_velocity_and_acceleration_needs_no_derivative(folder: Path) -> None:
+    log = read_log(folder / "sway_train.npz").select(np.arange(1))
+    q = log.joint_position
+    assert check(Log("one.npz", log.time, log.joint_names, q, joint_velocity=q, joint_acceleration=q)).usable
+    assert not check(Log("one.npz", log.time, log.joint_names, q, joint_velocity=q)).usable
+
+
+def test_an_overview_gives_the_range_of_every_channel_and_names_only_what_there_is(folder: Path) -> None:
+    clean, spiked = (check(read_log(folder / f"sway_{name}.npz")) for name in ("train", "test"))
+    assert not hygiene_figure([clean]).axes[0].get_legend()
+    (axes,) = hygiene_figure([spiked]).axes
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["condemned"]
+    (beside,) = axes.child_axes
+    names, ranges = ([label.get_text() for label in x.get_yticklabels()] for x in (axes, beside))
+    told = dict(zip(names, ranges, strict=True))
+    low, high = np.percentile(value(spiked.log.joint_torque)[:, 3], (0.5, 99.5))
+    assert told["joint_torque front_right_hip"] == f"{low:.3g} to {high:.3g} N m"
+    assert told["contact_wrench_local front_left_foot fz"].endswith(" N")
+    assert told["contact_active front_left_foot"] == "0 to 1"
+
+
+def test_the_documented_check_from_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    root = Path(__file__).parents[1]
+    (code,) = re.findall(r"```python\n(.*?)```", (root / "docs" / "checking.md").read_text(), re.DOTALL)
+    monkeypatch.chdir(root)
+    said: dict[str, Any] = {}
+    exec(code, said)
+    assert said["checked"].usable
+    assert said["mended"].joint_position.shape == said["log"].joint_position.shape
 
 
 def test_findings_and_an_overview_are_written_whole(folder: Path, tmp_path: Path) -> None:

@@ -283,6 +283,26 @@ def test_a_foot_that_stands_while_its_flag_is_off_is_no_offset() -> None:
     assert not found(checked, "offset")
 
 
+def test_a_loaded_foot_whose_flag_is_off_is_found_though_it_reads_nothing_in_the_air() -> None:
+    active, wrench = np.ones((300, 4), bool), 6.0 * value(carried().log.contact_wrench_world)
+    active[100:200, 2] = False  # while it carries 300 N
+    active[220:280, 2], wrench[220:280, 2] = False, np.nan
+    checked = carried(robot=False, contact_active=active, contact_wrench_world=wrench)
+    finding = only(checked, "force without contact")
+    assert places(finding) == {(100, 199)}
+    assert "inactive with up to 31" in finding.found
+    assert not any("flags" in skip.name for skip in checked.skipped)
+
+
+def test_a_contact_whose_force_was_not_measured_is_named_and_the_others_are_judged() -> None:
+    active, wrench = np.ones((300, 4), bool), value(carried().log.contact_wrench_world).copy()
+    active[100:150, 2], wrench[:, 1] = False, np.nan
+    checked = carried(robot=False, contact_active=active, contact_wrench_world=wrench)
+    assert places(only(checked, "force without contact")) == {(100, 149)}
+    (skip,) = [skip for skip in checked.skipped if "flags" in skip.name]
+    assert skip.reason == f"{demo_log().contact_names[1]}: its force was not measured whenever it touches"
+
+
 def test_what_the_feet_carry_at_rest_is_compared_with_the_weight() -> None:
     log = carried().log
     assert not list(weight(log, demo_robot()))

@@ -179,6 +179,13 @@ def test_an_imu_at_a_frame_that_does_not_exist_is_refused_with_the_nearest() -> 
     assert IMU in message
 
 
+def test_an_imu_at_a_frame_that_does_not_exist_is_not_sent_to_a_limb() -> None:
+    robot, oracle, log = recorded()
+    message = refusal(replace(with_imu(oracle, log, IMU), imu_frame="imu_in_tors"), robot, UnknownNameError)
+    assert "imu_in_torso" in robot.links
+    assert set(message.split("accepted: ")[1].split(", ")) <= set(robot.bodies[0].links)
+
+
 @pytest.mark.parametrize("name", ["imu_specific_force", "imu_angular_velocity", "imu_angular_acceleration"])
 def test_a_missing_reading_is_named(name: str) -> None:
     robot, oracle, log = recorded()

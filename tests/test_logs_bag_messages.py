@@ -55,7 +55,8 @@ def test_messages_of_other_joints_are_left_out_if_the_joints_are_listed(tmp_path
     assert (
         "/joint_states: a message without x; accepted: all 3 joints in every message, or joint_states.joints" in message
     )
-    assert "no messages" in refusal(tmp_path / "x.mcap", hand, joint_states={"topic": "/joint_states", "joints": ["a"]})
+    message = refusal(tmp_path / "x.mcap", arms + hand, joint_states={"topic": "/joint_states", "joints": ["nope"]})
+    assert "x.mcap: logs.topics.joint_states.joints: unknown name 'nope'; accepted: x, b, a, g" in message
 
 
 BAD_STATES: list[tuple[list[dict[str, Any]], str]] = [

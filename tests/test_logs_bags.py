@@ -128,6 +128,26 @@ def test_without_rosbags_the_message_says_what_to_install(tmp_path: Path, monkey
         read_log(path, parsed({"joint_states": "/joint_states"}))
 
 
+@pytest.mark.parametrize(
+    ("absent", "found"),
+    [
+        (("rosbags", "mcap", "zstandard"), "rosbags and mcap and zstandard are not installed"),
+        (("rosbags", "zstandard"), "rosbags and zstandard are not installed"),
+        (("mcap",), "mcap is not installed"),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".bag", ".db3"])
+def test_every_package_that_is_missing_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, absent: tuple[str, ...], found: str, suffix: str
+) -> None:
+    path = write_bag(tmp_path / f"x{suffix}", joints_at(STAMPS))
+    for name in [*sys.modules, *absent]:
+        if name.partition(".")[0] in absent:
+            monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(LogError, match=f"a bag, but {found}; accepted: "):
+        read_log(path, parsed({"joint_states": "/joint_states"}))
+
+
 # ------------------------------------------------------------------------------------------------- kinds of recording
 
 

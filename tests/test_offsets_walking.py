@@ -17,7 +17,7 @@ from synthetic import Array, load
 from unknowns import Fit, fit
 
 from torchid import parameters
-from torchid.analysis.calibration import APART, total_mass
+from torchid.analysis.known import APART, total_mass
 from torchid.estimators import LeastSquares
 from torchid.logs import Log, preprocess, read_log
 from torchid.problem import bind

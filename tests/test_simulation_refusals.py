@@ -199,11 +199,8 @@ def test_without_mujoco_a_simulation_says_how_to_install_it(
         if name.startswith("torchid.simulation") or name == "torchid.run.simulate":
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    before = files_in(folder)
-    assert main(["simulate", str(folder / "sim.yaml")]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "pip install 'torchid[sim]'" in line
-    assert files_in(folder) == before
+    line = refusal(["simulate", str(folder / "sim.yaml")], folder, capsys)
+    assert line.endswith("MuJoCo, which is not installed; accepted: pip install 'torchid[sim]'")
 
 
 # -------------------------------------------------------------------------------------------------- folders in the way

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
         project,
         violations,
     )
+    from torchid.hygiene import Checked, without_condemned
+    from torchid.hygiene.check import check
     from torchid.logs import Log, Topics, preprocess, read_log, write_log
     from torchid.problem import (
         ExtraTerms,
@@ -63,6 +65,8 @@ _HOMES = {
         "project",
         "violations",
     ),
+    "torchid.hygiene": ("Checked", "without_condemned"),
+    "torchid.hygiene.check": ("check",),
     "torchid.logs": ("Log", "Topics", "preprocess", "read_log", "write_log"),
     "torchid.problem": (
         "ExtraTerms",
@@ -92,6 +96,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "BaseParameters",
+    "Checked",
     "Conditions",
     "Consistent",
     "Contact",
@@ -119,6 +124,7 @@ __all__ = [
     "assemble",
     "base_parameters",
     "bind",
+    "check",
     "chosen_sensors",
     "compress",
     "compress_parts",
@@ -133,6 +139,7 @@ __all__ = [
     "structural_problem",
     "violations",
     "with_ft_sensors",
+    "without_condemned",
     "write_log",
 ]
 

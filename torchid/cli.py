@@ -94,11 +94,15 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.set_defaults(command=_evaluate)
     analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
     analyze.add_argument("file", help="experiment file (YAML); logs and sensors may be left out")
-    analyze.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example analysis.candidates.contacts=axis")
+    analyze.add_argument(
+        "overrides", nargs="*", default=[], help="key.subkey=value, for example analysis.candidates.contacts=axis"
+    )
     analyze.set_defaults(command=_analyze)
     simulate = commands.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
     simulate.add_argument("file", help="simulation file (YAML)")
-    simulate.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example sensors.bias.enabled=true")
+    simulate.add_argument(
+        "overrides", nargs="*", default=[], help="key.subkey=value, for example sensors.bias.enabled=true"
+    )
     simulate.set_defaults(command=_simulate)
     check = commands.add_parser("check", help=_CHECK, description=_CHECK)
     check.add_argument("file", help="experiment file (YAML), whose logs are checked against its robot, or a log")

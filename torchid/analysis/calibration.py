@@ -8,21 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchid import parameters
+from torchid.analysis.known import APART, ROUNDING, Known
 from torchid.estimators.result import Estimate
 from torchid.parameters import Array
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
-from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
 
-APART = 10.0
-"""An unknown whose standard error grows more than this by not knowing all others cannot be told from them.
-
-It is a variance inflation of 100, ten times what is commonly taken for serious collinearity; source: Belsley, Kuh,
-Welsch, "Regression Diagnostics", 1980.
-"""
-
-_ROUNDING = 1e-6
 _NAMED = 4  # parameters, at most, that a message names
 
 
@@ -54,84 +46,6 @@ class ExtraEstimate:
         return self.inflation <= APART
 
 
-@dataclass(frozen=True)
-class _Known:
-    """What the rows say of the free parameters, in units of their scale and of the rows' noise.
-
-    `root`, (P', rank): its outer product is their covariance; `hidden`, (P', ...): directions that no row sees;
-    `values`: singular values that belong to the columns of both.
-    """
-
-    root: Array
-    hidden: Array
-    values: Array
-    scale: Array
-    free: np.ndarray
-
-    @classmethod
-    def of(cls, problem: LinearProblem, rank_tolerance: float) -> _Known:
-        scale = problem.scale[problem.free]
-        _, values, Vt = np.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=True)
-        least = max(rank_tolerance, np.finfo(float).eps * max(problem.A.shape)) * values.max(initial=0.0)
-        rank = int((values > least).sum())
-        values = np.pad(values, (0, len(Vt) - len(values)))
-        values[rank:] = 0.0
-        return cls(Vt[:rank].T / values[:rank], Vt[rank:].T, values, scale, problem.free)
-
-    def blamed(self, sensitivity: Array, noise: float) -> Array:
-        """Share of the variance along sensitivities (P',) that each parameter brings in, of the largest such share.
-
-        None is taken to be off by more than its scale: else the worst known would be named, however little it weighs.
-        """
-        noise = max(noise, _ROUNDING**2)  # of exact data, where the least known is to blame
-        rank = self.root.shape[1]
-        directions = np.hstack([self.root * self.values[:rank], self.hidden])
-        along = directions.T @ sensitivity / (1.0 + (self.values / noise) ** 2)
-        shares = sensitivity * (directions @ along)
-        return np.asarray(shares / max(np.abs(shares).max(initial=0.0), np.finfo(float).tiny))
-
-    def reached(self, sensitivity: Array) -> Array:
-        """Sensitivities to all parameters, (M, 12 L), as those to the scaled free ones, (M, P')."""
-        return np.asarray(sensitivity[:, self.free] * self.scale)
-
-
-@dataclass(frozen=True)
-class TotalMass:
-    """How well the total mass is known [kg]: `standard_error`, infinite where the data do not determine it.
-
-    `told_apart`: whether they tell it from offsets and scales of sensors, as of `ExtraEstimate`.
-    """
-
-    standard_error: float
-    told_apart: bool
-
-
-def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1e-10) -> TotalMass:
-    """Of the estimated parameters."""
-    weights = np.zeros((len(estimate.phi) // parameters.PER_BODY, parameters.PER_BODY))
-    weights[:, parameters.MASS] = 1.0
-    error, if_known = (
-        standard_error_of(problem, estimate, weights.flatten(), rank_tolerance)
-        for problem in (assembly.problem, assembly.if_known)
-    )
-    return TotalMass(error, not np.isfinite(if_known) or error <= APART * if_known)
-
-
-@one_thread()
-def standard_error_of(
-    problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = 1e-10
-) -> float:
-    """Standard error of a combination `weights @ phi`, (12 L,), without the pull to nominal parameters.
-
-    Infinite where the data do not determine it; what is not free counts as known.
-    """
-    known = _Known.of(problem, rank_tolerance)
-    along = known.reached(weights[None])
-    if np.linalg.norm(along @ known.hidden) > _ROUNDING * np.linalg.norm(along):
-        return float("inf")
-    return float(np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ known.root))
-
-
 @one_thread()
 def estimate_extras(
     assembly: Assembly, estimate: Estimate, body_names: Sequence[str], rank_tolerance: float = 1e-10
@@ -144,7 +58,7 @@ def estimate_extras(
         body_names: the robot's.
         rank_tolerance: as in `LeastSquares`.
     """
-    known, names = _Known.of(assembly.problem, rank_tolerance), _names(assembly.problem.free, body_names)
+    known, names = Known.of(assembly.problem, rank_tolerance), _names(assembly.problem.free, body_names)
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     shared = next((found for found in assembly.eliminations if not found.log), None)
     values = zip(assembly.unknowns(estimate.phi), assembly.unknowns(assembly.problem.nominal), strict=True)
@@ -158,7 +72,7 @@ def _found(
     found: Elimination,
     values: tuple[Array, Array],
     noise: float,
-    known: _Known,
+    known: Known,
     names: Sequence[str],
     shared: Elimination | None,
 ) -> list[ExtraEstimate]:
@@ -173,10 +87,10 @@ def _found(
     G = known.reached(sensitivity)
     unseen = G @ known.hidden
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
-    lost = np.linalg.norm(unseen, axis=1) > _ROUNDING * size
+    lost = np.linalg.norm(unseen, axis=1) > ROUNDING * size
     through_parameters = ((G @ known.root) ** 2).sum(1)
     variance = sum((x**2).sum(1) for x in own) + through_parameters
-    undetermined = lost | ~found.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > _ROUNDING)
+    undetermined = lost | ~found.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > ROUNDING)
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
     for k, extra in enumerate(found.extras):
@@ -202,7 +116,7 @@ def _labels(found: Elimination) -> list[str]:
 def _largest(along: Array, names: Sequence[str]) -> tuple[str, ...]:
     """Names of the largest components of a direction, none that is small beside them."""
     order = np.argsort(-np.abs(along))[:_NAMED]
-    least = max(0.2 * np.abs(along).max(initial=0.0), _ROUNDING)
+    least = max(0.2 * np.abs(along).max(initial=0.0), ROUNDING)
     return tuple(names[k] for k in order if np.abs(along[k]) > least)
 
 

@@ -234,7 +234,9 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
         }
         described = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
         accepted = plain.get(first["type"], described)
-    return ConfigError(path, field, f"found {shown}", kind.accepted_at(place, accepted))
+    if first["type"] in ("dataclass_type", "dict_type"):
+        accepted = kind.accepted_at(place, accepted)
+    return ConfigError(path, field, f"found {shown}", accepted)
 
 
 def _repr(value: object) -> str:

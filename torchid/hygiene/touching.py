@@ -70,7 +70,7 @@ def _contacts(log: Log) -> Iterator[_Contact]:
         return
     for index, name in enumerate(log.contact_names):
         force, active = wrench[:, index, :3], log.contact_active[:, index]
-        read = np.isfinite(force).all(axis=1)
+        read = np.asarray(np.isfinite(force).all(axis=1))
         if read.any() and read[active].all():
             yield _Contact(name, active, np.where(read[:, None], force, np.nan))
 

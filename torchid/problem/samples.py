@@ -193,8 +193,8 @@ def _torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
 
 def _check_limbs(log: Log, robot: Robot, required: SensorSet) -> None:
     """Make sure that the log has the required sensors in limbs at all."""
-    needed = required.torque[robot.n :].reshape(-1, 6).any(axis=1)
-    names = [name for name, here in zip(robot.ft_names, needed, strict=True) if here]
+    needed = required.torque[robot.n :].reshape(-1, 6)
+    names = [name for name, here in zip(robot.ft_names, needed, strict=True) if here.any()]
     if names and log.ft_wrench is None:
         raise LogError(log.source, "ft_wrench", "missing", "the field, or sensors without ft_sensors")
     if lost := [name for name in names if name not in log.ft_names]:

@@ -158,12 +158,12 @@ def warn_of_confounded(found: Sequence[ExtraEstimate], source: object) -> None:
 
 
 def _grouped(labels: Iterable[str]) -> str:
-    """Labels by sensor or body, the most frequent first: "scale of l_hip, r_hip and 8 more; m, mcx of pelvis"."""
+    """Labels by sensor or body, the most frequent first: "scale of l_hip, r_hip; m, mcx of pelvis"."""
     groups: dict[str, dict[str, None]] = {}
     for label in labels:
         first, _, last = label.rpartition(" ")
         groups.setdefault(first, {})[last] = None
     order = sorted(groups, key=lambda first: -len(groups[first]))
     more = f"; and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
-    named = ((first, listed(list(groups[first]))) for first in order[:_NAMED])
+    named = ((first, listed(list(groups[first]), _NAMED)) for first in order[:_NAMED])
     return "; ".join(f"{first} {names}" if " of" in first else f"{names} of {first}" for first, names in named) + more

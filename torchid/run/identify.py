@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from rich.progress import Progress
 
-from torchid.analysis.calibration import total_mass
 from torchid.analysis.contributions import Contributions, contributions
+from torchid.analysis.known import total_mass
 from torchid.config import ExperimentConfig
 from torchid.errors import NumericalWarning, SensorError
 from torchid.estimators import Estimate, LeastSquares, violations

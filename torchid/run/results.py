@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from torchid.analysis.calibration import ExtraEstimate, TotalMass
+from torchid.analysis.calibration import ExtraEstimate
 from torchid.analysis.contributions import Contributions
+from torchid.analysis.known import TotalMass
 from torchid.config import ExperimentConfig, dump_config
 from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
 from torchid.parameters import PER_BODY, Array
