@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -63,10 +63,27 @@ def errors_in(metrics: dict[str, float]) -> dict[str, float]:
     return {group: metrics[f"{group}_rms"] for group in groups}
 
 
-def test_a_run_through_files_finds_them_and_another_log_is_predicted_with_them(tmp_path: Path) -> None:
-    """Offsets of each log, armature and asymmetric friction: the new log's own offsets are fitted on it."""
-    file, true, off = files(tmp_path, 0.2)
+@dataclass(frozen=True)
+class Run:
+    """A folder with logs, an experiment file and its run, and the truth of `files`."""
+
+    folder: Path
+    file: Path
+    true: dict[tuple[str, str], float]
+    off: dict[str, Miscalibration]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("machine")
+    file, true, off = files(folder, 0.2)
     assert main(["identify", str(file)]) == 0
+    return Run(folder, file, true, off)
+
+
+def test_a_run_through_files_finds_them_and_another_log_is_predicted_with_them(run: Run) -> None:
+    """Offsets of each log, armature and asymmetric friction: the new log's own offsets are fitted on it."""
+    tmp_path, true, off = run.folder, run.true, run.off
     document = json.loads((tmp_path / "run" / "parameters.json").read_text())
     values = {(entry["log"] or "", entry["label"]): entry for entry in document["extras"]}
     for key, expected in true.items():
@@ -96,9 +113,8 @@ def test_a_urdf_that_is_right_has_no_errors_whatever_the_offsets(tmp_path: Path)
     assert max(errors_in(json.loads(written.read_text())["new"]["nominal"]).values()) < 1e-8
 
 
-def test_sensor_sets_are_compared_with_calibrated_readings_of_all_sensors(tmp_path: Path) -> None:
-    file, _, _ = files(tmp_path, 0.2)
-    experiment = yaml.safe_load(file.read_text())
+def test_sensor_sets_are_compared_with_calibrated_readings_of_all_sensors(run: Run) -> None:
+    experiment = yaml.safe_load(run.file.read_text())
     experiment["logs"]["test"] = ["new.npz"]
     joints = list(load(experiment["robot"]["urdf"], None, False, SENSORS).joint_names)
     compare = {
@@ -106,31 +122,29 @@ def test_sensor_sets_are_compared_with_calibrated_readings_of_all_sensors(tmp_pa
         "torques and limbs": {"joint_torques": joints, "ft_sensors": list(SENSORS)},
     }
     experiment["analysis"] = {"scenarios": {"stand": [["sole"]]}, "compare": compare}
-    file.write_text(yaml.safe_dump(experiment))
-    assert main(["analyze", str(file)]) == 0
-    accuracy = json.loads((tmp_path / "run.analysis" / "analysis.json").read_text())["accuracy"]
+    (run.folder / "analysis.yaml").write_text(yaml.safe_dump(experiment))
+    assert main(["analyze", str(run.folder / "analysis.yaml")]) == 0
+    accuracy = json.loads((run.folder / "run.analysis" / "analysis.json").read_text())["accuracy"]
     found = {name: one["measured"] for name, one in accuracy.items()}
     for name in ("proposed", "torques and limbs"):
         assert max(found[name].values()) < 1e-7, found
     assert found["torques"]["base_force"] < 0.5, "0.13; 49 as recorded: it cannot tell bodies beyond a weld from others"
 
 
-def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(tmp_path: Path) -> None:
-    file, _, off = files(tmp_path, 0.2)
-    assert main(["identify", str(file)]) == 0
-    spoilt = read_log(tmp_path / "new.npz")
+def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(run: Run) -> None:
+    spoilt = read_log(run.folder / "new.npz")
     torque = value(spoilt.joint_torque).copy()
     torque[::40] += 500.0
     new = replace(spoilt, joint_torque=torque)
     errors = {}
     for robust in ("null", "tukey"):
-        experiment = set_up(load_config(file, [f"estimator.robust={robust}"]))
-        document = tmp_path / "run" / "parameters.json"
+        experiment = set_up(load_config(run.file, [f"estimator.robust={robust}"]))
+        document = run.folder / "run" / "parameters.json"
         shared = {("", label): x for label, x in read_shared_extras(document).items()}
         phi = read_parameters(document, experiment.robot).ravel()
         calibration = Calibration(experiment, experiment.sensors, phi, shared)
         (read,) = calibration.logs([bind(new, experiment.robot, CONTACTS)])
-        expected = torque - off[str(tmp_path / "new.npz")].torque
+        expected = torque - run.off[str(run.folder / "new.npz")].torque
         errors[robust] = np.abs(value(read.torque)[:, : len(expected[0])].numpy() - expected).max()
     assert errors["null"] > 1.0
     assert errors["tukey"] < 1e-6, errors

@@ -17,7 +17,7 @@ from refusals import files_in
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 COMMANDS = ("identify", "train", "evaluate", "analyze", "convert")
-TIMES = [2, pytest.param(25, marks=pytest.mark.slow)]
+TIMES = [1, pytest.param(25, marks=pytest.mark.slow)]
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, listed
+from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding
 from torchid.logs import Log
 from torchid.robot import Robot
+from torchid.text import listed
 
 #: Two turns [rad]: a joint with stops goes nowhere near.
 TWO_TURNS = 4.0 * np.pi

@@ -7,13 +7,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from torchid.hygiene.channels import channel_names
-from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped, listed
+from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped
 from torchid.hygiene.rates import Comparison, compare
 from torchid.logs import Log
 from torchid.logs.fields import BoolArray
 from torchid.logs.preprocess import CHAINS
 from torchid.logs.quaternion import rotate, rotate_back
 from torchid.regressor.motion import GRAVITY_WORLD
+from torchid.text import listed
 
 #: A delay [samples] worth a word: half a sample comes from integrators and central differences.
 DELAYED = 1.5

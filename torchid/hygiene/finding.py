@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,13 +93,3 @@ def spans_of(where: BoolArray | NDArray[np.intp], channel: str = "") -> Iterator
     for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1):
         if len(run):
             yield Span(int(run[0]), int(run[-1]), channel)
-
-
-def listed(names: Sequence[str], most: int = 4) -> str:
-    """Names joined by commas, the first few of many."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def counted(count: int, what: str) -> str:
-    """A number of things, as in "1 gap" and "3 gaps"."""
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -7,13 +7,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from torchid.errors import InputError
-from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped, listed
+from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped
 from torchid.hygiene.mistakes import mistakes
 from torchid.hygiene.model import TRIED, ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES, FloatArray
 from torchid.robot import Robot
 from torchid.sensing import Contact
+from torchid.text import listed
 
 #: Misfit above which usual mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
 WRONG = 0.4

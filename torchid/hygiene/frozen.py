@@ -11,9 +11,10 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from torchid.hygiene.channels import Group
-from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, counted, listed
+from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
 from torchid.hygiene.repeats import Runs, held_for, implausible, in_dead_band
 from torchid.logs.fields import WRENCHES, BoolArray, FloatArray
+from torchid.text import counted, listed
 
 #: Samples at the very same extreme value from which on it is a limit and no coincidence.
 AT_LIMIT = 5

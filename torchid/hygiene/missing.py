@@ -7,9 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from torchid.hygiene.channels import NO_SIGNALS, channel_names
-from torchid.hygiene.finding import CONDEMNED, NOTE, Finding, Span, counted, listed, spans_of
+from torchid.hygiene.finding import CONDEMNED, NOTE, Finding, Span, spans_of
 from torchid.logs import Log
 from torchid.logs.fields import NAN_ALLOWED, WRENCHES, FloatArray
+from torchid.text import counted, listed
 
 #: Share of NaN above which a channel counts as one that was not recorded, and not as one with holes.
 MOSTLY_THERE = 0.2

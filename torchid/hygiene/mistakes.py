@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.hygiene.angles import TWO_TURNS
-from torchid.hygiene.finding import listed
 from torchid.hygiene.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES
 from torchid.logs.quaternion import inverse, sign_continuous
+from torchid.text import listed
 
 #: What follows from positions and orientation, whoever gives it.
 _JOINT_RATES = ("joint_velocity", "joint_acceleration")

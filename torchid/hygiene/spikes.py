@@ -12,12 +12,13 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from torchid.hygiene.channels import Group, median_step
-from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, counted, listed
+from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
 from torchid.hygiene.jumps import LONGEST_SPIKE, Jump, jumps
 from torchid.hygiene.neighbours import near
 from torchid.logs import Log
 from torchid.logs.fields import BoolArray, FloatArray
 from torchid.logs.transitions import near_contact_changes
+from torchid.text import counted, listed
 
 POSES = ("joint_position", "base_quat_xyzw", "base_position_world")
 #: Fields whose lasting steps are worth a word; velocities and accelerations have theirs from impacts and commands.

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from torchid.hygiene.channels import LONG_STEP
-from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, counted
+from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
 from torchid.logs import Log
 from torchid.logs.fields import BoolArray, FloatArray
 from torchid.logs.plan import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_STEP
 from torchid.logs.preprocess import differentiates
+from torchid.text import counted
 
 #: A median step [s] above which no acceleration can be seen: robots move at 0.5 to 5 Hz.
 SLOWEST_STEP = 0.5

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchid.hygiene.channels import median_step
-from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, Span, counted, spans_of
+from torchid.hygiene.finding import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, Span, spans_of
 from torchid.hygiene.neighbours import NORMAL
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES, BoolArray, FloatArray
+from torchid.text import counted
 
 #: Share of the weight that an inactive contact must not carry. Thresholds of flags are 20 to 50 N, for 60 kg 3 to 8 %.
 LOADED = 0.1

@@ -10,8 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.hygiene import Checked, Finding, Span
-from torchid.hygiene.finding import listed
 from torchid.logs.fields import FloatArray
+from torchid.text import listed
 
 _SPANS = 3
 

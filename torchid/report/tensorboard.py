@@ -6,7 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 from torch.utils.tensorboard import SummaryWriter
 
 from torchid.analysis.information import Knowledge
@@ -126,7 +128,7 @@ class RunEvents:
         settings: str,
         hyperparameters: Mapping[str, str | float | bool],
         final: Mapping[str, float],
-        figures: Mapping[str, Figure],
+        figures: Mapping[str, Path],
         step: int,
     ) -> None:
         """What a finished run adds.
@@ -135,12 +137,13 @@ class RunEvents:
             settings: resolved configuration, YAML.
             hyperparameters: for the HParams tab.
             final: metrics beside them.
-            figures: by tag.
+            figures: PNG files by tag; drawing is what a run's end spends most time on.
             step: of the figures.
         """
         self._writer.add_text("config", _preformatted(settings))
-        for tag, figure in figures.items():
-            self._writer.add_figure(tag, figure, step, close=False)
+        for tag, path in figures.items():
+            pixels = np.round(255.0 * imread(path)).astype(np.uint8)
+            self._writer.add_image(tag, pixels, step, dataformats="HWC")
         named = {f"final/{name}": value for name, value in final.items()}
         self._writer.add_hparams(dict(hyperparameters), named, run_name="hparams")
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchid.analysis.calibration import ExtraEstimate
 from torchid.errors import ConfoundedWarning, LogError, TorchidWarning
-from torchid.hygiene.finding import listed
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.calibrate import calibrated
@@ -24,9 +23,9 @@ from torchid.report.metrics import Evaluation, Metrics
 from torchid.run.experiment import Scene
 from torchid.run.robust import loss_of, robust_unknowns
 from torchid.sensing import SensorSet
+from torchid.text import listed
 
 _NAMED = 6  # sensors or bodies that a warning names
-
 
 Values = Mapping[tuple[str, str], float]
 """Unknowns beside the bodies' parameters, by log, "" for those of all, and `Extra.label`."""
@@ -136,7 +135,10 @@ def errors(
     if not nominal.changes_readings:
         before, after = evaluation.metrics(logs, np.stack([one.parameters(evaluation) for one in both]), progress)
     else:
-        (before,) = evaluation.metrics(nominal.logs(logs), nominal.parameters(evaluation)[None])
+        with warnings.catch_warnings():  # the identified ones say the same
+            warnings.simplefilter("ignore", TorchidWarning)
+            readings = nominal.logs(logs)
+        (before,) = evaluation.metrics(readings, nominal.parameters(evaluation)[None])
         (after,) = evaluation.metrics(identified.logs(logs), identified.parameters(evaluation)[None], progress)
     return before, after
 

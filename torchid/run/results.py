@@ -111,7 +111,7 @@ def write_run(
             figure.savefig(folder / f"{name}.png", dpi=130)
         if training is not None:
             training.copy_curves(folder)
-        _write_curves(run, folder, figures)
+        _write_curves(run, folder, {name: folder / f"{name}.png" for name in figures})
     if training is not None:
         training.forget()
 
@@ -189,7 +189,7 @@ def _solution_document(estimate: Estimate) -> dict[str, object] | None:
     return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}
 
 
-def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Figure]) -> None:
+def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]) -> None:
     estimate, robot, config = run.estimate, run.experiment.robot, run.experiment.config
     epochs = estimate.epochs if isinstance(estimate, SgdEstimate) else None
     last = 1 if epochs is None else epochs
