@@ -1,11 +1,15 @@
-"""Robots that several test files use."""
+"""Robots, and places to run commands in, that several test files use."""
 
 from __future__ import annotations
 
 import signal
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from demo import shortened_demo
+from hostile_commands import Commands, commands
 from synthetic import load
 
 from torchid.robot import Robot
@@ -44,3 +48,19 @@ def biped_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("simulations") / "biped"
     simulate(short(output))
     return output
+
+
+@pytest.fixture(scope="module")
+def place() -> Iterator[Path]:
+    """A folder with a short demo that anyone may read."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o755)
+        shortened_demo(Path(name) / "demo", 100)
+        yield Path(name)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Commands]:
+    """What runs commands in processes of their own."""
+    with commands() as running:
+        yield running

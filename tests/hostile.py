@@ -62,6 +62,10 @@ class Tally:
         """One line for each case that went wrong."""
         return [f"{self.kind}, {x.name}: {fault}" for x in self.verdicts for fault in x.faults]
 
+    def share(self, outcome: str) -> float:
+        """Of the cases that ended so."""
+        return sum(x.outcome == outcome for x in self.verdicts) / len(self.verdicts)
+
     def __str__(self) -> str:
         outcomes = Counter(x.outcome for x in self.verdicts)
         slow = max(self.verdicts, key=lambda x: x.seconds)
@@ -162,12 +166,11 @@ def examined(
     folder: Path,
     may_write: Iterable[Path] = (),
 ) -> Tally:
-    """Every case of a kind, given to a call; asserts that nothing went wrong and prints what became of them."""
+    """What became of every case of a kind, given to a call; printed too."""
     tally, allowed = Tally(kind), tuple(may_write)
     for name, case in cases:
         tally.verdicts.append(judged(name, lambda case=case: call(case), folder, allowed))
     print(tally)
-    assert not tally.faults, "\n".join(tally.faults[:20])
     return tally
 
 

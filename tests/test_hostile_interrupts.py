@@ -5,32 +5,16 @@ from __future__ import annotations
 import random
 import shutil
 import signal
-import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from demo import shortened_demo
-from hostile_commands import Commands, commands
+from hostile_commands import Commands
 from refusals import files_in
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 COMMANDS = ("identify", "train", "evaluate", "analyze", "convert")
 TIMES = [1, pytest.param(25, marks=pytest.mark.slow)]
-
-
-@pytest.fixture(scope="module")
-def place() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory() as name:
-        shortened_demo(Path(name) / "demo", 100)
-        yield Path(name)
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[Commands]:
-    with commands() as running:
-        yield running
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,12 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
-from demo import shortened_demo
 from hostile import judged
-from hostile_commands import Commands, commands
+from hostile_commands import Commands
 from refusals import files_in
 
 from torchid.cli import main
@@ -25,21 +22,6 @@ from torchid.run.folder import RUN, new_folder, remove_folder, write_json
 
 WHOLE = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "hparams", "forces.png", "errors.png"}
 NOBODY = 65534
-
-
-@pytest.fixture(scope="module")
-def place() -> Iterator[Path]:
-    """A folder with a short demo that anyone may read."""
-    with tempfile.TemporaryDirectory() as name:
-        Path(name).chmod(0o755)
-        shortened_demo(Path(name) / "demo", 100)
-        yield Path(name)
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[Commands]:
-    with commands() as running:
-        yield running
 
 
 def identify(place: Path, output: object, *more: str) -> list[str]:

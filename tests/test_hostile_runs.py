@@ -54,7 +54,9 @@ def test_parameters_edited_by_hand_are_finite_or_refused(place: Path, count: int
         assert np.isfinite(read_parameters(path, robot)).all()
 
     cases = islice(parameter_files(place / "run" / "parameters.json", count, seed=8), 0, None, share)
-    examined("parameters.json", cases, read, place)
+    tally = examined("parameters.json", cases, read, place)
+    assert tally.faults == []
+    assert tally.share("refused") > 0.8
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
@@ -62,7 +64,9 @@ def test_parameters_edited_by_hand_are_finite_or_refused(place: Path, count: int
 def test_a_run_with_parameters_edited_by_hand_is_evaluated_or_refused(place: Path, share: int) -> None:
     cases = islice(parameter_files(place / "run" / "parameters.json", 40, seed=9), 0, None, share)
     may_write = [place / "run" / "evaluation"]
-    examined("runs, edited by hand", cases, lambda _: main(evaluation(place)), place, may_write)
+    tally = examined("runs, edited by hand", cases, lambda _: main(evaluation(place)), place, may_write)
+    assert tally.faults == []
+    assert tally.share("refused") > 0.6
 
 
 @pytest.mark.parametrize("share", [8, pytest.param(1, marks=pytest.mark.slow)])
@@ -77,7 +81,8 @@ def test_a_run_with_hostile_settings_is_refused(place: Path, share: int) -> None
         config.write_text(whole)
 
     tally = examined("config.yaml of runs", cases(), lambda _: main(evaluation(place)), place)
-    assert all(x.outcome == "refused" for x in tally.verdicts)
+    assert tally.faults == []
+    assert tally.share("refused") == 1.0
 
 
 @pytest.mark.parametrize("name", ["..npz", "...npz", "....npz"])
@@ -98,7 +103,9 @@ def test_checkpoints_are_tensors_and_plain_types_or_refused(place: Path, count: 
     def load(path: Path) -> None:
         assert isinstance(load_checkpoint(path.parent), dict)
 
-    examined("checkpoints", checkpoints(place / "sgd.training" / CHECKPOINT, count, 10, share), load, place)
+    tally = examined("checkpoints", checkpoints(place / "sgd.training" / CHECKPOINT, count, 10, share), load, place)
+    assert tally.faults == []
+    assert tally.share("refused") > 0.2
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
@@ -117,7 +124,9 @@ def test_a_training_goes_on_from_its_own_state_alone(place: Path, tmp_path: Path
             shutil.copytree(kept, place / "sgd.training")
 
     may_write = [place / "sgd", place / "sgd.training", place / ".sgd"]
-    examined("resumed trainings", cases(), lambda _: main(arguments), place, may_write)
+    tally = examined("resumed trainings", cases(), lambda _: main(arguments), place, may_write)
+    assert tally.faults == []
+    assert tally.share("refused") > 0.3
 
 
 def test_states_are_alike_if_they_are_made_of_the_same() -> None:

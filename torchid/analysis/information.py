@@ -54,21 +54,14 @@ def triangle(X: Array) -> Array:
     return np.asarray(np.linalg.qr(X, mode="r"))
 
 
-def without(X: Array, unknown: Sequence[int]) -> Array:
-    """Rows of the other columns that say the same of them as X, (R, N), does where some columns are unknown."""
-    if not unknown:
-        return X
-    rest = np.delete(X, unknown, axis=1)
-    columns = X[:, list(unknown)]
-    size = np.linalg.norm(columns, axis=0)
-    U, values, _ = np.linalg.svd(columns / np.where(size > 0.0, size, 1.0), full_matrices=True)
-    left = U[:, int((values > DEPENDENT).sum()) :].T @ rest
-    left[:, np.linalg.norm(left, axis=0) < DEPENDENT * np.linalg.norm(rest, axis=0)] = 0.0
-    return np.asarray(left)
-
-
 def information_without(H: Array, unknown: Sequence[int], size: Array) -> Array:
-    """As `without`, of H = X^T X; what is below the share `DEPENDENT` of `size`, (M,), of an unknown is rounding."""
+    """As `elimination.without`, of H = X^T X.
+
+    Args:
+        H: (N, N).
+        unknown: places of M columns.
+        size: (M,), squared norms of these; what is below the share `DEPENDENT` of them is rounding.
+    """
     if not unknown:
         return H
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))

@@ -8,9 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from torchid.analysis.information import Knowledge, triangle, without
+from torchid.analysis.information import Knowledge, triangle
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
+from torchid.problem.elimination import without
 from torchid.problem.streaming import Part
 
 

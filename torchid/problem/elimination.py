@@ -119,14 +119,28 @@ def _eliminate(
     """
     seen = sizes > _DEPENDENT * sizes.max(initial=0.0)
     scale = np.where(seen, sizes, 1.0)
-    U, values, Vt = np.linalg.svd(np.where(seen, columns / scale, 0.0), full_matrices=True)
-    rank = int((values > _DEPENDENT).sum())
-    top, V = U[:, :rank].T @ rest, Vt[:rank].T
-    count = builder.columns.count
+    U, values, V, left = _split(np.where(seen, columns / scale, 0.0), rest)
+    top, count = U.T @ rest, builder.columns.count
     C = np.hstack([top[:, :count] @ builder.columns.from_parameters(), top[:, count:-1]])
     alone = np.where(seen, 1.0 / scale, np.inf)
     hidden = np.eye(len(extras)) - V @ V.T
-    found = Elimination(log, extras, (V / values[:rank]) / scale[:, None], C, top[:, -1], alone, hidden)
+    found = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], alone, hidden)
+    return found, left
+
+
+def without(X: Array, unknown: Sequence[int]) -> Array:
+    """Rows of the other columns that say the same of them as X, (R, N), does where some columns are unknown."""
+    if not unknown:
+        return X
+    columns = X[:, list(unknown)]
+    size = np.linalg.norm(columns, axis=0)
+    return _split(columns / np.where(size > 0.0, size, 1.0), np.delete(X, unknown, axis=1))[-1]
+
+
+def _split(columns: Array, rest: Array) -> tuple[Array, Array, Array, Array]:
+    """U, singular values and V of what columns of norm 1 or 0 span, and the rows of the rest that they do not reach."""
+    U, values, Vt = np.linalg.svd(columns, full_matrices=True)
+    rank = int((values > _DEPENDENT).sum())
     left = U[:, rank:].T @ rest
     left[:, np.linalg.norm(left, axis=0) < _DEPENDENT * np.linalg.norm(rest, axis=0)] = 0.0  # nothing but rounding
-    return found, left
+    return U[:, :rank], values[:rank], Vt[:rank].T, left
