@@ -117,12 +117,19 @@ def write_run(
 
 
 def forces_of(evaluation: Evaluation, samples: Samples, both: tuple[Calibration, Calibration]) -> Figure:
-    """The figure of forces of a log's first samples: nominal, identified, and measured as the latter calibrates it."""
-    (samples,) = both[1].logs([samples])
-    part, robot = samples[:_PLOTTED_SAMPLES], evaluation.robot
-    phi = np.stack([one.parameters(evaluation) for one in both])
-    measured, (nominal, identified) = force_series(evaluation.builder, part, phi)
-    series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured, nominal, identified)
+    """The figure of forces of a log's first samples: nominal, identified, and measured as the latter calibrates it.
+
+    Each prediction is as far from what was measured as from readings that are calibrated for it.
+    """
+    measured, predicted = [], []
+    for one in both:
+        (read,) = one.logs([samples])
+        part = read[:_PLOTTED_SAMPLES]
+        readings, (forces,) = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
+        measured.append(readings)
+        predicted.append(forces)
+    robot, nominal = evaluation.robot, predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured
+    series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured[1], nominal, predicted[1])
     return force_figure(series, robot.dof_names, robot.base_rows)
 
 
