@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic import Array
+from torch import Tensor
 
 from torchid.sensing.nullspace import null_space
 
@@ -68,10 +69,29 @@ def test_a_direction_is_lost_below_a_billionth_of_the_largest(smallest: float, r
     assert [x.shape[1] for x in V] == [5 - rank, 5 - min(k, 5)]
 
 
-def test_a_basis_carries_no_gradient() -> None:
-    A = torch.randn(4, 2, 5, dtype=torch.float64, requires_grad=True)
-    for _, V in null_space(A):
-        assert not V.requires_grad
+@pytest.mark.parametrize("rank", [1, 2, 3], ids=["one", "two", "full"])
+def test_the_projector_on_a_null_space_has_its_derivatives_along_motions_that_keep_the_rank(rank: int) -> None:
+    rng = np.random.default_rng(rank)
+    left, right = (torch.from_numpy(rng.normal(size=shape)) for shape in ((4, 3, rank), (4, rank, 7)))
+
+    def projector(left: Tensor, right: Tensor) -> Tensor:
+        ((_, V),) = null_space(left @ right)
+        assert V.shape == (4, 7, 7 - rank)
+        return V @ V.mT
+
+    arguments = [left.requires_grad_(), right.requires_grad_()]
+    assert torch.autograd.gradcheck(projector, arguments)
+    assert torch.autograd.gradgradcheck(projector, arguments)
+
+
+def test_a_basis_that_carries_a_gradient_is_the_one_that_carries_none() -> None:
+    A = torch.randn(50, 4, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    A[::7, 3] = A[::7, 2]
+    for (index, V), (other, same) in zip(null_space(A.clone().requires_grad_()), null_space(A), strict=True):
+        assert V.requires_grad
+        assert not same.requires_grad
+        torch.testing.assert_close(torch.arange(50)[index], torch.arange(50)[other])
+        torch.testing.assert_close(V.detach(), same, rtol=0.0, atol=1e-14)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

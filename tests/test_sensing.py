@@ -264,3 +264,20 @@ def test_gradients_flow_through_regressor_and_measured_forces(noise: float | Non
     assert torch.autograd.gradcheck(
         projected, [x.clone().requires_grad_() for x in (scene.K, scene.torque, scene.wrench)], fast_mode=True
     )
+
+
+@pytest.mark.parametrize("noise", [None, 0.5], ids=["orthonormal", "whitened"])
+def test_projected_forces_have_their_gradient_in_the_posture(noise: float | None) -> None:
+    """With feet of which nothing, part or all is measured: the null space turns with the legs."""
+    scene = Scene(robot_of(ANYMAL), FEET, 11, samples=4)
+    scene.touching[:] = torch.tensor([[1, 1, 1, 1], [1, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=torch.bool)
+    project = Projection([True] * 9 + [False] * 3, [True] * 3 + [False] * 8 + [True], 6, noise, noise, noise)
+    frames = [FrameJacobian(scene.robot, foot.frame) for foot in FEET]
+
+    def squares(joints: Tensor) -> Tensor:
+        q = torch.cat([scene.q[:, :7], joints], dim=1)
+        J = torch.cat([frame(q)[:, :3] for frame in frames], dim=1)
+        groups = project(J, scene.active, scene.K, scene.torque, scene.wrench)
+        return torch.cat([(group.K.mean(2) - group.f).square().sum(1) for group in groups])
+
+    assert torch.autograd.gradcheck(squares, scene.q[:, 7:].clone().requires_grad_(), atol=1e-5, rtol=1e-6)

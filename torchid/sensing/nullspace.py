@@ -17,21 +17,42 @@ def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Orthonormal bases of the null spaces of a batch of matrices, grouped by rank.
 
     A QR factorization of the transpose serves samples of full row rank; only those that might have lost rank (straight
-    knees) pay for a singular value decomposition. Bases carry no gradient: they depend on the motion alone, and their
-    choice within the null space is arbitrary.
+    knees) pay for a singular value decomposition. Which basis of a null space comes out is arbitrary, and so is its
+    gradient; whatever depends on the null space alone, such as `V V^T` or the norm of `V^T f`, has the right one as
+    long as the rank stays. Where the rank changes, null spaces jump: there is no derivative, and what is returned is
+    that along motions that keep the rank.
 
     Args:
-        A: (B, k, m).
+        A: (B, k, m); with gradient if it requires one.
 
     Yields:
         (index of the samples, V): V is (B', m, m - rank) with `A @ V = 0` and `V^T V = I`.
     """
-    A = A.detach()
+    for index, V in _bases(A.detach()):
+        yield index, _differentiable(A[index], V) if A.requires_grad else V
+
+
+def _differentiable(A: Tensor, V: Tensor) -> Tensor:
+    """Bases `V` as functions of A: projected onto the null space of A and made orthonormal again.
+
+    Their value does not change but by rounding. To first order dV = -A^+ dA V (Golub, Pereyra 1973).
+    """
+    inverse = torch.linalg.pinv(A, rtol=_tolerance(A))
+    inside = V - inverse @ (A @ V)
+    L = torch.linalg.cholesky(inside.mT @ inside)
+    return torch.linalg.solve_triangular(L, inside.mT, upper=False).mT
+
+
+def _tolerance(A: Tensor) -> float:
+    return max(RANK_TOLERANCE, max(A.shape[1:]) * torch.finfo(A.dtype).eps)
+
+
+def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
     samples, k, m = A.shape
     if samples == 0:
         return
     identity = torch.eye(m, dtype=A.dtype, device=A.device)
-    tolerance = max(RANK_TOLERANCE, max(k, m) * torch.finfo(A.dtype).eps)
+    tolerance = _tolerance(A)
     if k == 0:
         yield slice(None), identity.expand(samples, m, m)
         return
@@ -70,9 +91,8 @@ def whitened_null_space(
 
     Yields:
         (index of the samples, W): W is (B', m, m - rank) with `A @ W = 0` and `W^T S W = I`, where S, the covariance of
-        the generalized force, is `diag(row_std^2) + J_m^T diag(wrench_std^2) J_m`.
+        the generalized force, is `diag(row_std^2) + J_m^T diag(wrench_std^2) J_m`. Gradients as in `null_space`.
     """
-    J_m = J_m.detach()
     for index, V in null_space(A / row_std):
         W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
         if len(wrench_std):

@@ -47,6 +47,10 @@ class Projection(nn.Module):
     The unmeasured forces enter through `A_x = [S_x; J_x]`: rows of unit vectors for unmeasured joint torques, rows of
     the contact Jacobian for unmeasured wrench components of active contacts. `V_x` spans its null space; whatever is
     unmeasured has no place in `V_x^T K phi = V_x^T A_m^T [tau_m; lambda_m]`.
+
+    Gradients flow to all arguments, the Jacobian included: through `V_x` too, whose choice is arbitrary, so that only
+    losses that do not depend on it (squares of projected forces, their sum over a batch) have one that means
+    something. Where an active contact loses rank (a straight knee), the null space jumps and has no derivative.
     """
 
     def __init__(
@@ -132,8 +136,8 @@ class Projection(nn.Module):
             V = basis.new_zeros(basis.shape[0], len(kept), basis.shape[2])
             V[:, kept] = basis
             if self.base_rows:
-                orthonormal = torch.linalg.qr(V).Q if self._whiten else V
-                rank = base_rank(base_singular_values(orthonormal))
+                fixed = V.detach()
+                rank = base_rank(base_singular_values(torch.linalg.qr(fixed).Q if self._whiten else fixed))
             else:
                 rank = index.new_zeros(V.shape[0])
             groups.append(
