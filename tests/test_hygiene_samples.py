@@ -155,6 +155,49 @@ def test_a_quantised_encoder_that_rests_is_not_frozen() -> None:
     assert not found(check(replace(moving(), joint_position=flicker)), "frozen")
 
 
+@pytest.mark.parametrize("quantum", [1.5e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("blur", ["none", "single precision", "degrees in single precision"])
+def test_rest_and_slow_motion_on_a_grid_are_no_fault(quantum: float, blur: str) -> None:
+    """An encoder whose grid is blurred by a conversion: its steps are still whole quanta."""
+
+    def read(angle: Array) -> Array:
+        on_grid = quantum * np.round(angle / quantum)
+        if blur == "degrees in single precision":
+            return np.radians(np.degrees(on_grid).astype(np.float32).astype(np.float64))
+        return on_grid.astype(np.float32 if blur == "single precision" else np.float64).astype(np.float64)
+
+    log, rng = moving(4000, noise=0.0), np.random.default_rng(4)
+    q = position(log.time)
+    creeps = q * [1.0, 0.002, 1.0]  # 2 mrad in a whole log
+    stands = q[:1] + 0.6 * quantum * rng.normal(size=q.shape)
+    sways = q[:1] + 1e-4 * np.sin(3.0 * log.time)[:, None]
+    for joints in (creeps, stands, sways):
+        checked = check(replace(log, joint_position=read(joints)))
+        assert not checked.condemned.any()
+        assert {one.name for one in checked.findings} <= {"constant"}
+
+
+@pytest.mark.parametrize("quantum", [0.0, 1e-4])
+def test_a_pose_that_arrives_at_half_the_rate_and_irregularly_is_held(quantum: float) -> None:
+    rng = np.random.default_rng(5)
+    time, sent = np.arange(2700) / 60.0, np.arange(1351) / 30.0
+    place = np.stack([0.3 * sent, 0.05 * np.sin(2.0 * sent), 0.02 * np.sin(5.0 * sent)], axis=1)
+    place = quantum * np.round(place / quantum) if quantum else place
+    latest = np.searchsorted(np.sort(sent + rng.uniform(0.0, 0.03, len(sent))), time, side="right") - 1
+    log = Log("walk.npz", time, ("a", "b", "c"), position(time), base_position_world=place[latest.clip(0)])
+    checked = check(log)
+    assert "every 2 samples" in only(checked, "held", "base_position_world").found
+    assert not checked.condemned.any()
+
+
+def test_a_joint_that_is_sent_at_a_lower_rate_than_the_others_is_named() -> None:
+    log = moving()
+    held = changed(log, "joint_position", lambda q: q.__setitem__((slice(None), 1), q[np.arange(2000) // 5 * 5, 1]))
+    finding = only(check(held), "held")
+    assert finding.channels == ("b",)
+    assert "b: new values only every 5 samples" in finding.found
+
+
 def test_a_velocity_of_zero_is_frozen_only_while_the_joint_moves() -> None:
     at_stop = with_rates(moving(noise=0.0))
     stopped = np.maximum(at_stop.joint_position[:, 0], np.percentile(at_stop.joint_position[:, 0], 40.0))
