@@ -79,6 +79,7 @@ def test_a_lasting_step_of_a_position_makes_a_log_useless_unless_one_side_is_sho
     middle = check(changed(demo_log(), "joint_position", put((slice(HERE, None), 2), 0.05)))
     assert not middle.usable
     assert only(middle, "step").whole
+    assert places(only(middle, "step")) == {(HERE - 1, HERE)}
     short = check(changed(demo_log(), "joint_position", put((slice(1250, None), 2), 0.05)))
     assert short.usable
     assert places(only(short, "step")) == {(1250, 1299)}
@@ -88,6 +89,23 @@ def test_a_torque_may_step_which_is_only_worth_a_look() -> None:
     checked = check(changed(demo_log(), "joint_torque", put((slice(HERE, None), 2), 30.0)))
     step = only(checked, "step")
     assert (step.severity, places(step)) == (SUSPICIOUS, {(HERE - 1, HERE)})
+    assert not checked.condemned.any()
+
+
+@pytest.mark.parametrize("peak", [0.0, 900.0])
+@pytest.mark.parametrize("reset", [0.0, 500.0])
+def test_a_heel_strike_without_a_contact_flag_is_no_step_but_a_reset_is(peak: float, reset: float) -> None:
+    rng, time = np.random.default_rng(6), np.arange(6000) / 500.0
+    phase = time % 1.0
+    load = np.where(phase < 0.6, 600.0 + 200.0 * np.sin(phase / 0.2) + peak * np.exp(-phase / 0.004), 0.0)
+    wrench = rng.normal(size=(6000, 1, 6))
+    wrench[:, 0] += load[:, None] * [0.1, 0.0, 1.0, 0.0, 0.05, 0.0]
+    wrench[3170:, 0, 2] += reset
+    torque = load[:, None] * [0.1, 0.02, 0.0] + rng.normal(size=(6000, 3))
+    log = replace(moving(), time=time, joint_position=position(time), joint_torque=torque)
+    checked = check(replace(log, ft_names=("ankle",), ft_wrench=wrench))
+    steps = {(one.field, places(one).pop()) for one in found(checked, "step")}
+    assert steps == ({("ft_wrench", (3169, 3170))} if reset else set())
     assert not checked.condemned.any()
 
 
