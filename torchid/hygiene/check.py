@@ -79,7 +79,7 @@ def check(
     """Check a log as it was read.
 
     Args:
-        log: as `read_log` gives it.
+        log: as `read_log` gives it, if need be with gaps.
         robot: the robot; without one, what needs its URDF is skipped.
         contacts: of the robot.
         cutoff_hz: of the filter that the log will go through; None for a usual one.
@@ -87,7 +87,10 @@ def check(
     found: list[Finding | Skipped] = list(absurd(log))
     if (lost := _lost(found)) is not None:
         return _concluded(log, log, [*found, _unchecked(lost)])
-    found += [*stamps(log), *missing(log)]
+    found += stamps(log)
+    found += (gaps := list(missing(log)))
+    if (lost := _lost(gaps)) is not None:
+        return _concluded(log, log, [*found, _unchecked(lost)])
     mended = repaired(log, _findings(found))
     found += frozen(groups(mended))
     mended = repaired(log, _findings(found))

@@ -68,13 +68,10 @@ def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> I
     stuck: _Stuck = []
     dead: list[tuple[str, float, float]] = []
     limits: list[tuple[str, Runs, float]] = []
-    held: list[tuple[str, float]] = []
-    for column in columns:
+    every = {column: held_for(group.values[:, [column]], all_repeated[:, column]) for column in columns}
+    for column in (column for column in columns if not every[column]):
         repeated = all_repeated[:, column]
         name, values = group.names[column], group.values[:, column]
-        if every := held_for(values[:, None], repeated):
-            held.append((name, every))
-            continue
         runs = implausible(values[:, None], repeated)
         zeros = values[runs.first] == 0.0
         quiet = in_dead_band(values[:, None], runs)
@@ -97,8 +94,8 @@ def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> I
         yield Finding("dead band", SUSPICIOUS, group.field, f"reads 0: {listed(each)}", advice, names)
     if limits:
         yield _saturated(group, limits)
-    if held:
-        yield _held(group, held)
+    if any(every.values()):
+        yield _held(group, [(group.names[column], each) for column, each in every.items() if each])
 
 
 def _spans(group: Group, channel: str, runs: Runs, skip: int = 1) -> Iterator[Span]:
