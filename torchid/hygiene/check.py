@@ -12,6 +12,7 @@ from torchid.hygiene.derivatives import derivatives
 from torchid.hygiene.finding import SEVERITIES, Finding, Skipped
 from torchid.hygiene.forces import forces
 from torchid.hygiene.frozen import frozen
+from torchid.hygiene.limb_sensors import limb_sensors
 from torchid.hygiene.missing import absurd, missing
 from torchid.hygiene.repair import condemned, repaired
 from torchid.hygiene.spikes import spikes
@@ -105,6 +106,7 @@ def check(
     lost = _lost(found)
     if lost is None:
         found += forces(without_offsets(mended), robot, contacts, cutoff_hz)
+        found += limb_sensors(mended, robot, contacts, cutoff_hz)
         lost = _lost(found)
     if lost is None or lost.name == "sign":
         found += weight(without_offsets(mended), robot)
