@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from faults import found, only
-from motions import value
 from synthetic import Array
 from welded import machine
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import HERE, changed, demo_log, found, moving, only, places, with_rates
-from motions import position, value
+from motions import DATA, position, value
 
 from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, check
 from torchid.hygiene.jumps import jumps
@@ -321,3 +321,14 @@ def test_jitter_of_the_stamps_is_told_from_jitter_of_the_sampling() -> None:
     assert "the stamps jitter, not the sampling" in stamped.found
     assert "the stamps jitter" not in sampled.found
     assert not found(check(log), "jitter")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"recorded logs are not in {DATA}")
+def test_a_recorded_quadruped_that_stands_and_sways_keeps_its_samples() -> None:
+    """Its encoders give whole quanta in single precision; one true spike of a velocity is left."""
+    recorded = np.load(DATA / "go2_standing" / "log.npz")
+    q, v, tau = (recorded[name].astype(float) for name in ("joint_position", "joint_velocity", "torque_estimate"))
+    names = tuple(map(str, recorded["joint_names"]))
+    checked = check(Log("go2", recorded["time"].astype(float), names, q, joint_velocity=v, joint_torque=tau))
+    assert checked.condemned.sum() <= 1
+    assert not found(checked, "held")

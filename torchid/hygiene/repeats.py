@@ -80,7 +80,7 @@ class Runs:
 def held_for(values: FloatArray, repeated: BoolArray) -> float:
     """For how many samples values (M, c) are held on average whose steps (M - 1,) `repeated` all; 0 if they are not.
 
-    Held values repeat at more or less regular times while the robot moves on: what changes in between is no single
+    Held values repeat at more or less regular times while the robot moves on: the change after a repeat is no single
     quantum, as it is of an encoder that creeps, and most repeats do not lie in long rests.
     """
     if float(np.mean(repeated)) <= HELD:
@@ -90,7 +90,8 @@ def held_for(values: FloatArray, repeated: BoolArray) -> float:
         return 0.0
     lengths = np.diff(changes)
     quanta = np.array([resolution(column) for column in values.T])
-    sizes = np.abs(values[changes + 1] - values[changes])
+    after = changes[1:][lengths > 1]
+    sizes = np.abs(values[after + 1] - values[after])
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = np.nan_to_num(sizes / quanta, nan=0.0, posinf=np.inf).max(axis=1)
     if np.median(steps) <= _GRAINS:
