@@ -69,6 +69,29 @@ def test_without_condemned_samples_the_parameters_are_those_of_the_clean_log() -
     assert np.max((np.abs(found.phi - whole.phi) / whole.standard_error)[seen]) < 1.0, "a tenth of the log is lost"
 
 
+def test_holes_in_poses_are_found_and_left_out_where_that_is_asked_for(tmp_path: Path) -> None:
+    holes = changed(demo_log(), "base_quat_xyzw", lambda quat: quat.__setitem__(slice(300, 310), np.nan))
+    holes = changed(holes, "joint_position", lambda q: q.__setitem__((slice(700, 705), 3), np.nan))
+    write_log(holes, tmp_path / "holes.npz")
+    with pytest.raises(LogError, match="joint_position: nan at sample 700, front_right_hip; accepted: finite numbers"):
+        read_log(tmp_path / "holes.npz")
+    log = read_log(tmp_path / "holes.npz", allow_gaps=True)
+    checked = check(log, demo_robot(), CONTACTS, CUTOFF)
+    assert sorted(np.flatnonzero(checked.condemned)) == [*range(300, 310), *range(700, 705)]
+    kept, clean = quietly_excluding(log), processed(demo_log())
+    same = clean[np.flatnonzero(np.isin(clean.time.numpy(), kept.time.numpy()))]
+    assert len(kept) == len(same) > 0.9 * len(clean)
+    error = np.abs(fitted(kept).phi - fitted(same).phi) / fitted(same).standard_error
+    assert np.nanmax(error) < 0.1, "a tenth of a standard error is left of ten samples interpolated by a line"
+
+
+def test_a_pose_that_was_mostly_not_measured_makes_a_log_useless(tmp_path: Path) -> None:
+    log = changed(demo_log(), "joint_position", lambda q: q.__setitem__((slice(0, 800), 3), np.nan))
+    write_log(log, tmp_path / "gone.npz")
+    checked = check(read_log(tmp_path / "gone.npz", allow_gaps=True), demo_robot(), CONTACTS, CUTOFF)
+    assert checked.verdict == "not usable: joint_position: not measured"
+
+
 @pytest.mark.parametrize("cutoff", [4.0, 8.0, 20.0])
 def test_samples_are_left_out_over_the_reach_of_the_filter_and_two_more(cutoff: float) -> None:
     log = changed(demo_log(), "joint_torque", lambda t: t.__setitem__((650, 4), 300.0))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import HERE, changed, demo_log, found, moving, only, places, with_rates
-from motions import position, value
+from motions import DATA, position, value
 
 from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, check
 from torchid.hygiene.jumps import jumps
@@ -79,6 +79,7 @@ def test_a_lasting_step_of_a_position_makes_a_log_useless_unless_one_side_is_sho
     middle = check(changed(demo_log(), "joint_position", put((slice(HERE, None), 2), 0.05)))
     assert not middle.usable
     assert only(middle, "step").whole
+    assert places(only(middle, "step")) == {(HERE - 1, HERE)}
     short = check(changed(demo_log(), "joint_position", put((slice(1250, None), 2), 0.05)))
     assert short.usable
     assert places(only(short, "step")) == {(1250, 1299)}
@@ -88,6 +89,23 @@ def test_a_torque_may_step_which_is_only_worth_a_look() -> None:
     checked = check(changed(demo_log(), "joint_torque", put((slice(HERE, None), 2), 30.0)))
     step = only(checked, "step")
     assert (step.severity, places(step)) == (SUSPICIOUS, {(HERE - 1, HERE)})
+    assert not checked.condemned.any()
+
+
+@pytest.mark.parametrize("peak", [0.0, 900.0])
+@pytest.mark.parametrize("reset", [0.0, 500.0])
+def test_a_heel_strike_without_a_contact_flag_is_no_step_but_a_reset_is(peak: float, reset: float) -> None:
+    rng, time = np.random.default_rng(6), np.arange(6000) / 500.0
+    phase = time % 1.0
+    load = np.where(phase < 0.6, 600.0 + 200.0 * np.sin(phase / 0.2) + peak * np.exp(-phase / 0.004), 0.0)
+    wrench = rng.normal(size=(6000, 1, 6))
+    wrench[:, 0] += load[:, None] * [0.1, 0.0, 1.0, 0.0, 0.05, 0.0]
+    wrench[3170:, 0, 2] += reset
+    torque = load[:, None] * [0.1, 0.02, 0.0] + rng.normal(size=(6000, 3))
+    log = replace(moving(), time=time, joint_position=position(time), joint_torque=torque)
+    checked = check(replace(log, ft_names=("ankle",), ft_wrench=wrench))
+    steps = {(one.field, places(one).pop()) for one in found(checked, "step")}
+    assert steps == ({("ft_wrench", (3169, 3170))} if reset else set())
     assert not checked.condemned.any()
 
 
@@ -153,6 +171,49 @@ def test_a_quantised_encoder_that_rests_is_not_frozen() -> None:
     position = np.round(moving(noise=2e-3).joint_position * 0.0 + moving(noise=2e-3).joint_position[:1], 3)
     flicker = position + 1e-3 * (np.random.default_rng(3).random(position.shape) < 0.3)
     assert not found(check(replace(moving(), joint_position=flicker)), "frozen")
+
+
+@pytest.mark.parametrize("quantum", [1.5e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("blur", ["none", "single precision", "degrees in single precision"])
+def test_rest_and_slow_motion_on_a_grid_are_no_fault(quantum: float, blur: str) -> None:
+    """An encoder whose grid is blurred by a conversion: its steps are still whole quanta."""
+
+    def read(angle: Array) -> Array:
+        on_grid = quantum * np.round(angle / quantum)
+        if blur == "degrees in single precision":
+            return np.radians(np.degrees(on_grid).astype(np.float32).astype(np.float64))
+        return on_grid.astype(np.float32 if blur == "single precision" else np.float64).astype(np.float64)
+
+    log, rng = moving(4000, noise=0.0), np.random.default_rng(4)
+    q = position(log.time)
+    creeps = q * [1.0, 0.002, 1.0]  # 2 mrad in a whole log
+    stands = q[:1] + 0.6 * quantum * rng.normal(size=q.shape)
+    sways = q[:1] + 1e-4 * np.sin(3.0 * log.time)[:, None]
+    for joints in (creeps, stands, sways):
+        checked = check(replace(log, joint_position=read(joints)))
+        assert not checked.condemned.any()
+        assert {one.name for one in checked.findings} <= {"constant"}
+
+
+@pytest.mark.parametrize("quantum", [0.0, 1e-4])
+def test_a_pose_that_arrives_at_half_the_rate_and_irregularly_is_held(quantum: float) -> None:
+    rng = np.random.default_rng(5)
+    time, sent = np.arange(2700) / 60.0, np.arange(1351) / 30.0
+    place = np.stack([0.3 * sent, 0.05 * np.sin(2.0 * sent), 0.02 * np.sin(5.0 * sent)], axis=1)
+    place = quantum * np.round(place / quantum) if quantum else place
+    latest = np.searchsorted(np.sort(sent + rng.uniform(0.0, 0.03, len(sent))), time, side="right") - 1
+    log = Log("walk.npz", time, ("a", "b", "c"), position(time), base_position_world=place[latest.clip(0)])
+    checked = check(log)
+    assert "every 2 samples" in only(checked, "held", "base_position_world").found
+    assert not checked.condemned.any()
+
+
+def test_a_joint_that_is_sent_at_a_lower_rate_than_the_others_is_named() -> None:
+    log = moving()
+    held = changed(log, "joint_position", lambda q: q.__setitem__((slice(None), 1), q[np.arange(2000) // 5 * 5, 1]))
+    finding = only(check(held), "held")
+    assert finding.channels == ("b",)
+    assert "b: new values only every 5 samples" in finding.found
 
 
 def test_a_velocity_of_zero_is_frozen_only_while_the_joint_moves() -> None:
@@ -260,3 +321,14 @@ def test_jitter_of_the_stamps_is_told_from_jitter_of_the_sampling() -> None:
     assert "the stamps jitter, not the sampling" in stamped.found
     assert "the stamps jitter" not in sampled.found
     assert not found(check(log), "jitter")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"recorded logs are not in {DATA}")
+def test_a_recorded_quadruped_that_stands_and_sways_keeps_its_samples() -> None:
+    """Its encoders give whole quanta in single precision; one true spike of a velocity is left."""
+    recorded = np.load(DATA / "go2_standing" / "log.npz")
+    q, v, tau = (recorded[name].astype(float) for name in ("joint_position", "joint_velocity", "torque_estimate"))
+    names = tuple(map(str, recorded["joint_names"]))
+    checked = check(Log("go2", recorded["time"].astype(float), names, q, joint_velocity=v, joint_torque=tau))
+    assert checked.condemned.sum() <= 1
+    assert not found(checked, "held")

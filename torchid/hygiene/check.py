@@ -12,6 +12,7 @@ from torchid.hygiene.derivatives import derivatives
 from torchid.hygiene.finding import SEVERITIES, Finding, Skipped
 from torchid.hygiene.forces import forces
 from torchid.hygiene.frozen import frozen
+from torchid.hygiene.limb_sensors import limb_sensors
 from torchid.hygiene.missing import absurd, missing
 from torchid.hygiene.repair import condemned, repaired
 from torchid.hygiene.spikes import spikes
@@ -79,7 +80,7 @@ def check(
     """Check a log as it was read.
 
     Args:
-        log: as `read_log` gives it.
+        log: as `read_log` gives it, if need be with gaps.
         robot: the robot; without one, what needs its URDF is skipped.
         contacts: of the robot.
         cutoff_hz: of the filter that the log will go through; None for a usual one.
@@ -87,7 +88,10 @@ def check(
     found: list[Finding | Skipped] = list(absurd(log))
     if (lost := _lost(found)) is not None:
         return _concluded(log, log, [*found, _unchecked(lost)])
-    found += [*stamps(log), *missing(log)]
+    found += stamps(log)
+    found += (gaps := list(missing(log)))
+    if (lost := _lost(gaps)) is not None:
+        return _concluded(log, log, [*found, _unchecked(lost)])
     mended = repaired(log, _findings(found))
     found += frozen(groups(mended))
     mended = repaired(log, _findings(found))
@@ -102,6 +106,7 @@ def check(
     lost = _lost(found)
     if lost is None:
         found += forces(without_offsets(mended), robot, contacts, cutoff_hz)
+        found += limb_sensors(mended, robot, contacts, cutoff_hz)
         lost = _lost(found)
     if lost is None or lost.name == "sign":
         found += weight(without_offsets(mended), robot)

@@ -48,9 +48,10 @@ class Finding:
         severity: one of `SEVERITIES`.
         field: of the log.
         channels: names within the field; empty for all of it.
-        spans: the samples; empty for the whole log.
+        spans: the samples; empty for the whole log, unless the finding is to be seen at some places.
         found: what was found, with numbers.
         advice: what to do.
+        everywhere: whether it concerns every sample though `spans` say where it is to be seen.
     """
 
     name: str
@@ -60,11 +61,12 @@ class Finding:
     advice: str
     channels: tuple[str, ...] = ()
     spans: tuple[Span, ...] = ()
+    everywhere: bool = False
 
     @property
     def whole(self) -> bool:
         """Whether it concerns every sample."""
-        return not self.spans
+        return self.everywhere or not self.spans
 
     @property
     def condemns_all(self) -> bool:

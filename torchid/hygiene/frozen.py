@@ -39,8 +39,8 @@ def frozen(groups: Iterable[Group]) -> Iterator[Finding]:
             continue
         rests = _at_rest(group, steps, positions)
         together = ((steps == 0.0) & ~rests)[:, ~constant].all(axis=1) & group.joined
-        if every := held_for(together):
-            yield _held(group, every)
+        if every := held_for(group.values[:, ~constant], together):
+            yield _held(group, [(name, every) for name in group.names])
             continue
         moving = group.values[:, ~constant]
         runs = implausible(moving, together)
@@ -68,10 +68,9 @@ def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> I
     stuck: _Stuck = []
     dead: list[tuple[str, float, float]] = []
     limits: list[tuple[str, Runs, float]] = []
-    for column in columns:
+    every = {column: held_for(group.values[:, [column]], all_repeated[:, column]) for column in columns}
+    for column in (column for column in columns if not every[column]):
         repeated = all_repeated[:, column]
-        if held_for(repeated):
-            continue
         name, values = group.names[column], group.values[:, column]
         runs = implausible(values[:, None], repeated)
         zeros = values[runs.first] == 0.0
@@ -95,6 +94,8 @@ def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> I
         yield Finding("dead band", SUSPICIOUS, group.field, f"reads 0: {listed(each)}", advice, names)
     if limits:
         yield _saturated(group, limits)
+    if any(every.values()):
+        yield _held(group, [(group.names[column], each) for column, each in every.items() if each])
 
 
 def _spans(group: Group, channel: str, runs: Runs, skip: int = 1) -> Iterator[Span]:
@@ -129,10 +130,16 @@ def _saturated(group: Group, limits: list[tuple[str, Runs, float]]) -> Finding:
     return Finding("saturated", CONDEMNED, group.field, text, advice, names, spans)
 
 
-def _held(group: Group, every: int) -> Finding:
-    text = f"new values only every {every} samples, repeated in between: {0.5 * (every - 1):g} samples late on average"
+def _held(group: Group, held: list[tuple[str, float]]) -> Finding:
+    every = max(each for _, each in held)
+    names = tuple(name for name, _ in held)
+    whose = f"{listed(names)}: " if len(names) < len(group.names) else ""
+    text = (
+        f"{whose}new values only every {every:.3g} samples, repeated in between: "
+        f"{0.5 * (every - 1):.2g} samples late on average"
+    )
     advice = f"record at one rate, or set preprocessing.cutoff_hz below {0.25 / every:.2g} of the sample rate"
-    return Finding("held", SUSPICIOUS, group.field, text, advice, group.names)
+    return Finding("held", SUSPICIOUS, group.field, text, advice, names)
 
 
 def _constant(group: Group, constant: BoolArray) -> Iterator[Finding]:

@@ -39,9 +39,9 @@ def absurd(log: Log) -> Iterator[Finding]:
 
 
 def missing(log: Log) -> Iterator[Finding]:
-    """Findings about NaN in channels that may hold it; of a contact, while it is active."""
-    for field in NAN_ALLOWED:
-        if getattr(log, field) is not None:
+    """Findings about NaN; of a contact, while it is active. Motion has to be known throughout, a force has not."""
+    for field in log.arrays():
+        if field not in NO_SIGNALS:
             yield from _missing(log, field)
 
 
@@ -67,10 +67,18 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
         )
         shares = ", ".join(f"{name} {100 * share:.2g} %" for name, (_, share) in list(holes.items())[:4])
         text = f"NaN in {counted(len(holes), 'channel')}, {counted(len(spans), 'time')}: {shares}"
-        advice = "leave these samples out; a filter would lose the channels throughout"
+        if field in NAN_ALLOWED:
+            advice = "leave these samples out; a filter would lose the channels throughout"
+        else:
+            advice = "leave these samples out (preprocessing.exclude_condemned): motion must be known throughout"
         yield Finding("not measured", CONDEMNED, field, text, advice, tuple(holes), spans)
     if gone:
         entire = all(share == 1.0 for _, share in gone.values())
         how = "throughout" if entire else f"in {100 * max(share for _, share in gone.values()):.3g} % at most"
-        advice = "none, as long as it is not among the sensors" if entire else "leave it out of the sensors"
-        yield Finding("not measured", NOTE, field, f"{listed(list(gone))}: NaN {how}", advice, tuple(gone))
+        needed = field not in NAN_ALLOWED
+        if needed:
+            advice = "record it throughout, or leave the field out if something else gives this motion"
+        else:
+            advice = "none, as long as it is not among the sensors" if entire else "leave it out of the sensors"
+        severity = CONDEMNED if needed else NOTE
+        yield Finding("not measured", severity, field, f"{listed(list(gone))}: NaN {how}", advice, tuple(gone))

@@ -2,7 +2,9 @@
 
 A robot at rest repeats itself as well. Whether a run can be chance follows from its neighbourhood: where a channel
 moves by a median |d| from sample to sample on a grid of quantum q, one repeat has a probability of about q / (2 |d|);
-for k of them in c channels it is the product. And a robot that comes to rest slows down before.
+for k of them in c channels it is the product. And a robot that comes to rest slows down before. The quantum is that of
+the whole channel where its steps lie on a grid, be it one that single precision or a change of units has blurred: the
+differences between the smallest steps would be rounding then.
 """
 
 from __future__ import annotations
@@ -28,8 +30,16 @@ _MOVING, _NEAREST = 0.5, 4
 HELD = 0.2
 #: ... if this share of the runs has the typical length, give or take one sample.
 _REGULAR = 0.8
-#: Share of a channel's largest value below which differences are rounding.
+#: Share of the time in values held longer than so many times the mean from which on a robot rests and starts again.
+_RESTING, _LONG = 0.2, 5.0
+#: Share of a channel's largest value below which differences are rounding, and the same after single precision.
 ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
+_SINGLE = 2.0 * float(np.finfo(np.float32).eps)
+#: A grid: this share of at least `_STEPS` steps of up to `_QUANTA` quanta is whole to within `_OFF` quanta, where of
+#: steps of any size a fifth would be.
+_ON_GRID, _STEPS, _QUANTA, _OFF = 0.95, 10, 10.5, 0.1
+#: Shares of the steps below which the smallest are looked for.
+_SMALLEST = (0.001, 0.005, 0.02)
 #: Runs after which nobody can tell chance from design.
 _MOST_RUNS = 20000
 
@@ -67,16 +77,44 @@ class Runs:
         return np.asarray(np.cumsum(edges[:-1]) > 0)
 
 
-def held_for(repeated: BoolArray) -> int:
-    """For how many samples a channel is held whose steps (M - 1,) repeat the value before; 0 if it is not."""
+def held_for(values: FloatArray, repeated: BoolArray) -> float:
+    """For how many samples values (M, c) are held on average whose steps (M - 1,) `repeated` all; 0 if they are not.
+
+    Held values repeat at more or less regular times while the robot moves on: the change after a repeat is no single
+    quantum, as it is of an encoder that creeps, and most repeats do not lie in long rests.
+    """
     if float(np.mean(repeated)) <= HELD:
-        return 0
+        return 0.0
     changes = np.flatnonzero(~repeated)
     if len(changes) < NEIGHBOURS:
-        return 0
+        return 0.0
     lengths = np.diff(changes)
+    quanta = np.array([resolution(column) for column in values.T])
+    after = changes[1:][lengths > 1]
+    sizes = np.abs(values[after + 1] - values[after])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = np.nan_to_num(sizes / quanta, nan=0.0, posinf=np.inf).max(axis=1)
+    if np.median(steps) <= _GRAINS:
+        return 0.0
     typical = int(np.median(lengths))
-    return typical if typical > 1 and float(np.mean(np.abs(lengths - typical) <= 1)) >= _REGULAR else 0
+    if typical > 1 and float(np.mean(np.abs(lengths - typical) <= 1)) >= _REGULAR:
+        return typical
+    mean = float(lengths.mean())
+    return mean if lengths[lengths > _LONG * mean].sum() <= _RESTING * lengths.sum() else 0.0
+
+
+def resolution(values: FloatArray) -> float:
+    """Quantum of the grid that the steps of a channel (M,) lie on; 0 if they lie on none, inf if too few tell."""
+    sizes = np.abs(np.diff(values))
+    sizes = sizes[sizes > _SINGLE * np.abs(values).max()]
+    if len(sizes) < _STEPS:
+        return np.inf
+    for least in np.quantile(sizes, _SMALLEST):  # single quanta are rare in a channel that is fast
+        quantum = float(np.median(sizes[sizes < 1.5 * least]))
+        steps = sizes[sizes < _QUANTA * quantum] / quantum
+        if len(steps) >= _STEPS and float(np.mean(np.abs(steps - np.rint(steps)) < _OFF)) >= _ON_GRID:
+            return quantum
+    return 0.0
 
 
 def implausible(values: FloatArray, repeated: BoolArray) -> Runs:
@@ -87,7 +125,8 @@ def implausible(values: FloatArray, repeated: BoolArray) -> Runs:
     sizes = np.abs(np.diff(values, axis=0))
     sides = [beside(sizes, runs.first, -1, NEIGHBOURS), beside(sizes, runs.last, 1, NEIGHBOURS)]  # (R, k, c)
     typical = median_known(np.concatenate(sides, axis=1))
-    finest = _finest(sides, ROUNDING * np.abs(values).max(axis=0))
+    quanta = np.array([resolution(column) for column in values.T])
+    finest = np.maximum(_finest(sides, ROUNDING * np.abs(values).max(axis=0)), quanta)
     moving = np.ones(len(runs), bool)
     with np.errstate(divide="ignore", invalid="ignore"):
         one = np.where(typical > _GRAINS * finest, 0.5 * finest / typical, 1.0)

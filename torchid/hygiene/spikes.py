@@ -2,6 +2,8 @@
 
 Positions cannot jump at all. Velocities and forces can where a foot lands or lifts, torques where friction changes its
 sign, and accelerations wherever something hits something. There only what exceeds the channel's whole range counts.
+Where no flag says when a foot lands, forces do: a sensor that was reset reads differently from then on, a load goes as
+it came.
 """
 
 from __future__ import annotations
@@ -38,6 +40,9 @@ HARMLESS = 0.01
 SHORT_SIDE = 0.1
 #: Time around a change of contact [s] in which forces and velocities may jump: impacts ring that long.
 _IMPACT = 0.1
+#: Percentiles of a force before and after a step, and the share of the step by which all of them move if the sensor was
+#: reset there.
+_LEVELS, _MOVED = (10.0, 50.0, 90.0), 0.5
 #: Samples around a reversal of a joint in which its torque may jump, and the share of its usual speed below which it
 #: counts as about to reverse.
 _REVERSAL, _SLOW = 5, 0.2
@@ -50,12 +55,13 @@ _Jumps = list[tuple[str, Jump]]
 
 def spikes(log: Log, groups: Iterable[Group]) -> Iterator[Finding]:
     """Findings about jumps in all channels."""
-    impacts = _contact_changes(log)
+    given = [(group, [_raw(group, column) for column in range(len(group.names))]) for group in groups]
+    impacts = _contact_changes(log) | _load_changes(log, given)
     by_field: dict[str, tuple[str, _Jumps]] = {}
-    for group in groups:
+    for group, by_column in given:
         _, found = by_field.setdefault(group.field, (group.unit, []))
         for column, name in enumerate(group.names):
-            for jump in _jumps(log, group, column, impacts):
+            for jump in _unexplained(log, group, column, by_column[column], impacts):
                 first, last = (int(group.samples[i]) for i in (jump.first, jump.last))
                 found.append((name, dataclasses.replace(jump, first=first, last=last)))
     for field, (unit, found) in by_field.items():
@@ -99,13 +105,18 @@ def _span(channel: str, jump: Jump, shift: float = 0.0) -> Span:
     return Span(jump.first, jump.last, channel, shift)
 
 
-def _jumps(log: Log, group: Group, column: int, impacts: BoolArray) -> list[Jump]:
-    """The jumps of a channel that neither motion nor contact explains, in numbers of the group's samples."""
+def _raw(group: Group, column: int) -> list[Jump]:
+    """All jumps of a channel, in numbers of the group's samples."""
+    values = group.values[:, column]
+    longest = max(LONGEST_SPIKE, int(SHORT_SIDE * len(values))) if group.field in POSES else LONGEST_SPIKE
+    return jumps(values, group.elapsed, group.piece, longest)
+
+
+def _unexplained(log: Log, group: Group, column: int, found: list[Jump], impacts: BoolArray) -> list[Jump]:
+    """The jumps of a channel that neither motion nor contact explains."""
     values = group.values[:, column]
     if group.field in POSES:
-        found = jumps(values, group.elapsed, group.piece, max(LONGEST_SPIKE, int(SHORT_SIDE * len(values))))
         return [jump for jump in found if abs(jump.size) > NEGLIGIBLE]
-    found = jumps(values, group.elapsed, group.piece)
     if not found:
         return found
     excused = impacts[group.samples] | group.field.endswith(_RINGING)
@@ -118,8 +129,29 @@ def _jumps(log: Log, group: Group, column: int, impacts: BoolArray) -> list[Jump
         jump
         for jump in found
         if abs(jump.size) > (RESET if jump.lasting else RELEVANT) * span
+        and not (jump.lasting and group.field in _STEPPING and not _reset(values, jump))
         and (abs(jump.size) > span or not excused[jump.first : jump.last + 1].any())
     ]
+
+
+def _reset(values: FloatArray, jump: Jump) -> bool:
+    """Whether a channel reads differently after a lasting step than before, all in all."""
+    before, after = (np.percentile(side, _LEVELS) for side in (values[: jump.first + 1], values[jump.last :]))
+    return bool(((after - before) * np.sign(jump.size) > _MOVED * abs(jump.size)).all())
+
+
+def _load_changes(log: Log, given: Iterable[tuple[Group, list[list[Jump]]]]) -> BoolArray:
+    """Samples close to where a force jumps and its sensor was not reset, (N,): something landed or lifted off."""
+    where = np.zeros(len(log), bool)
+    for group, by_column in given:
+        if group.field not in _STEPPING:
+            continue
+        for column, found in enumerate(by_column):
+            values = group.values[:, column]
+            span = np.ptp(np.percentile(values, (1.0, 99.0)))
+            steps = [jump for jump in found if jump.lasting and abs(jump.size) > RESET * span]
+            where[[group.samples[jump.first] for jump in steps if not _reset(values, jump)]] = True
+    return near(where, round(max(_IMPACT / median_step(log), LONGEST_SPIKE)))
 
 
 def _contact_changes(log: Log) -> BoolArray:
@@ -158,7 +190,7 @@ def _position_steps(field: str, unit: str, lasting: _Jumps, samples: int) -> Ite
             yield _finding("step", CONDEMNED, field, unit, found, advice, spans)
         else:
             advice = "split the log there and find out which part has the right zero"
-            yield _finding("step", CONDEMNED, field, unit, found, advice, ())
+            yield dataclasses.replace(_finding("step", CONDEMNED, field, unit, found, advice), everywhere=True)
 
 
 def _kind(field: str, jump: Jump, together: float, samples: int) -> str:

@@ -79,12 +79,15 @@ def check_time(source: str, time: FloatArray) -> None:
         raise LogError(source, "time", found, "strictly increasing seconds")
 
 
-def unit_quaternion(source: str, name: str, quat: FloatArray) -> FloatArray:
-    """The quaternions (N, 4) with a norm of exactly one, LogError at the first whose norm is not one."""
-    check_finite(source, name, quat)
+def unit_quaternion(source: str, name: str, quat: FloatArray, allow_nan: bool = False) -> FloatArray:
+    """The quaternions (N, 4) with a norm of exactly one, LogError at the first whose norm is not one.
+
+    With `allow_nan`, one that is NaN in part is NaN as a whole.
+    """
+    check_finite(source, name, quat, allow_nan=allow_nan)
     with np.errstate(over="ignore"):  # to a norm that is refused
         norm = np.linalg.norm(quat, axis=1)
-    bad = ~(np.abs(norm - 1.0) <= QUATERNION_TOLERANCE)
+    bad = ~((np.abs(norm - 1.0) <= QUATERNION_TOLERANCE) | np.isnan(norm))
     if bad.any():
         i = int(np.argmax(bad))
         found = f"norm {norm[i]:.6g} at sample {i}"

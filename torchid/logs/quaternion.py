@@ -10,8 +10,14 @@ from torchid.logs.fields import FloatArray
 def sign_continuous(quat: FloatArray) -> FloatArray:
     """The same rotations without sign flips between neighbours, (N, 4) in any order; itself where it has none.
 
-    q and -q are one rotation, but components that jump sign cannot be interpolated or filtered.
+    q and -q are one rotation, but components that jump sign cannot be interpolated or filtered. Rows of NaN are passed
+    over.
     """
+    known = ~np.isnan(quat).any(axis=1)
+    if not known.all():
+        out = quat.copy()
+        out[known] = sign_continuous(quat[known])
+        return out
     flips = np.einsum("ni,ni->n", quat[1:], quat[:-1]) < 0.0
     if not flips.any():
         return quat

@@ -45,7 +45,10 @@ from torchid.logs.table import read_table
 
 
 def read_log(
-    path: str | os.PathLike[str], topics: Topics | None = None, progress: Callable[[float], None] | None = None
+    path: str | os.PathLike[str],
+    topics: Topics | None = None,
+    progress: Callable[[float], None] | None = None,
+    allow_gaps: bool = False,
 ) -> Log:
     """Read a log: arrays (.npz, never pickled, .h5, .hdf5), a table (.csv, .parquet) or a bag of ROS messages.
 
@@ -57,6 +60,7 @@ def read_log(
         path: the file; of a ROS 2 bag also its folder.
         topics: of a bag (.bag, .mcap, .db3), which holds what; nothing else needs them.
         progress: called with the share of a bag that has been read.
+        allow_gaps: take NaN in poses and their derivatives too, for `torchid.check` to find.
 
     Raises:
         LogError: one line that names the file, the field, what was found and what is accepted.
@@ -70,12 +74,12 @@ def read_log(
     else:
         raw = read_table(Path(path)) if kind is Kind.TABLE else read_bag(Path(path), topics, progress)
         check_fields_given(source, raw)
-    return checked_log(source, raw)
+    return checked_log(source, raw, allow_gaps)
 
 
-def checked_log(source: str, raw: dict[str, NDArray[Any]]) -> Log:
+def checked_log(source: str, raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
     """The log of the fields of a file, in canonical frames and orders, LogError where one is not what it should be."""
-    return _canonical(source, _checked(source, raw))
+    return _canonical(source, _checked(source, raw, allow_gaps))
 
 
 def check_fields_given(source: str, names: Collection[str]) -> None:
@@ -122,7 +126,7 @@ def _check_combination(source: str, names: Collection[str]) -> None:
             raise LogError(source, name, "given without the base's orientation", accepted)
 
 
-def _checked(source: str, raw: dict[str, NDArray[Any]]) -> dict[str, Any]:
+def _checked(source: str, raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:
     """Every field of the file in its canonical type, each checked by itself and against the sizes N, n, C."""
     names = {name: as_names(source, name, raw[name]) if name in raw else () for name in NAMES}
     check_shape(source, "time", raw["time"], SHAPES["time"], {})
@@ -141,8 +145,8 @@ def _checked(source: str, raw: dict[str, NDArray[Any]]) -> dict[str, Any]:
             fields[name] = as_flags(source, name, array, labels)
             continue
         values = as_real(source, name, array)
-        check_finite(source, name, values, allow_nan=name in NAN_ALLOWED, labels=labels)
-        fields[name] = unit_quaternion(source, name, values) if is_quaternion(name) else values
+        check_finite(source, name, values, allow_nan=allow_gaps or name in NAN_ALLOWED, labels=labels)
+        fields[name] = unit_quaternion(source, name, values, allow_gaps) if is_quaternion(name) else values
     return fields
 
 

@@ -64,7 +64,8 @@ def _places(finding: Finding) -> str:
     spans = [str(Span(first, last)) for first, last in _ranges(finding)]
     if not spans:
         return "all"
-    return ", ".join(spans[:_SPANS]) + (f" and {len(spans) - _SPANS} more" if len(spans) > _SPANS else "")
+    some = ", ".join(spans[:_SPANS]) + (f" and {len(spans) - _SPANS} more" if len(spans) > _SPANS else "")
+    return f"all; seen at {some}" if finding.whole else some
 
 
 def hygiene_document(checked: Sequence[Checked]) -> dict[str, Any]:

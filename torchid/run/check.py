@@ -110,7 +110,7 @@ def _read(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> L
     if size > settings.memory_gb:
         accepted = f"parts of the log, or an experiment file with a preprocessing.memory_gb above {size:.2g}"
         raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
-    return read_log(path, topics)
+    return read_log(path, topics, allow_gaps=True)
 
 
 def _contact(log: Log, index: int) -> Contact:

@@ -85,7 +85,8 @@ class LogReader:
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""
         settings, files = self.scene.config.preprocessing, self.scene.config.logs
-        recorded = read_log(path, None if files is None else files.topics)
+        topics = None if files is None else files.topics
+        recorded = read_log(path, topics, allow_gaps=settings.exclude_condemned)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
