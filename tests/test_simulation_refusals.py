@@ -200,7 +200,7 @@ def test_without_mujoco_a_simulation_says_how_to_install_it(
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     line = refusal(["simulate", str(folder / "sim.yaml")], folder, capsys)
-    assert line.endswith("MuJoCo, which is not installed; accepted: pip install 'torchid[sim]'")
+    assert line.endswith("MuJoCo, which is not installed; accepted: pip install '.[sim]' in the clone of torchid")
 
 
 # -------------------------------------------------------------------------------------------------- folders in the way

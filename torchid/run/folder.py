@@ -30,7 +30,7 @@ _MOST_NAMES = 50  # in one message
 
 
 def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: Iterable[object] = ()) -> None:
-    """Make sure, before any work, that a folder of a kind may be written; a killed process may have left it moved aside.
+    """Make sure, before any work, that a folder of a kind may be written; leftovers of killed processes go first.
 
     Args:
         output: the folder.
@@ -62,6 +62,29 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: It
         replaceable(output, kind)
 
 
+def check_free_file(path: Path, field: str, overwrite: bool, inputs: Iterable[object]) -> None:
+    """Make sure, before any work, that a file may be written.
+
+    Args:
+        path: of the file.
+        field: of the command line that names it.
+        overwrite: whether a file there may be replaced.
+        inputs: files and folders that the command reads.
+
+    Raises:
+        ConfigError: it exists and may not be replaced, or there is no folder for it.
+    """
+    if os.path.lexists(path) and not (overwrite and os.path.isfile(path) and not os.path.islink(path)):
+        found = "a link" if os.path.islink(path) else "exists"
+        raise ConfigError(path, field, found, "a new file, or --overwrite in place of a file")
+    if not os.path.isdir(path.parent):
+        raise ConfigError(path, field, f"no folder {path.parent}", "a file in an existing folder")
+    for other in inputs:
+        one, of = os.path.realpath(path), os.path.realpath(str(other))
+        if os.path.lexists(path) and (one == of or one.startswith(of + os.sep)):
+            raise ConfigError(path, field, "is or belongs to what is read", "another file")
+
+
 def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
     """Make sure that a folder which will be replaced or removed holds nothing that the command reads.
 
@@ -70,7 +93,7 @@ def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
     """
     top = os.path.realpath(output)
     for path in inputs:
-        if os.path.realpath(str(path)).startswith(top + os.sep):
+        if os.path.lexists(str(path)) and os.path.realpath(str(path)).startswith(top + os.sep):
             found = f"holds {shown(str(path))}, which is an input"
             raise ConfigError(output, "output", found, "another output, or inputs that lie elsewhere")
 
