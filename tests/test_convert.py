@@ -38,7 +38,7 @@ def identified(folder: Path, name: str, **logs: Any) -> dict[str, Any]:
     """Every identified parameter, by body and name."""
     settings = yaml.safe_load((folder / "quadruped.yaml").read_text())
     settings["logs"] |= logs
-    settings["output"] = f"runs/{name}"
+    settings["output"] = str(folder / "runs" / name)
     (folder / f"{name}.yaml").write_text(yaml.safe_dump(settings))
     assert main(["identify", str(folder / f"{name}.yaml")]) == 0
     bodies = json.loads((folder / "runs" / name / "parameters.json").read_text())["bodies"]

@@ -25,8 +25,9 @@ ONE_POINT = [[0.0, 0.0, 0.0]]
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A simulation file that would run, and its robot."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A simulation file that would run, and its robot; also the working folder."""
+    monkeypatch.chdir(tmp_path)
     shutil.copy(BIPED, tmp_path / "biped.urdf")
     posture = yaml.safe_load(SHIPPED.read_text())["posture"]
     settings = {"robot": {"urdf": "biped.urdf"}, "feet": FEET, "posture": posture, "motions": [SQUAT], "output": "out"}

@@ -139,8 +139,12 @@ def clear_leftovers(output: Path, kind: FolderKind) -> None:
             continue
         if not os.path.lexists(output):
             (folder / OLD).rename(output)
-        elif found := inspect(folder / OLD, kind):
+            continue
+        if found := inspect(folder / OLD, kind):
             found.remove()
+        for place, _, _ in os.walk(folder / OLD, topdown=False):  # the process was killed after their manifests went
+            with suppress(OSError):
+                os.rmdir(place)
 
 
 def write_json(path: Path, document: object) -> None:

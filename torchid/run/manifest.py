@@ -134,7 +134,15 @@ def read_manifest(folder: Path) -> Manifest | None:
             {str(name): (int(x["size"]), str(x["sha256"])) for name, x in document["files"].items()},
             tuple(map(str, document["growing"])),
         )
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError):  # anything may be in it
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ):  # anything may be in it
         return None
 
 
