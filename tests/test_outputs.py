@@ -158,7 +158,7 @@ OTHERS: dict[str, dict[str, str]] = {
     "a manifest that is a list": {"manifest.json": "[]"},
     "a manifest nested beyond all bounds": {"manifest.json": "[" * 10**5},
     "a manifest of infinite sizes": {
-        "manifest.json": '{"torchid": "a run", "folder": "x", "growing": [], "files": {"x": {"size": 1e999, "sha256": ""}}}'
+        "manifest.json": '{"torchid": "a run", "folder": "", "growing": [], "files": {"x": {"size": 1e999, "sha256": ""}}}'
     },
 }  # fmt: skip
 
@@ -191,7 +191,7 @@ def test_a_folder_of_one_kind_is_not_replaced_by_another(tmp_path: Path) -> None
     with new_folder(tmp_path / "x", kind=SIMULATION) as folder:
         write(folder, {"logs/a.npz": "x"})
     for kind in (RUN, TRAINING, EVALUATION):
-        with pytest.raises(ConfigError, match="holds logs, manifest.json, and no manifest.json that says"):
+        with pytest.raises(ConfigError, match="holds a simulation; accepted: a new folder"):
             check_free(tmp_path / "x", True, kind)
 
 

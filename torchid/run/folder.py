@@ -11,7 +11,7 @@ from pathlib import Path
 
 from torchid.errors import ConfigError
 from torchid.interrupts import interrupt_held_back, note_written
-from torchid.run.manifest import MANIFEST, Contents, FolderKind, inspect, manifest_of
+from torchid.run.manifest import MANIFEST, Contents, FolderKind, inspect, manifest_of, read_manifest
 from torchid.staging import NEW, OLD, leftovers, staging
 from torchid.text import listed, shown
 
@@ -114,6 +114,9 @@ def replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> C
         found, names = inspect(folder, kind), [shown(name) for name in sorted(os.listdir(folder))]
     except OSError as error:
         raise ConfigError(output, "output", f"cannot be read ({error})", "a new folder") from error
+    if found is None and (other := read_manifest(folder)):
+        accepted = f"a new folder, or {kind.name} to overwrite"
+        raise ConfigError(output, "output", f"holds {shown(other.kind)}", accepted)
     if found is None:
         what = f"holds {listed(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
         accepted = f"a new folder, or {kind.name} to overwrite; one that an older version wrote is for you to remove"
