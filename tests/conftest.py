@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import tempfile
 from collections.abc import Iterator
@@ -15,6 +16,15 @@ from synthetic import load
 from torchid.robot import Robot
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a run started in the background inherits one that is ignored
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Work in a folder of its own: results without an absolute path go to the working folder."""
+    before = Path.cwd()
+    os.chdir(tmp_path_factory.mktemp("work"))
+    yield
+    os.chdir(before)
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ def test_a_full_disk_leaves_the_earlier_file_as_it_was(
 
     (tmp_path / "found.json").write_text("earlier")
     monkeypatch.setattr(Path, "write_text", full)
-    assert main(given) == 2
+    assert main([*given, "--overwrite"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"torchid: {tmp_path / 'found.json'}: file: cannot be written")
     assert "No space left on device" in line

@@ -22,9 +22,11 @@ Edit = Callable[[Path], None]
 
 
 @pytest.fixture
-def experiment(tmp_path: Path) -> Path:
-    """A copy of the demo, shortened, that would run."""
-    return shortened_demo(tmp_path / "experiment", 300)
+def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the demo, shortened, that would run; also the working folder."""
+    folder = shortened_demo(tmp_path / "experiment", 300)
+    monkeypatch.chdir(folder)
+    return folder
 
 
 def edit_log(**changes: object) -> Edit:

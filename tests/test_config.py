@@ -157,7 +157,7 @@ def test_numbers_survive_to_the_last_bit(file: Path, ridge: float) -> None:
 # -------------------------------------------------------------------------------------------------------------- paths
 
 
-def test_paths_in_the_file_are_relative_to_it_and_not_to_the_caller(
+def test_inputs_in_the_file_are_relative_to_it_and_results_to_the_caller(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "caller").mkdir()
@@ -167,7 +167,7 @@ def test_paths_in_the_file_are_relative_to_it_and_not_to_the_caller(
     assert config.robot.urdf == file.parent / "models" / "robot.urdf"
     assert config.logs.train == [file.parent / "a.npz", Path("/logs/b.h5")]
     assert config.logs.test == [tmp_path / "c.csv"]
-    assert config.output == file.parent / "runs" / "all"
+    assert config.output == tmp_path / "caller" / "runs" / "all", "results go where the work is done"
     assert load(file, changed(output="~/runs")).output == Path("/home/me/runs")
     load(file, ALL)
     assert load_config(Path("../experiments/experiment.yaml")) == config

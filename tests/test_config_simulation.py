@@ -106,13 +106,13 @@ def test_waves_may_be_written_once_and_repeated_by_name(file: Path) -> None:
     assert config.motions[0].waves[0].amplitude == 0.01
 
 
-def test_paths_in_the_file_are_relative_to_it_and_those_in_overrides_to_the_caller(
+def test_inputs_in_the_file_are_relative_to_it_and_results_and_overrides_to_the_caller(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     config = load(file, ALL)
     assert config.robot.urdf == file.parent / "models" / "robot.urdf"
-    assert config.output == file.parent / "runs" / "all"
+    assert config.output == tmp_path / "runs" / "all"
     assert load(file, ALL, "output=here").output == tmp_path / "here"
     assert load(file, ALL, "robot.urdf=../r.urdf").robot.urdf == tmp_path.parent / "r.urdf"
 

@@ -38,7 +38,7 @@ def identified(folder: Path, name: str, **logs: Any) -> dict[str, Any]:
     """Every identified parameter, by body and name."""
     settings = yaml.safe_load((folder / "quadruped.yaml").read_text())
     settings["logs"] |= logs
-    settings["output"] = f"runs/{name}"
+    settings["output"] = str(folder / "runs" / name)
     (folder / f"{name}.yaml").write_text(yaml.safe_dump(settings))
     assert main(["identify", str(folder / f"{name}.yaml")]) == 0
     bodies = json.loads((folder / "runs" / name / "parameters.json").read_text())["bodies"]
@@ -134,10 +134,9 @@ def test_what_is_there_is_not_overwritten_unless_asked_for(log: Path, capsys: py
     folder = log.parent / "folder.npz"
     folder.mkdir()
     (log.parent / "link.npz").symlink_to("nowhere.npz")
-    for path in (folder, log.parent / "link.npz"):
+    (log.parent / "self.npz").symlink_to(log)
+    for path in (folder, log.parent / "link.npz", log.parent / "self.npz", log):
         refusal(["convert", str(log), str(path), "--overwrite"], log.parent, capsys)
-    assert main(["convert", str(log), str(log), "--overwrite"]) == 0, "onto itself"
-    assert len(read_log(log)) == 5
 
 
 BAD: list[tuple[str, str, list[str], str]] = [

@@ -52,7 +52,7 @@ def files(folder: Path, deviation: float) -> tuple[Path, dict[tuple[str, str], f
         "sensors": {"set": "full", "ft_sensors": list(SENSORS), "offsets": "log"},
         "actuators": {"armature": True, "asymmetric_coulomb": True, "sign_width": WIDTH},
         "estimator": {"name": "least_squares"},
-        "output": "run",
+        "output": str(folder / "run"),
     }  # fmt: skip
     (folder / "experiment.yaml").write_text(yaml.safe_dump(experiment))
     return folder / "experiment.yaml", true, off
@@ -96,7 +96,7 @@ def test_a_run_through_files_finds_them_and_another_log_is_predicted_with_them(r
     assert max(errors_in(metrics["train"]).values()) < 1e-8, "each log is read with its own offsets"
 
     assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "new.npz")]) == 0
-    (written,) = (tmp_path / "run" / "evaluation").rglob("*.json")
+    (written,) = (tmp_path / "run" / "evaluation").rglob("metrics.json")
     found = json.loads(written.read_text())["new"]
     assert max(errors_in(found["identified"]).values()) < 1e-8
     assert min(errors_in(found["nominal"]).values()) > 1e-2
@@ -109,7 +109,7 @@ def test_a_urdf_that_is_right_has_no_errors_whatever_the_offsets(tmp_path: Path)
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert max(errors_in(metrics["train_nominal"]).values()) < 1e-8
     assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "new.npz")]) == 0
-    (written,) = (tmp_path / "run" / "evaluation").rglob("*.json")
+    (written,) = (tmp_path / "run" / "evaluation").rglob("metrics.json")
     assert max(errors_in(json.loads(written.read_text())["new"]["nominal"]).values()) < 1e-8
 
 

@@ -12,7 +12,7 @@ import pytest
 from hostile_commands import Commands
 from refusals import files_in
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP)
 COMMANDS = ("identify", "train", "evaluate", "analyze", "convert")
 TIMES = [1, pytest.param(25, marks=pytest.mark.slow)]
 
@@ -50,7 +50,10 @@ def content(made: Path) -> set[str]:
 
 def hidden(out: Path) -> list[str]:
     """Temporary files and folders, wherever they are."""
-    return sorted(str(path.relative_to(out)) for path in out.rglob(".*") if path.name != ".checkpoint.pt")
+    found = (
+        path for path in out.rglob(".*") if path.name != ".checkpoint.pt" and out / "run.training" not in path.parents
+    )
+    return sorted(str(path.relative_to(out)) for path in found)
 
 
 @pytest.mark.parametrize("times", TIMES)
@@ -66,7 +69,7 @@ def test_a_command_stopped_at_any_moment_leaves_all_or_nothing(
     seconds, whole = time.monotonic() - start, content(made)
     draw, out = random.Random(COMMANDS.index(command)), tmp_path / "out"
     for number in range(times):
-        kind = SIGNALS[(number + COMMANDS.index(command)) % 3]
+        kind = SIGNALS[(number + COMMANDS.index(command)) % len(SIGNALS)]
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         line, made = arguments(command, place, run, out)
@@ -89,9 +92,10 @@ def test_a_command_stopped_at_any_moment_leaves_all_or_nothing(
         if number < 6:
             assert server.run(line).status == 0, case
             assert content(made) == whole, case
+            assert hidden(out) == [], f"{case}: left by the killed command"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_run_that_is_replaced_is_there_at_any_moment(
     place: Path, server: Commands, run: Path, tmp_path: Path, number: signal.Signals
 ) -> None:

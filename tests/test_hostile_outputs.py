@@ -18,7 +18,8 @@ from torchid.cli import main
 from torchid.errors import ConfigError, LogError
 from torchid.logs import read_log, write_log
 from torchid.run.claim import claimed
-from torchid.run.folder import RUN, new_folder, remove_folder, write_json
+from torchid.run.folder import RUN, new_folder, replaceable, write_json
+from torchid.run.manifest import MANIFEST
 
 WHOLE = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "hparams", "forces.png", "errors.png"}
 NOBODY = 65534
@@ -33,7 +34,8 @@ def is_whole(run: Path) -> bool:
     names = {path.name for path in run.iterdir()}
     json.loads((run / "parameters.json").read_text())
     json.loads((run / "metrics.json").read_text())
-    return names >= WHOLE and not RUN.foreign(sorted(names))
+    replaceable(run, RUN)
+    return names >= WHOLE
 
 
 # --------------------------------------------------------------------------------------------------------------- places
@@ -223,11 +225,11 @@ def test_another_run_that_was_faster_is_kept_or_replaced_whole(tmp_path: Path) -
 
 def test_what_came_in_the_way_meanwhile_stays_and_so_does_the_old_run(tmp_path: Path) -> None:
     output = tmp_path / "run"
-    output.mkdir()
-    (output / "config.yaml").write_text("old")
+    with new_folder(output) as folder:
+        (folder / "config.yaml").write_text("old")
     with pytest.raises(ConfigError, match="notes.txt"), new_folder(output, overwrite=True):  # noqa: PT012
         (output / "notes.txt").write_text("mine")
-    assert {path.name for path in output.iterdir()} == {"config.yaml", "notes.txt"}
+    assert {path.name for path in output.iterdir()} == {"config.yaml", "notes.txt", MANIFEST}
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -254,13 +256,3 @@ def test_a_folder_is_claimed_by_one_process_until_that_ends(tmp_path: Path) -> N
     with claimed(tmp_path / "y" / "run"):
         pass
     assert not (tmp_path / "y").exists()
-
-
-def test_a_folder_that_is_removed_has_no_name_any_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever stops the removal leaves a temporary name at most."""
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "x").write_text("x")
-    monkeypatch.setattr("shutil.rmtree", lambda *_, **__: None)
-    remove_folder(tmp_path / "old")
-    remove_folder(tmp_path / "old")
-    assert all(path.name.startswith(".old-") for path in tmp_path.iterdir())

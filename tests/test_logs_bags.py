@@ -124,7 +124,7 @@ def test_without_rosbags_the_message_says_what_to_install(tmp_path: Path, monkey
         return load(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", absent)
-    with pytest.raises(LogError, match=r"rosbags is not installed; accepted: pip install 'torchid\[ros\]'"):
+    with pytest.raises(LogError, match=r"rosbags is not installed; accepted: pip install '.\[ros\]'"):
         read_log(path, parsed({"joint_states": "/joint_states"}))
 
 

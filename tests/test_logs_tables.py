@@ -282,6 +282,6 @@ def test_without_pyarrow_the_message_says_what_to_install(tmp_path: Path, monkey
         return load(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", absent)
-    assert "pip install 'torchid[tables]'" in message_of(path)
+    assert "pip install '.[tables]'" in message_of(path)
     with pytest.raises(LogError, match="pyarrow is not installed"):
         write_log(Log("x", np.zeros(1), (), np.zeros((1, 0))), tmp_path / "y.parquet")

@@ -25,7 +25,7 @@ from torchid.problem.extras import ExtraTerms
 from torchid.sensing import Contact, SensorNoise, named_sensors, with_ft_sensors
 from torchid.wrenches import COMPONENTS
 
-pytest.importorskip("mujoco", reason="the simulation needs mujoco, which torchid[sim] installs")
+pytest.importorskip("mujoco", reason="the simulation needs mujoco, which the extra sim installs")
 
 WELDS = ("l_sole_weld", "r_sole_weld")
 CONTACTS = [Contact(frame, "flat") for frame in SOLES]

@@ -205,7 +205,7 @@ def test_forces_in_other_units_are_noticed(tmp_path: Path, capsys: pytest.Captur
         fields = dict(log)
     fields["joint_position"] = np.rad2deg(fields["joint_position"])
     np.savez(tmp_path / "demo" / "sway_train.npz", **fields)
-    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml")]) == 0
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), f"output={tmp_path / 'run'}"]) == 0
     assert "times the stated sensor noise" in capsys.readouterr().err
 
 

@@ -166,7 +166,8 @@ def assert_as_uninterrupted(output: Path, run: Path) -> None:
 def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
     names = {"events" if path.name.startswith("events") else path.name for path in run.iterdir()}
     figures = {"forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png"}
-    assert names == {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "events", "hparams", *figures}
+    results = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "manifest.json"}
+    assert names == {"events", "hparams", *results, *figures}
     assert list(run.parent.iterdir()) == [run]
     assert load_config(run / "config.yaml").estimator.training.epochs == EPOCHS
 
@@ -318,7 +319,7 @@ def test_a_run_killed_at_any_moments_ends_as_if_it_had_not_been(
         assert killed(server, arguments, output, draw.uniform(0.0, 0.1)) == -signal.SIGKILL
         assert not output.exists()
         assert {path.name.split(".out")[0] for path in training_of(output).iterdir()} <= {
-            *("config.yaml", CHECKPOINT, f".{CHECKPOINT}", "events"),
+            *("config.yaml", CHECKPOINT, f".{CHECKPOINT}", "events", "manifest.json"),
         }
         assert load_checkpoint(training_of(output))["trainer"]["epoch"] < EPOCHS
         arguments = command(experiment, output, "--resume")
@@ -503,7 +504,6 @@ def test_a_run_stays_as_it_is_until_the_one_that_replaces_it_is_complete(
 ) -> None:
     output = tmp_path / "runs" / "run"
     shutil.copytree(run, output)
-    (output / "parameters.json").write_text("{}")
     before = files_in(output)
     with pytest.MonkeyPatch.context() as monkeypatch:
         stopped_in(4, monkeypatch, interrupt())
@@ -548,7 +548,9 @@ def test_a_folder_of_that_name_that_is_no_training_stays(
     output = tmp_path / "runs" / "run"
     training_of(output).mkdir(parents=True)
     (training_of(output) / "notes.txt").write_text("mine")
-    assert "notes.txt, no part of a training" in refusal(command(experiment, output, *more), tmp_path, capsys)
+    assert "holds notes.txt, and no manifest.json that says that torchid wrote a training" in refusal(
+        command(experiment, output, *more), tmp_path, capsys
+    )
 
 
 @pytest.mark.usefixtures("plain")
@@ -564,7 +566,7 @@ def test_a_descent_that_diverges_ends_in_one_line_and_is_not_in_the_way_of_the_n
     assert line.endswith("; accepted: smaller steps")
     assert printed.out == ""
     assert [path.name for path in output.parent.iterdir()] == ["run.training"]
-    assert {path.name.split(".")[0] for path in training_of(output).iterdir()} == {"config", "events"}
+    assert {path.name.split(".")[0] for path in training_of(output).iterdir()} == {"config", "events", "manifest"}
     assert main(command(experiment, output, "estimator.training.epochs=1")) == 0
     assert [path.name for path in output.parent.iterdir()] == ["run"]
 

@@ -17,6 +17,7 @@ from simulated import BIPED, SHIPPED, SOLES, STOOD
 from torchid.cli import main
 from torchid.config import load_simulation
 from torchid.errors import InputError
+from torchid.run.folder import SIMULATION, new_folder
 from torchid.simulation import Recording, set_up_simulation
 
 FEET = [{"frame": sole} for sole in SOLES]
@@ -25,8 +26,9 @@ ONE_POINT = [[0.0, 0.0, 0.0]]
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A simulation file that would run, and its robot."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A simulation file that would run, and its robot; also the working folder."""
+    monkeypatch.chdir(tmp_path)
     shutil.copy(BIPED, tmp_path / "biped.urdf")
     posture = yaml.safe_load(SHIPPED.read_text())["posture"]
     settings = {"robot": {"urdf": "biped.urdf"}, "feet": FEET, "posture": posture, "motions": [SQUAT], "output": "out"}
@@ -200,7 +202,7 @@ def test_without_mujoco_a_simulation_says_how_to_install_it(
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     line = refusal(["simulate", str(folder / "sim.yaml")], folder, capsys)
-    assert line.endswith("MuJoCo, which is not installed; accepted: pip install 'torchid[sim]'")
+    assert line.endswith("MuJoCo, which is not installed; accepted: pip install '.[sim]' in the clone of torchid")
 
 
 # -------------------------------------------------------------------------------------------------- folders in the way
@@ -219,13 +221,13 @@ def occupied(folder: Path, *names: str) -> Path:
     ("names", "overrides", "expected"),
     [
         (("simulation.yaml", "stability.json"), (), "not empty; accepted: a new folder, or overwrite=true"),
-        (("simulation.yaml", "notes.txt"), ("overwrite=true",), "holds notes.txt, no part of a simulation"),
+        (("simulation.yaml", "notes.txt"), ("overwrite=true",), "holds notes.txt, simulation.yaml, and no manifest"),
         (
             ("config.yaml", "metrics.json"),
             ("overwrite=true",),
-            "holds config.yaml, metrics.json, no part of a simulation",
+            "holds config.yaml, metrics.json, and no manifest.json that says that torchid wrote a simulation",
         ),
-        (("stability.json",), ("overwrite=true",), "not empty and not a simulation folder"),
+        (("stability.json",), ("overwrite=true",), "holds stability.json, and no manifest"),
     ],
     ids=["not asked to", "with a file of the user's", "an identification", "without its mark"],
 )
@@ -238,8 +240,10 @@ def test_a_folder_is_replaced_on_request_only_and_only_by_its_like(
 
 
 def test_an_identification_does_not_replace_a_simulation(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = occupied(folder, "simulation.yaml", "nominal.urdf")
+    output = folder / "out"
+    with new_folder(output, kind=SIMULATION) as new:
+        (new / "nominal.urdf").write_text("x")
     demo = BIPED.parent / "quadruped.yaml"
     assert main(["identify", str(demo), f"output={output}", "overwrite=true"]) == 2
-    assert "no part of a run" in capsys.readouterr().err
+    assert "holds a simulation; accepted: a new folder, or a run to overwrite" in capsys.readouterr().err
     assert len(list(output.iterdir())) == 2

@@ -35,7 +35,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_simulation_folder_holds_what_it_promises(biped_folder: Path) -> None:
     names = {path.name for path in biped_folder.iterdir()}
-    assert names == {"logs", "exact", "nominal.urdf", "stability.json", "simulation.yaml"}
+    assert names == {"logs", "exact", "nominal.urdf", "stability.json", "simulation.yaml", "manifest.json"}
     for kind in ("logs", "exact"):
         assert {path.name for path in (biped_folder / kind).iterdir()} == {f"{name}.npz" for name in MOTIONS}
     assert [path.name for path in biped_folder.parent.iterdir()] == [biped_folder.name], "temporary folders left behind"
@@ -87,7 +87,7 @@ def test_the_same_seed_writes_the_same_logs_bit_for_bit_and_another_changes_the_
     second = files_in(output)
     assert second.keys() == first.keys()
     changed = {name for name in first if second[name] != first[name]}
-    assert changed == {f"logs/{ALONE}.npz", "simulation.yaml"}
+    assert changed == {f"logs/{ALONE}.npz", "simulation.yaml", "manifest.json"}
     assert sorted(path.name for path in alone.parent.iterdir()) == ["out", "sim.yaml"]
 
 
@@ -111,8 +111,9 @@ def test_the_logs_identify_the_robot_from_its_joint_torques_alone(
     assert trained == [str(logs / f"{name}.npz") for name in (*SQUATS, *SWAYS)]
 
 
-def test_shipped_experiments_read_the_logs_that_the_shipped_simulation_writes() -> None:
-    """Their patterns must match every training motion and no other; the paths must be the simulation's output."""
+def test_shipped_experiments_read_the_logs_that_the_shipped_simulation_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their patterns match every training motion and no other; the paths are the simulation's output in the clone."""
+    monkeypatch.chdir(SHIPPED.parents[1])
     config = load_simulation(SHIPPED)
     assert [motion.name for motion in config.motions] == list(MOTIONS)
     for name in ("full", "contacts", "joints", "reduced"):

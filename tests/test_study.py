@@ -120,7 +120,7 @@ def test_figures_and_charts_are_written(study: tuple[Path, str]) -> None:
     for name in ("rms", "forces", "projected"):
         assert (folder / f"{name}.png").stat().st_size > 20_000
     assert {path.name for path in folder.iterdir()} == {
-        "results.json", "tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard",
+        "results.json", "tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard", "manifest.json",
     }  # fmt: skip
     events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"images": 0})
     events.Reload()

@@ -6,6 +6,8 @@ Building blocks are here; whole runs, from files to folders, are in `torchid.run
 import importlib
 from typing import TYPE_CHECKING
 
+__version__ = "0.1.0"
+
 if TYPE_CHECKING:
     from torchid.analysis.base_parameters import BaseParameters, base_parameters
     from torchid.analysis.calibration import estimate_extras

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
-from importlib.metadata import version
 from math import isfinite
 from textwrap import fill
 from typing import TYPE_CHECKING
 
+from torchid import __version__
 from torchid.errors import BaseLostError, InputError, TorchidWarning
-from torchid.interrupts import begin, written
+from torchid.interrupts import begin, ending_interrupts, written
 from torchid.interrupts import interrupt_held_back as _interrupt_held_back
 
 if TYPE_CHECKING:
@@ -49,7 +46,7 @@ def guarded(program: str, command: Callable[[], int | None], debug: bool = False
         warnings.showwarning = partial(_show_warning, program)
         try:
             begin()
-            with _termination_interrupts():
+            with ending_interrupts():
                 return command() or 0
         except (InputError, BaseLostError) as error:
             print(f"{program}: {error}", file=sys.stderr)
@@ -78,7 +75,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="torchid", description="Identify a robot's inertia and friction from logs.")
-    parser.add_argument("--version", action="version", version=f"torchid {version('torchid')}")
+    parser.add_argument("--version", action="version", version=f"torchid {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     identify.add_argument("file", help="experiment file (YAML)")
@@ -113,6 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--topics", metavar="FILE", help="experiment file whose logs.topics says what a bag holds")
     check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
     check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
+    check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
     check.set_defaults(command=_check)
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
     convert.add_argument("source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, or a bag of ROS messages")
@@ -123,19 +121,6 @@ def _parser() -> argparse.ArgumentParser:
     for command in (identify, evaluate, analyze, check, convert, simulate):
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
     return parser
-
-
-@contextmanager
-def _termination_interrupts() -> Iterator[None]:
-    """Let SIGTERM end a command as Ctrl-C does, which leaves nothing behind."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _identify(options: argparse.Namespace) -> None:
@@ -252,7 +237,7 @@ def _check(options: argparse.Namespace) -> int:
         from torchid.report.tables import print_tables
         from torchid.run.check import check_files, check_outputs, write_outputs
 
-    check_outputs(options.json, options.figure)
+    check_outputs(options.json, options.figure, options.overwrite, (options.file, options.urdf, options.topics))
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
     write_outputs(checked, options.json, options.figure)

@@ -86,6 +86,11 @@ class NumericalWarning(TorchidWarning):
     """A result whose accuracy is limited by the conditioning of the problem."""
 
 
+def install(extra: str) -> str:
+    """How to install the packages of an extra; the name torchid on PyPI is not ours."""
+    return f"pip install '.[{extra}]' in the clone of torchid"
+
+
 def nearest(name: str, valid: Iterable[str], limit: int = 3) -> str:
     """The names in `valid` closest to `name`, or the first few of them, as one readable string."""
     valid = list(valid)

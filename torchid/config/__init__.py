@@ -1,6 +1,13 @@
 """Settings files: typed dataclasses, YAML, and overrides from the command line."""
 
-from torchid.config.experiment import AnalyzeConfig, ExperimentConfig, dump_config, load_analysis, load_config
+from torchid.config.experiment import (
+    AnalyzeConfig,
+    ExperimentConfig,
+    dump_config,
+    inputs_of,
+    load_analysis,
+    load_config,
+)
 from torchid.config.simulation import (
     BoundsConfig,
     FootConfig,
@@ -23,6 +30,7 @@ __all__ = [
     "SimulationConfig",
     "StepsConfig",
     "dump_config",
+    "inputs_of",
     "load_analysis",
     "load_config",
     "load_simulation",

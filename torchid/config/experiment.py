@@ -136,7 +136,8 @@ _EXPERIMENT = FileKind(
     name="experiment",
     keys="robot, logs, sensors, output",
     list_example="contacts=[{frame: l_sole, type: flat}]",
-    paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*", "output"),
+    paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*"),
+    outputs=("output",),
     prepare=_with_sensors_spelled_out,
     accepted={
         "sensors": CHOICE_ACCEPTED,
@@ -154,7 +155,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     """Read and check an experiment file.
 
     Args:
-        path: the YAML file; paths in it are relative to it.
+        path: the YAML file; paths in it are relative to it, but `output` to the working directory.
         overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory.
 
     Raises:
@@ -216,6 +217,12 @@ def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
     if logs.topics is not None:
         check_topics(path, logs.topics)
     return LogsConfig(**found, topics=logs.topics)
+
+
+def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
+    """URDF and logs; a bag may be a folder."""
+    logs = config.logs
+    return [config.robot.urdf, *([*logs.train, *logs.validation, *logs.test] if logs else [])]
 
 
 def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:

@@ -46,6 +46,7 @@ class FileKind(Generic[T]):
         keys: the chief keys, as in "a mapping with robot, logs, ...".
         list_example: an override that gives a list as a whole.
         paths: places that hold a path, such as `robot.urdf`; `logs.train.*` is every item of the list `logs.train`.
+        outputs: places that hold the path of a result.
         prepare: takes settings and those that will override them, and returns the settings to merge; it is called for
             the file and nothing, then, for each override, for all before and it, and for it and nothing.
         accepted: what a message says is accepted, by place (`*` for a name that the file gives), where the type alone
@@ -57,6 +58,7 @@ class FileKind(Generic[T]):
     keys: str
     list_example: str
     paths: Sequence[str] = ()
+    outputs: Sequence[str] = ()
     prepare: Callable[[Settings, Settings], Settings] = _as_is
     accepted: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
@@ -74,7 +76,7 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
 
     Args:
         kind: of the file.
-        path: the YAML file; paths in it are relative to it.
+        path: the YAML file; paths of inputs in it are relative to it, those of results to the working directory.
         overrides: `key.subkey=value`, the value in YAML, one after the other; paths in them are relative to the working
             directory. A mapping adds to what is there, unless it is empty: `key={}` clears it.
 
@@ -82,9 +84,10 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
         UnknownNameError: a key that does not exist; the message names the nearest that do.
     """
-    settings = kind.prepare(_absolute(path, _read(kind, path), kind.paths, path.resolve().parent), {})
+    in_file = _absolute(path, _read(kind, path), kind.paths, path.resolve().parent)
+    settings = kind.prepare(_absolute(path, in_file, kind.outputs, Path.cwd()), {})
     for text in overrides:
-        given = _absolute("command line", _parsed(text), kind.paths, Path.cwd())
+        given = _absolute("command line", _parsed(text), (*kind.paths, *kind.outputs), Path.cwd())
         try:
             layers = _cleared(kind.prepare(settings, given), given), kind.prepare(given, {})
             settings = _container(OmegaConf.merge(*layers))

@@ -169,7 +169,8 @@ _FILE = FileKind(
     "simulation",
     "robot, feet, motions, output",
     "feet=[{frame: l_sole}, {frame: r_sole}]",
-    ("robot.urdf", "output"),
+    ("robot.urdf",),
+    ("output",),
 )
 
 
@@ -177,7 +178,7 @@ def load_simulation(path: str | Path, overrides: Sequence[str] = ()) -> Simulati
     """Read and check a simulation file.
 
     Args:
-        path: the YAML file; paths in it are relative to it.
+        path: the YAML file; paths in it are relative to it, but `output` to the working directory.
         overrides: `key.subkey=value`, the value in YAML; paths in them are relative to the working directory.
 
     Raises:

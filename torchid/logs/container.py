@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import secrets
 import struct
 import zipfile
 import zlib
@@ -15,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.interrupts import interrupt_held_back, note_written
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.limits import check_growth
 from torchid.logs.npz import Npz, open_archive
 from torchid.logs.spill import Sliced
+from torchid.staging import whole_file
 from torchid.text import shown
 
 SUFFIXES = (".npz", ".h5", ".hdf5")
@@ -105,17 +104,11 @@ def appearing_whole(path: Path) -> Iterator[Path]:
     Raises:
         LogError: the file cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        yield temporary
-        with interrupt_held_back():
-            temporary.replace(path)
-            note_written(path)
+        with whole_file(path) as temporary:
+            yield temporary
     except OSError as error:
         raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

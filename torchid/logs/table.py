@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid.errors import LogError, install
 from torchid.logs import container
 from torchid.logs.columns import TEXT, Layout, columns_of, layout_of
 from torchid.logs.container import appearing_whole, translated
@@ -106,7 +106,7 @@ def _pyarrow(path: Path) -> Any:
         import pyarrow
     except ImportError as error:
         found = f"a {path.suffix.lower()} file, but pyarrow is not installed"
-        raise LogError(path, "file", found, "a .npz or .h5 file, or pip install 'torchid[tables]'") from error
+        raise LogError(path, "file", found, f"a .npz or .h5 file, or {install('tables')}") from error
     return pyarrow
 
 

@@ -13,7 +13,7 @@ from torchid.analysis.base_check import StateCheck
 from torchid.analysis.base_parameters import base_parameters
 from torchid.analysis.candidates import sensor_set
 from torchid.analysis.planner import Question, check, plan_sensors
-from torchid.config import AnalyzeConfig
+from torchid.config import AnalyzeConfig, inputs_of
 from torchid.errors import ConfigError
 from torchid.problem import Samples
 from torchid.problem.chunks import by_state
@@ -50,7 +50,7 @@ def analyze(config: AnalyzeConfig, source: object = "experiment") -> Analysis:
     output = analysis_folder(config.output)
     if not config.output.name:
         raise ConfigError(source, "output", f"'{config.output}', no name for a folder", "a path to a new folder")
-    check_free(output, config.overwrite, ANALYSIS)
+    check_free(output, config.overwrite, ANALYSIS, (source, *inputs_of(config)))
     scene = set_up_scene(config, source)
     ask = asked(scene, source)
     with progress_bars() as bars:

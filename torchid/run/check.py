@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from torchid.report.hygiene_figure import hygiene_figure
 from torchid.report.hygiene_tables import hygiene_document
 from torchid.robot import load_robot
 from torchid.run.experiment import set_up_scene
+from torchid.run.folder import check_free_file
 from torchid.run.progress import progress_bars
 from torchid.run.reading import gigabytes
 from torchid.sensing import Contact
@@ -120,11 +120,19 @@ def _contact(log: Log, index: int) -> Contact:
     return Contact(log.contact_names[index], "point" if force and not moment else "flat")
 
 
-def check_outputs(document: str | None, figure: str | None) -> None:
+def check_outputs(
+    document: str | None, figure: str | None, overwrite: bool = False, inputs: Sequence[str | None] = ()
+) -> None:
     """Make sure, before any work, that files can be written there.
 
+    Args:
+        document: name of the .json file.
+        figure: name of the figure.
+        overwrite: whether files there may be replaced.
+        inputs: files that are read.
+
     Raises:
-        ConfigError: another extension, a folder in the way, or no folder to write to.
+        ConfigError: another extension, something in the way, or no folder to write to.
     """
     for option, name, accepted in (("--json", document, (".json",)), ("--figure", figure, FIGURES)):
         if name is None:
@@ -132,8 +140,7 @@ def check_outputs(document: str | None, figure: str | None) -> None:
         path = Path(name)
         if path.suffix.lower() not in accepted:
             raise ConfigError("command line", option, f"'{name}'", f"a file name that ends in {', '.join(accepted)}")
-        if os.path.isdir(path) or not os.path.isdir(path.parent):
-            raise ConfigError("command line", option, f"'{name}', no file in an existing folder", "a file name")
+        check_free_file(path, option, overwrite, [x for x in inputs if x is not None])
 
 
 def write_outputs(checked: Sequence[Checked], document: str | None, figure: str | None) -> None:

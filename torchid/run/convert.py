@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from torchid.config.topics import load_topics
-from torchid.errors import ConfigError
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.kinds import kind_to_write
+from torchid.run.folder import check_free_file
 from torchid.run.progress import progress_bars
 
 
@@ -19,7 +18,7 @@ def convert(source: str | Path, target: str | Path, topics: str | Path | None = 
         source: any log that can be read.
         target: .npz, .h5, .hdf5, .csv or .parquet.
         topics: experiment file whose `logs.topics` says what the topics of a bag hold.
-        overwrite: whether `target` may be replaced.
+        overwrite: whether `target` may be replaced; what is read never is, as a log may hold more than is written.
 
     Returns:
         The log, in canonical frames and orders: another quaternion order or frame of the source is not kept.
@@ -29,10 +28,7 @@ def convert(source: str | Path, target: str | Path, topics: str | Path | None = 
     """
     path = Path(target)
     kind_to_write(path)
-    if os.path.lexists(path) and not (overwrite and os.path.isfile(path)):
-        raise ConfigError(target, "OUT", "exists", "a new file, or --overwrite in place of a file")
-    if not os.path.isdir(path.parent):
-        raise ConfigError(target, "OUT", f"no folder {path.parent}", "a file in an existing folder")
+    check_free_file(path, "OUT", overwrite, (source, *([] if topics is None else [topics])))
     mapped = None if topics is None else load_topics(topics)
     with progress_bars() as bars:
         reading = bars.add_task("reading", total=None)

@@ -13,7 +13,7 @@ from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.parameters_json import read_parameters, read_shared_extras
 from torchid.run.calibration import Calibration, errors
 from torchid.run.experiment import Experiment, set_up
-from torchid.run.folder import check_free, new_folder, write_json
+from torchid.run.folder import EVALUATION, check_free, new_folder, write_json
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import forces_of
@@ -45,7 +45,7 @@ def evaluate(
     if again:
         raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
     output = folder / "evaluation" / names[0]
-    check_free(output, overwrite=True)
+    check_free(output, True, EVALUATION, logs)
     config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])
     with progress_bars() as bars:
         experiment = set_up(config, folder / "config.yaml")
@@ -69,7 +69,7 @@ def evaluate(
         }
         for path, count in reader.excluded.items():
             document[Path(path).stem]["excluded_samples"] = count
-        with new_folder(output, overwrite=True) as new:
+        with new_folder(output, True, EVALUATION) as new:
             (new / "config.yaml").write_text((folder / "config.yaml").read_text())
             write_json(new / "metrics.json", document)
             forces_of(evaluation, samples[0], both).savefig(new / "forces.png", dpi=130)

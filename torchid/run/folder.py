@@ -1,63 +1,49 @@
-"""A run folder that appears complete or not at all."""
+"""A folder of results that appears complete or not at all, and replaces nothing but what torchid wrote."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
-import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from fnmatch import fnmatch
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from torchid.errors import ConfigError
 from torchid.interrupts import interrupt_held_back, note_written
+from torchid.run.manifest import MANIFEST, Contents, FolderKind, inspect, manifest_of, read_manifest
+from torchid.staging import NEW, OLD, leftovers, staging
+from torchid.text import listed, shown
 
-
-@dataclass(frozen=True)
-class FolderKind:
-    """What a folder that may be overwritten holds: a file that tells its kind, and patterns of the other names.
-
-    `name`: with its article, as in "a run".
-    """
-
-    name: str
-    mark: str
-    others: tuple[str, ...]
-
-    def foreign(self, names: Sequence[str]) -> list[str]:
-        """Those of the names that are no part of such a folder."""
-        own = (self.mark, *self.others)
-        return sorted(name for name in names if not any(fnmatch(name, pattern) for pattern in own))
-
-
-_FIGURES = ("forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png", "extras.png")
-_RESULTS = ("parameters.json", "metrics.json", "identified.urdf", *_FIGURES)
 EVENTS = "events.out.tfevents*"
-RUN = FolderKind("a run", "config.yaml", (*_RESULTS, "hparams", "evaluation", EVENTS))
-TRAINING = FolderKind("a training", "config.yaml", ("checkpoint.pt", ".checkpoint.pt", EVENTS))
-SIMULATION = FolderKind("a simulation", "simulation.yaml", ("logs", "exact", "nominal.urdf", "stability.json"))
-ANALYSIS = FolderKind(
-    "an analysis", "analysis.json", ("config.yaml", "base_parameters.txt", "sensors-*.png", "accuracy.png")
-)
-STUDY = FolderKind("a study", "results.json", ("tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard"))
+EVALUATION = FolderKind("an evaluation")
+RUN = FolderKind("a run", "evaluation", EVALUATION)
+TRAINING = FolderKind("a training", result=False)
+SIMULATION = FolderKind("a simulation")
+ANALYSIS = FolderKind("an analysis")
+STUDY = FolderKind("a study")
 
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer
 _TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # by another run
 _TRIES = 100
+_MOST_NAMES = 50  # in one message
 
 
-def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN) -> None:
-    """Make sure, before any work, that a folder of a kind may be written.
+def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: Iterable[object] = ()) -> None:
+    """Make sure, before any work, that a folder of a kind may be written; leftovers of killed processes go first.
+
+    Args:
+        output: the folder.
+        overwrite: whether one of its kind may be replaced.
+        kind: what it will be.
+        inputs: files and folders that the command reads.
 
     Raises:
         ConfigError: `output` exists and may not be replaced, or is no place for a folder.
     """
     try:
-        names = [path.name for path in output.iterdir()] if output.is_dir() else []
+        clear_leftovers(output, kind)
+        names = os.listdir(output) if output.is_dir() else []
         above = next(path for path in output.absolute().parents if path.exists())
         taken = output.is_symlink() or (output.exists() and not output.is_dir())
     except (OSError, ValueError) as error:
@@ -71,11 +57,97 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN) -> None:
         raise ConfigError(output, "output", f"no folder can be made there, in {above}", "a place that can be written")
     if names and not overwrite:
         raise ConfigError(output, "output", "not empty", "a new folder, or overwrite=true")
-    foreign = kind.foreign(names)
-    if names and (foreign or kind.mark not in names):
-        what = f"no part of {kind.name}" if foreign else f"not {kind.name} folder"
-        found = f"holds {', '.join(foreign[:3])}, {what}" if foreign else f"not empty and {what}"
-        raise ConfigError(output, "output", found, f"a new folder, or {kind.name} to overwrite")
+    if names:
+        refuse_inputs(output, inputs)
+        replaceable(output, kind)
+
+
+def check_free_file(path: Path, field: str, overwrite: bool, inputs: Iterable[object]) -> None:
+    """Make sure, before any work, that a file may be written.
+
+    Args:
+        path: of the file.
+        field: of the command line that names it.
+        overwrite: whether a file there may be replaced.
+        inputs: files and folders that the command reads.
+
+    Raises:
+        ConfigError: it exists and may not be replaced, or there is no folder for it.
+    """
+    if os.path.lexists(path) and not (overwrite and os.path.isfile(path) and not os.path.islink(path)):
+        found = "a link" if os.path.islink(path) else "exists"
+        raise ConfigError(path, field, found, "a new file, or --overwrite in place of a file")
+    if not os.path.isdir(path.parent):
+        raise ConfigError(path, field, f"no folder {path.parent}", "a file in an existing folder")
+    for other in inputs:
+        one, of = os.path.realpath(path), os.path.realpath(str(other))
+        if os.path.lexists(path) and (one == of or one.startswith(of + os.sep)):
+            raise ConfigError(path, field, "is or belongs to what is read", "another file")
+
+
+def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
+    """Make sure that a folder which will be replaced or removed holds nothing that the command reads.
+
+    Raises:
+        ConfigError: it does.
+    """
+    top = os.path.realpath(output)
+    for path in inputs:
+        if os.path.lexists(str(path)) and os.path.realpath(str(path)).startswith(top + os.sep):
+            found = f"holds {shown(str(path))}, which is an input"
+            raise ConfigError(output, "output", found, "another output, or inputs that lie elsewhere")
+
+
+def replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> Contents:
+    """What is in a folder that torchid wrote, and nobody else.
+
+    Args:
+        folder: to be replaced or removed.
+        kind: that it should be of.
+        output: its name in messages, if another.
+
+    Raises:
+        ConfigError: something in it is not torchid's, or has changed since.
+    """
+    output = output or folder
+    try:
+        found, names = inspect(folder, kind), [shown(name) for name in sorted(os.listdir(folder))]
+    except OSError as error:
+        raise ConfigError(output, "output", f"cannot be read ({error})", "a new folder") from error
+    if found is None and (other := read_manifest(folder)):
+        accepted = f"a new folder, or {kind.name} to overwrite"
+        raise ConfigError(output, "output", f"holds {shown(other.kind)}", accepted)
+    if found is None:
+        what = f"holds {listed(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
+        accepted = f"a new folder, or {kind.name} to overwrite; one that an older version wrote is for you to remove"
+        raise ConfigError(output, "output", what, accepted)
+    complaints = [f"{listed(found.foreign, _MOST_NAMES)}, which torchid did not write"] if found.foreign else []
+    complaints += [f"{listed(found.changed, _MOST_NAMES)}, changed since torchid wrote it"] if found.changed else []
+    closed = [str(path) for path in found.folders if not os.access(path, os.W_OK | os.X_OK)]
+    complaints += [f"{listed(closed)}, where nothing can be removed"] if closed and not complaints else []
+    if complaints:
+        accepted = f"a new folder, or {kind.name} to overwrite; move elsewhere what is yours"
+        raise ConfigError(output, "output", f"holds {' and '.join(complaints)}", accepted)
+    return found
+
+
+def clear_leftovers(output: Path, kind: FolderKind) -> None:
+    """Remove what killed processes left of folders that were to become `output`; what one had moved aside comes back.
+
+    Raises:
+        OSError: it cannot be moved back.
+    """
+    for folder in leftovers(output):
+        if not os.path.lexists(folder / OLD):
+            continue
+        if not os.path.lexists(output):
+            (folder / OLD).rename(output)
+            continue
+        if found := inspect(folder / OLD, kind):
+            found.remove()
+        for place, _, _ in os.walk(folder / OLD, topdown=False):  # the process was killed after their manifests went
+            with suppress(OSError):
+                os.rmdir(place)
 
 
 def write_json(path: Path, document: object) -> None:
@@ -84,40 +156,33 @@ def write_json(path: Path, document: object) -> None:
 
 
 @contextmanager
-def new_folder(output: Path, overwrite: bool = False, kind: FolderKind = RUN) -> Iterator[Path]:
-    """A temporary folder beside `output` that takes its place when the block ends without an error.
+def new_folder(
+    output: Path, overwrite: bool = False, kind: FolderKind = RUN, growing: Sequence[str] = ()
+) -> Iterator[Path]:
+    """A temporary folder beside `output` that takes its place, with a manifest, when the block ends without an error.
 
     Of several at a time the first takes the place, or, with `overwrite`, the last.
+
+    Args:
+        output: the folder to be.
+        overwrite: whether one of its kind may be replaced.
+        kind: of the folder.
+        growing: patterns of files in it that are written on later.
 
     Raises:
         ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
     """
     check_free(output, overwrite, kind)
-    temporary: Path | None = None
-    with parents_of(output):
-        try:
-            with interrupt_held_back():
-                temporary = _temporary(output)
-            yield temporary
-            with interrupt_held_back():
-                _put(temporary, output, overwrite, kind)
+    with parents_of(output), ExitStack() as stack:
+        with creating(output):
+            folder = stack.enter_context(staging(output))
+            (folder / NEW).mkdir()
+        yield folder / NEW
+        manifest_of(folder / NEW, kind, output.name, growing).write(folder / NEW)
+        with interrupt_held_back():
+            _put(folder, output, overwrite, kind)
+            if kind.result:
                 note_written(output)
-        finally:
-            with interrupt_held_back():
-                if temporary is not None:
-                    shutil.rmtree(temporary, ignore_errors=True)
-
-
-def remove_folder(folder: Path) -> None:
-    """Remove a folder, which keeps its name no longer than it is whole."""
-    if not folder.exists():
-        return
-    with interrupt_held_back():
-        retired = _temporary(folder)
-        try:
-            folder.rename(retired / "old")
-        finally:
-            shutil.rmtree(retired, ignore_errors=True)
 
 
 @contextmanager
@@ -144,34 +209,29 @@ def creating(output: Path) -> Iterator[None]:
         raise ConfigError(output, "output", found, "a place that can be written") from error
 
 
-def _temporary(output: Path) -> Path:
-    """A new folder beside `output` whose name nobody takes for a run's."""
-    with creating(output):
-        temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-    temporary.chmod(0o755)
-    return temporary
-
-
-def _put(temporary: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
-    """Rename the temporary folder; what stood there, perhaps another run that ended meanwhile, is replaced whole."""
-    retired: list[Path] = []
-    try:
-        for _ in range(_TRIES):
-            if _renamed(temporary, output):
-                return
-            check_free(output, overwrite, kind)
-            with suppress(FileNotFoundError):  # taken away by another that replaces it
-                retired.append(_temporary(output))
-                output.rename(retired[-1] / "run")
-        raise ConfigError(output, "output", "other runs take the place again and again", "another output")
-    except BaseException:
-        for aside in reversed(retired):
+def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
+    """Rename the new folder in a staging folder; what stood there, perhaps another run that ended meanwhile, goes."""
+    for _ in range(_TRIES):
+        if _renamed(folder / NEW, output):
+            return
+        check_free(output, overwrite, kind)
+        try:
+            output.rename(folder / OLD)
+        except FileNotFoundError:  # taken away by another that replaces it
+            continue
+        except OSError as error:
+            raise ConfigError(output, "output", f"cannot be replaced ({error.strerror})", "a new folder") from error
+        try:
+            found = replaceable(folder / OLD, kind, output)  # where nobody puts anything any more
+            done = _renamed(folder / NEW, output)
+        except BaseException:
             with suppress(OSError):
-                (aside / "run").rename(output)
-        raise
-    finally:
-        for aside in retired:
-            shutil.rmtree(aside, ignore_errors=True)
+                (folder / OLD).rename(output)
+            raise
+        found.remove()
+        if done:
+            return
+    raise ConfigError(output, "output", "other runs take the place again and again", "another output")
 
 
 def _renamed(folder: Path, name: Path) -> bool:

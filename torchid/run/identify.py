@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from torchid.analysis.contributions import Contributions, contributions
 from torchid.analysis.known import total_mass
-from torchid.config import ExperimentConfig
+from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, SensorError
 from torchid.estimators import Estimate, LeastSquares, violations
 from torchid.parameters import PER_BODY, Array
@@ -29,7 +29,7 @@ from torchid.run.claim import claimed
 from torchid.run.estimation import assembled, batch_estimator, stated_conditions
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.fit import Fit, fitted
-from torchid.run.folder import check_free
+from torchid.run.folder import RUN, check_free
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import Identification, write_run
@@ -66,7 +66,7 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
     trains = config.estimator.name == "sgd"
     with claimed(training_folder(config.output)) if trains else nullcontext():
         check_training(config, resume, source)
-        check_free(config.output, config.overwrite)
+        check_free(config.output, config.overwrite, RUN, (source, *inputs_of(config)))
         return _identify(config, source, resume)
 
 

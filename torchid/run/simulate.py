@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict
@@ -40,7 +41,7 @@ def simulate(config: SimulationConfig, source: object = "simulation") -> dict[st
     Raises:
         InputError: whatever does not fit, or a robot that does not keep standing; nothing has been written then.
     """
-    check_free(config.output, config.overwrite, SIMULATION)
+    check_free(config.output, config.overwrite, SIMULATION, (source, config.robot.urdf))
     robot = load_robot(config.robot.urdf)
     simulation = set_up_simulation(config, source)
     for motion in config.motions:
@@ -91,7 +92,18 @@ _done: Synchronized[float]
 def _start_worker(done: Synchronized[float]) -> None:
     global _done
     _done = done
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
+    for name in ("SIGINT", "SIGHUP"):  # they are for the parent, which ends its workers
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End a worker whose parent was killed: it would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _simulate_motion(config: SimulationConfig, motion: MotionConfig, source: object, folder: Path) -> Stability:

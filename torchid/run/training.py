@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import glob
+import os
 import shutil
+import socket
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +19,7 @@ import yaml
 from rich.progress import Progress
 
 from torchid import parameters
-from torchid.config import ExperimentConfig, dump_config
+from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, InputError, SensorError, TorchidWarning
 from torchid.estimators import Epoch, PenaltyWeights, Sgd, SgdEstimate, Trainer
 from torchid.parameters import Array
@@ -24,7 +29,8 @@ from torchid.report.metrics import Metrics
 from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
 from torchid.run.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
-from torchid.run.folder import EVENTS, TRAINING, check_free
+from torchid.run.folder import EVENTS, TRAINING, check_free, clear_leftovers, new_folder, refuse_inputs
+from torchid.run.manifest import Manifest, inspect, read_manifest
 
 Evaluate = Callable[[Array], Mapping[str, Metrics]]
 
@@ -44,12 +50,13 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
     Raises:
         ConfigError: nothing to go on with, or an unfinished training in the way.
     """
-    folder, output = training_folder(config.output), config.output
+    folder, output, inputs = training_folder(config.output), config.output, (source, *inputs_of(config))
     if config.estimator.name != "sgd":
         if resume:
             found = f"{config.estimator.name}, which is done in one go"
             raise ConfigError(source, "--resume", found, "estimator.name: sgd, or no --resume")
         return
+    clear_leftovers(folder, TRAINING)
     waiting = (folder / CHECKPOINT).is_file()
     if resume and not waiting:
         if output.exists() and not config.overwrite:
@@ -59,7 +66,8 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
     elif waiting and not resume and not config.overwrite:
         raise ConfigError(folder, "output", "an unfinished training", "--resume, overwrite=true, or another output")
     if not waiting or not resume:
-        check_free(folder, True, TRAINING)  # without a checkpoint there is nothing to lose
+        check_free(folder, True, TRAINING, inputs)  # without a checkpoint there is nothing to lose
+    refuse_inputs(folder, inputs)  # it goes when the run is done
 
 
 class Training:
@@ -119,13 +127,23 @@ class Training:
             return trainer.estimate()
 
     def copy_curves(self, folder: Path) -> None:
-        """Copy the event files into the finished run's folder."""
-        for path in self.folder.glob(EVENTS):
-            shutil.copy2(path, folder)
+        """Copy the training's event files into the finished run's folder."""
+        found = inspect(self.folder, TRAINING)
+        for path in found.own if found else ():
+            if fnmatchcase(path.name, EVENTS):
+                shutil.copy2(path, folder)
 
     def forget(self) -> None:
-        """Remove the checkpoint of a run that is done."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove the checkpoint of a run that is done.
+
+        Warns:
+            TorchidWarning: there is more in its folder than torchid wrote.
+        """
+        if found := inspect(self.folder, TRAINING):
+            found.remove()
+        if self.folder.exists():
+            message = f"{self.folder}: stays: it holds what torchid did not write"
+            warnings.warn(message, TorchidWarning, stacklevel=3)
 
     def _train(self, trainer: Trainer, evaluate: Evaluate, events: RunEvents, progress: Callable[[str], None]) -> None:
         training = self.config.estimator.training
@@ -152,12 +170,11 @@ class Training:
                 self._check(state, trainer)
                 trainer.load_state_dict(state["trainer"])
             self._saved = trainer.epoch
+            before = read_manifest(self.folder) or Manifest(TRAINING.name, self.folder.name, {})
+            replace(before, growing=(*before.growing, *_growing())).write(self.folder)
             return
-        if self.folder.exists():
-            check_free(self.folder, True, TRAINING)
-            shutil.rmtree(self.folder)
-        self.folder.mkdir(parents=True)
-        (self.folder / "config.yaml").write_text(self._text)
+        with new_folder(self.folder, True, TRAINING, _growing()) as folder:
+            (folder / "config.yaml").write_text(self._text)
 
     def _save(self, trainer: Trainer, events: RunEvents) -> None:
         events.flush()  # first: a resumed run's curves start where the checkpoint is
@@ -232,6 +249,11 @@ def body_eigenvalues(robot: Robot, phi: Array) -> dict[str, float]:
     """Smallest eigenvalue of every body's scaled pseudo-inertia, by name, of parameters (12 L,)."""
     least = parameters.least_eigenvalues(phi, parameter_scale(robot.nominal).flatten())
     return {name: float(x) for name, x in zip(robot.body_names, least, strict=True) if x == x}
+
+
+def _growing() -> tuple[str, ...]:
+    """Patterns of what this process will write into the training's folder, event files by host and process."""
+    return CHECKPOINT, f".{CHECKPOINT}", f"{EVENTS}.{glob.escape(socket.gethostname())}.{os.getpid()}.*"
 
 
 def _described(epoch: Epoch) -> str:

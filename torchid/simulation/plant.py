@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from torchid.errors import InputError, UrdfError
+from torchid.errors import InputError, UrdfError, install
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
 from torchid.simulation.feet import Foot
@@ -18,7 +18,7 @@ try:
     import mujoco
 except ImportError as error:
     found = "needs MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
-    raise InputError("torchid", "simulate", found, "pip install 'torchid[sim]'") from error
+    raise InputError("torchid", "simulate", found, install("sim")) from error
 
 _WORLD = "world link"
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")

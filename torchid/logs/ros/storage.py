@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 
-from torchid.errors import LogError
+from torchid.errors import LogError, install
 from torchid.logs.container import translated
 from torchid.logs.limits import MAX_LETTERS
 from torchid.text import is_plain, shown
@@ -81,7 +81,7 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
     except ImportError as error:
         absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
         found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
-        raise LogError(path, "file", found, "pip install 'torchid[ros]'") from error
+        raise LogError(path, "file", found, install("ros")) from error
     from torchid.logs.ros.mcap_file import McapFile
     from torchid.logs.ros.ros1_file import Ros1File
     from torchid.logs.ros.sqlite_file import SqliteFile

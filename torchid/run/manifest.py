@@ -1,0 +1,224 @@
+"""What torchid wrote into a folder: a list with checksums, so that replacing it removes these files and no others."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from torchid.staging import is_leftover, remove_leftover, whole_file
+from torchid.text import shown
+
+MANIFEST = "manifest.json"
+
+_LARGEST = 2**24  # bytes of a manifest: those of 100 000 files
+_BLOCK = 2**20
+
+
+@dataclass(frozen=True)
+class FolderKind:
+    """What a folder that torchid writes holds.
+
+    Attributes:
+        name: with its article, as in "a run".
+        within: name of a folder in it that holds folders of another kind, with manifests of their own.
+        of: their kind.
+        result: whether it is what a command answers with, not a state on the way there.
+    """
+
+    name: str
+    within: str = ""
+    of: FolderKind | None = None
+    result: bool = True
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The manifest of a folder.
+
+    Attributes:
+        kind: name of the kind of folder.
+        folder: its name.
+        files: size [bytes] and SHA-256 of each file, by its path in the folder, with slashes.
+        growing: patterns of names of files that were still being written, which no checksum can tell.
+    """
+
+    kind: str
+    folder: str
+    files: dict[str, tuple[int, str]]
+    growing: tuple[str, ...] = ()
+
+    @cached_property
+    def folders(self) -> set[str]:
+        """Folders that hold its files."""
+        return {"/".join(name.split("/")[:k]) for name in self.files for k in range(1, name.count("/") + 1)}
+
+    def write(self, folder: Path) -> None:
+        """Write it into its folder, whole or not at all.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        files = {name: {"size": size, "sha256": checksum} for name, (size, checksum) in self.files.items()}
+        document = {"torchid": self.kind, "folder": self.folder, "files": files, "growing": self.growing}
+        with whole_file(folder / MANIFEST, result=False) as new:
+            new.write_text(json.dumps(document, indent=1) + "\n")
+
+
+@dataclass
+class Contents:
+    """What is in a folder.
+
+    Attributes:
+        own: files as torchid wrote them, the manifest last.
+        folders: folders that hold them, the innermost first.
+        foreign: names of all others.
+        changed: names of files that torchid wrote and somebody changed since.
+        leftovers: what killed processes left of files they did not finish.
+    """
+
+    own: list[Path] = field(default_factory=list)
+    folders: list[Path] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
+    changed: list[str] = field(default_factory=list)
+    leftovers: list[Path] = field(default_factory=list)
+
+    def remove(self) -> None:
+        """Remove the own files, and the folders that are empty then; what the system does not let go stays."""
+        for path in self.leftovers:
+            remove_leftover(path)
+        for path in self.own:
+            with suppress(OSError):
+                path.unlink()
+        for path in self.folders:
+            with suppress(OSError):
+                path.rmdir()
+
+
+def manifest_of(folder: Path, kind: FolderKind, name: str, growing: Sequence[str] = ()) -> Manifest:
+    """The manifest of a folder that holds nothing but torchid's files.
+
+    Args:
+        folder: the folder.
+        kind: of it.
+        name: that it has or will have.
+        growing: patterns of files in it that are written on.
+    """
+    files = {
+        path.relative_to(folder).as_posix(): (path.stat().st_size, _checksum(path))
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path != folder / MANIFEST
+    }
+    return Manifest(kind.name, name, files, tuple(growing))
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """The manifest of a folder, None if it has none of torchid's."""
+    path = folder / MANIFEST
+    try:
+        state = os.lstat(path)
+        if not stat.S_ISREG(state.st_mode) or state.st_size > _LARGEST:
+            return None
+        document: Any = json.loads(path.read_bytes())
+        return Manifest(
+            str(document["torchid"]),
+            str(document["folder"]),
+            {str(name): (int(x["size"]), str(x["sha256"])) for name, x in document["files"].items()},
+            tuple(map(str, document["growing"])),
+        )
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ):  # anything may be in it
+        return None
+
+
+def inspect(folder: Path, kind: FolderKind, name: str | None = None) -> Contents | None:
+    """What in a folder torchid wrote and what it did not; no link is followed.
+
+    Args:
+        folder: the folder, not a link.
+        kind: of folder that it should be.
+        name: that it should have had from the start; None: any.
+
+    Returns:
+        None: no folder of this kind that torchid wrote.
+    """
+    manifest = read_manifest(folder)
+    if manifest is None or manifest.kind != kind.name or name not in (None, manifest.folder):
+        return None
+    found = Contents()
+    _look(folder, "", manifest, kind, found)
+    found.own.append(folder / MANIFEST)
+    found.folders.append(folder)
+    return found
+
+
+def _look(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: Contents) -> None:
+    """Add what is in the folder at a place below the top."""
+    for name, path in _entries(top / place):
+        inner = f"{place}/{name}" if place else name
+        mode = os.lstat(path).st_mode
+        if stat.S_ISDIR(mode):
+            _look_into(top, inner, manifest, kind, found)
+        elif inner in manifest.files and stat.S_ISREG(mode):
+            same = _is(path, *manifest.files[inner])
+            found.own.append(path) if same else found.changed.append(shown(inner))
+        elif stat.S_ISREG(mode) and not place and any(fnmatchcase(name, x) for x in manifest.growing):
+            found.own.append(path)
+        elif inner != MANIFEST:
+            found.foreign.append(shown(inner))
+
+
+def _look_into(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: Contents) -> None:
+    """Add a folder."""
+    path, above = top / place, place.rpartition("/")[0]
+    if is_leftover(path):
+        found.leftovers.append(path)
+    elif kind.of is not None and above == kind.within:
+        inside = inspect(path, kind.of, path.name)
+        if inside is None:
+            found.foreign.append(shown(f"{place}/"))
+            return
+        found.own += inside.own
+        found.folders += inside.folders
+        found.leftovers += inside.leftovers
+        found.foreign += [f"{place}/{name}" for name in inside.foreign]
+        found.changed += [f"{place}/{name}" for name in inside.changed]
+    elif place in manifest.folders or place == kind.within:
+        _look(top, place, manifest, kind, found)
+        found.folders.append(path)
+    else:
+        found.foreign.append(shown(f"{place}/"))
+
+
+def _entries(folder: Path) -> Iterator[tuple[str, Path]]:
+    for name in sorted(os.listdir(folder)):
+        yield name, folder / name
+
+
+def _is(path: Path, size: int, checksum: str) -> bool:
+    """Whether a file still is what was written."""
+    return path.stat().st_size == size and _checksum(path) == checksum
+
+
+def _checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    found = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            found.update(block)
+    return found.hexdigest()
