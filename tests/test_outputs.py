@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -248,11 +249,16 @@ def test_a_process_killed_at_any_step_loses_nothing_and_the_next_run_clears_what
         stop += 1
         place = tmp_path / str(stop)
         output = a_run(place / "run")
-        pid = os.fork()
-        if not pid:  # forked, as an interpreter takes a second to start
-            sys.argv = ["", str(stop), str(output)]
-            exec(_KILLED, {})
-            os._exit(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads, which the child does not use
+            pid = os.fork()  # an interpreter would take a second to start
+        if not pid:
+            try:
+                sys.argv = ["", str(stop), str(output)]
+                exec(_KILLED, {})
+                os._exit(0)
+            finally:
+                os._exit(1)
         ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         check_free(output, True)  # which clears what was left
         text = (output / "config.yaml").read_text()
