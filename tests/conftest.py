@@ -13,6 +13,7 @@ from demo import shortened_demo
 from hostile_commands import Commands, commands
 from synthetic import load
 
+import torchid
 from torchid.robot import Robot
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a run started in the background inherits one that is ignored
@@ -21,10 +22,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a run started in the
 @pytest.fixture(scope="session", autouse=True)
 def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Work in a folder of its own: results without an absolute path go to the working folder."""
-    before = Path.cwd()
-    os.chdir(tmp_path_factory.mktemp("work"))
-    yield
-    os.chdir(before)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setenv("PYTHONPATH", str(Path(torchid.__file__).parents[1]), os.pathsep)  # of child processes
+        monkeypatch.chdir(tmp_path_factory.mktemp("work"))
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,10 +21,11 @@ from refusals import refusal
 import torchid
 from torchid.cli import main
 from torchid.config import load_analysis, load_simulation
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, TorchidWarning
 from torchid.interrupts import ending_interrupts, interrupt_held_back
 from torchid.run.folder import EVALUATION, RUN, SIMULATION, TRAINING, check_free, new_folder, refuse_inputs, replaceable
 from torchid.run.manifest import MANIFEST, read_manifest
+from torchid.run.training import Training
 from torchid.staging import staging
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -247,11 +249,16 @@ def test_a_process_killed_at_any_step_loses_nothing_and_the_next_run_clears_what
         stop += 1
         place = tmp_path / str(stop)
         output = a_run(place / "run")
-        pid = os.fork()
-        if not pid:  # forked, as an interpreter takes a second to start
-            sys.argv = ["", str(stop), str(output)]
-            exec(_KILLED, {})
-            os._exit(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads, which the child does not use
+            pid = os.fork()  # an interpreter would take a second to start
+        if not pid:
+            try:
+                sys.argv = ["", str(stop), str(output)]
+                exec(_KILLED, {})
+                os._exit(0)
+            finally:
+                os._exit(1)
         ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         check_free(output, True)  # which clears what was left
         text = (output / "config.yaml").read_text()
@@ -366,11 +373,30 @@ def test_an_evaluation_somebody_wrote_in_is_not_replaced(copy: Path, place: Path
     assert "metrics.json, changed since" in refused(server, arguments, copy)
     write(copy, {"evaluation/sway_test/notes.txt": "mine"})
     assert "holds notes.txt, which torchid did not write" in refused(server, arguments, copy)
+    (copy / "evaluation").rename(copy.parent / "elsewhere")
+    (copy / "evaluation").symlink_to(copy.parent / "elsewhere")
+    assert "evaluation: output: a link; accepted: a folder" in refused(server, arguments, copy.parent)
 
 
-def test_a_training_that_goes_on_leaves_notes_beside_its_checkpoint(
-    place: Path, tmp_path: Path, server: Commands
-) -> None:
+def test_the_end_of_a_training_takes_and_removes_what_is_its_own(tmp_path: Path) -> None:
+    training = object.__new__(Training)
+    training.folder = tmp_path / "run.training"
+    with new_folder(training.folder, kind=TRAINING, growing=["checkpoint.pt", "events.out.tfevents.*.host.7.*"]) as new:
+        write(new, {"config.yaml": "old"})
+    own = {"checkpoint.pt": "x", "events.out.tfevents.1.host.7.0": "x"}
+    write(
+        training.folder,
+        own | {"notes.txt": "mine", "events.out.tfevents.mine": "mine", "more/checkpoint.pt": "mine"},
+    )
+    training.copy_curves(tmp_path)
+    assert [path.name for path in tmp_path.glob("events*")] == ["events.out.tfevents.1.host.7.0"]
+    with pytest.warns(TorchidWarning, match="run.training: stays: it holds what torchid did not write"):
+        training.forget()
+    left = {"notes.txt", "events.out.tfevents.mine", "more", "more/checkpoint.pt"}
+    assert set(everything(training.folder)) == left
+
+
+def test_a_training_does_not_begin_where_somebody_keeps_notes(place: Path, tmp_path: Path, server: Commands) -> None:
     output = tmp_path / "run"
     line = ["identify", str(place / "demo" / "quadruped.yaml"), f"output={output}",
             "estimator={name: sgd, training: {epochs: 3, checkpoint_seconds: 0}}"]  # fmt: skip
@@ -378,7 +404,12 @@ def test_a_training_that_goes_on_leaves_notes_beside_its_checkpoint(
         write(folder, {"config.yaml": "old"})
     write(tmp_path / "run.training", {"notes.txt": "mine", "events.out.tfevents.mine": "mine"})
     assert "events.out.tfevents.mine, notes.txt, which torchid did not write" in refused(server, line, tmp_path)
-    shutil.rmtree(tmp_path / "run.training")
+    (tmp_path / "run.training").rename(tmp_path / "elsewhere")
+    (tmp_path / "run.training").symlink_to(tmp_path / "elsewhere")
+    for more in ("overwrite=true", "--resume"):
+        assert "run.training: output: a link" in refused(server, [*line, more], tmp_path)
+    (tmp_path / "run.training").unlink()
+    shutil.rmtree(tmp_path / "elsewhere")
     assert server.run([*line, "--resume"]).status == 0
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 

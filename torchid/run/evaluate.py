@@ -13,7 +13,7 @@ from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.parameters_json import read_parameters, read_shared_extras
 from torchid.run.calibration import Calibration, errors
 from torchid.run.experiment import Experiment, set_up
-from torchid.run.folder import EVALUATION, check_free, new_folder, write_json
+from torchid.run.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import forces_of
@@ -44,7 +44,8 @@ def evaluate(
     again = [name for name in names if names.count(name) > 1]
     if again:
         raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
-    output = folder / "evaluation" / names[0]
+    output = folder / RUN.within / names[0]
+    refuse_link(output.parent)
     check_free(output, True, EVALUATION, logs)
     config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])
     with progress_bars() as bars:

@@ -85,6 +85,16 @@ def check_free_file(path: Path, field: str, overwrite: bool, inputs: Iterable[ob
             raise ConfigError(path, field, "is or belongs to what is read", "another file")
 
 
+def refuse_link(folder: Path) -> None:
+    """Make sure that a folder in which files are written and removed is none that lies elsewhere.
+
+    Raises:
+        ConfigError: it does.
+    """
+    if folder.is_symlink():
+        raise ConfigError(folder, "output", "a link", "a folder, or none")
+
+
 def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
     """Make sure that a folder which will be replaced or removed holds nothing that the command reads.
 

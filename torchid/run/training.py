@@ -29,7 +29,7 @@ from torchid.report.metrics import Metrics
 from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
 from torchid.run.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
-from torchid.run.folder import EVENTS, TRAINING, check_free, clear_leftovers, new_folder, refuse_inputs
+from torchid.run.folder import EVENTS, TRAINING, check_free, clear_leftovers, new_folder, refuse_inputs, refuse_link
 from torchid.run.manifest import Manifest, inspect, read_manifest
 
 Evaluate = Callable[[Array], Mapping[str, Metrics]]
@@ -56,6 +56,7 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
             found = f"{config.estimator.name}, which is done in one go"
             raise ConfigError(source, "--resume", found, "estimator.name: sgd, or no --resume")
         return
+    refuse_link(folder)
     clear_leftovers(folder, TRAINING)
     waiting = (folder / CHECKPOINT).is_file()
     if resume and not waiting:
