@@ -16,6 +16,7 @@ from torchid.estimators.conic import ConicProblem, Solution
 from torchid.estimators.formulate import Prior, conic_problem
 from torchid.estimators.least_squares import LeastSquares
 from torchid.estimators.result import BoundEstimate
+from torchid.estimators.vanishing import vanishing_ridge
 from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 
@@ -86,19 +87,25 @@ class Consistent:
             InputError: the conditions exclude each other, or a prior of matter starts from bodies that cannot exist.
         """
         plain = LeastSquares(self.ridge, self.rank_tolerance).solve(problem)
-        conic = conic_problem(problem, self.conditions, self.ridge, self.prior)
+        data = conic = conic_problem(problem, self.conditions, self.ridge, self.prior)
+        vanishing = None
+        if self.ridge == 0.0 and len(data.linear):
+            vanishing = vanishing_ridge(problem, self.conditions, self.prior, self.rank_tolerance)
+            conic = vanishing.conic
         solution = _solve(conic, self.method)
         certified_gap = None
         if self.certify:
             other = _solve(conic, "certified" if self.method == "barrier" else "barrier")
             compared = max(solution.objective, conic.floor)
             certified_gap = abs(other.objective - solution.objective) / compared
+        if vanishing is not None:
+            solution = vanishing.judged(solution, data)
         phi = problem.nominal.copy()
         phi[problem.free] += problem.scale[problem.free] * solution.x
         return ConsistentEstimate(
             **(vars(plain) | {"phi": phi, "cost": problem.cost(phi)}),
             objective=solution.objective,
-            unconstrained=conic.unconstrained,
+            unconstrained=data.unconstrained,
             distance=problem.distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, problem.scale),
             gap=solution.gap,
