@@ -107,7 +107,7 @@ def _relaxed(problem: ConicProblem, kappa: float) -> ConicProblem:
     return replace(
         problem,
         start=None,
-        root=np.sqrt(0.5 * kappa) * np.eye(n, n + 1),
+        root=np.sqrt(0.5 * kappa) * np.hstack([problem.deviations, np.zeros((n, 1))]),
         target=np.zeros(n),
         linear=np.eye(n + 1)[n],
         slopes=slopes,

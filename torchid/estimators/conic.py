@@ -57,6 +57,7 @@ class ConicProblem:
         E, e: (Q, n), (Q,), rows of E orthonormal.
         names: (K,) and then (M,): what each condition says, for messages.
         floor: > 0, an objective that is as good as none: below, gaps are relative to this.
+        deviations: (n, n): `deviations @ x` is what parameters deviate by from nominal, in units of their scale.
         start: (n,), a point that is known to be inside all conditions; None where they are not known to leave room.
     """
 
@@ -74,6 +75,7 @@ class ConicProblem:
     e: Array
     names: tuple[str, ...]
     floor: float
+    deviations: Array
     start: Array | None = None
 
     @property

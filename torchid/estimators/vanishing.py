@@ -17,9 +17,11 @@ from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
 
-_RIDGES = 10.0 ** -np.arange(2.0, 15.0, 2.0)  # of the least misfit without conditions, or of what is as good as none
-_SETTLED = 1e-7  # change of the misfit, relative, with a hundredth of the ridge, and
-_STAYS = 0.01  # of the prior: where parameters grow without bound it is a factor of four and more
+_RIDGES = 10.0 ** -np.arange(0.0, 15.0, 2.0)  # of the least misfit without conditions, or of what is as good as none
+_SETTLED = 1e-5  # change of the misfit, relative, to a hundredth of the ridge; what is left is a hundredth of it or less
+_STAYS = 0.01  # and of the prior: where parameters grow without bound it is a factor of two and more
+_BOUNDED = 0.5  # change of the prior up to which a path that rounding ends has come near its limit
+_EXACT = 1e-7  # excess of a misfit that counts as none, relative
 _NEAR = 1e-3  # excess over the least misfit without conditions, relative, at which these may cost nothing at all
 _INSIDE = 1e-6  # least slack of a point that shows that what the data determine leaves the conditions room
 _SEARCH = 60  # Newton steps for such a point: one that exists is found in 10 to 40
@@ -76,19 +78,23 @@ def vanishing_ridge(
     held = _Held.of(path, rank_tolerance)
     if (found := held.through(np.zeros(len(path.data.linear)))) is not None:
         return found
-    unit, steps = max(held.misfit, path.data.floor), list[_Step]()
+    unit, steps, searched = max(held.misfit, path.data.floor), list[_Step](), False
     for ridge in unit * _RIDGES:
         step = path.at(float(ridge))
         if step is None:
             break
         steps.append(step)
-        if (found := held.through(step.x)) is not None:
+        found = held.through(step.x)
+        if found is None and not searched and step.misfit - held.misfit <= _NEAR * unit:
+            found, searched = held.searched(), True
+        if found is not None:
             return found
-        if np.linalg.norm(step.x) > REACH:
+        if path.away(step) > REACH:
             break
-        if len(steps) > 1 and _settled(steps[-2], step, path.data.floor):
-            near = step.misfit - held.misfit <= _NEAR * unit
-            return (held.searched() if near else None) or Vanishing(step.conic)
+        if len(steps) > 1 and _change(steps) <= _SETTLED * max(step.misfit, path.data.floor) and _stays(steps, _STAYS):
+            return Vanishing(step.conic)
+    if len(steps) > 1 and _stays(steps, _BOUNDED):
+        return Vanishing(steps[-1].conic)  # as near to the limit as rounding allows
     return path.near_the_least(steps, held.rank)
 
 
@@ -122,6 +128,10 @@ class _Path:
         misfit = self.data.objective(x)
         return _Step(ridge, conic, x, misfit, (conic.objective(x) - misfit) / ridge)
 
+    def away(self, step: _Step) -> float:
+        """Distance from the nominal parameters, in units of their scale."""
+        return float(np.linalg.norm(self.data.deviations @ step.x))
+
     def prior_alone(self) -> ConicProblem:
         """The same conditions without data."""
         nothing = np.zeros((0, len(self.problem.nominal)))
@@ -154,7 +164,7 @@ class _Path:
                 break
             below, above = (step, above) if step.misfit <= target else (below, step)
         message = "estimator: with ridge 0 the misfit goes on falling while parameters that the data do not determine grow "
-        message += f"without bound ({np.linalg.norm(steps[-1].x):.0f} scales); taken is the least prior at the misfit "
+        message += f"without bound ({self.away(steps[-1]):.0f} scales); taken is the least prior at the misfit "
         message += f"expected of the true parameters, as with ridge {below.ridge:.1g}; accepted: a ridge"
         warnings.warn(message, NumericalWarning, stacklevel=6)
         return Vanishing(below.conic)
@@ -162,34 +172,35 @@ class _Path:
 
 @dataclass(frozen=True)
 class _Held:
-    """What the data determine held as least squares has it: `basis.T @ x == value`, (r, n) and (r,)."""
+    """The prior alone, with what the `data` determine, so many combinations as have `rank`, held at the least misfit."""
 
     conic: ConicProblem
-    basis: Array
-    value: Array
+    data: ConicProblem
     misfit: float
+    rank: int
 
     @classmethod
     def of(cls, path: _Path, rank_tolerance: float) -> _Held:
-        data = path.data
-        start = data.E.T @ data.e
-        U, values, right = np.linalg.svd(data.root @ data.moves, full_matrices=False)
-        tolerance = max(rank_tolerance, np.finfo(float).eps * max(data.root.shape, default=1))
+        plain = conic_problem(path.problem, path.conditions, 0.0, "euclidean")  # whose x is in units of the scale
+        start = plain.E.T @ plain.e
+        U, values, right = np.linalg.svd(plain.root @ plain.moves, full_matrices=False)
+        tolerance = max(rank_tolerance, np.finfo(float).eps * max(plain.root.shape, default=1))
         rank = int((values > tolerance * values.max(initial=0.0)).sum())
-        basis = data.moves @ right[:rank].T
-        value = U[:, :rank].T @ (data.target - data.root @ start) / values[:rank] + basis.T @ start
+        basis = plain.moves @ right[:rank].T
+        step = basis @ (U[:, :rank].T @ (plain.target - plain.root @ start) / values[:rank])
+        misfit = plain.objective(start + step)
         alone = path.prior_alone()
-        conic = replace(alone, E=np.vstack([alone.E, basis.T]), e=np.append(alone.e, value))
-        return cls(conic, basis, value, data.objective(conic.E.T @ conic.e))
-
-    @property
-    def rank(self) -> int:
-        return len(self.value)
+        rows = basis.T @ alone.deviations
+        size = np.linalg.norm(rows, axis=1)
+        orthonormal, triangle = np.linalg.qr(np.vstack([alone.E, rows / size[:, None]]).T)
+        e = np.linalg.solve(triangle.T, np.append(alone.e, basis.T @ (start + step) / size))
+        return cls(replace(alone, E=orthonormal.T, e=e), path.data, misfit, rank)
 
     def through(self, x: Array) -> Vanishing | None:
         """What is held, if the nearest point to x, (n,), that meets the equalities is inside the conditions."""
         nearest = x - self.conic.E.T @ (self.conic.E @ x - self.conic.e)
-        if self.conic.slack(nearest).min(initial=np.inf) <= _INSIDE:
+        exact = self.data.objective(nearest) - self.misfit <= _EXACT * max(self.misfit, self.data.floor)
+        if not exact or self.conic.slack(nearest).min(initial=np.inf) <= _INSIDE:
             return None
         return Vanishing(replace(self.conic, start=nearest), self.misfit)
 
@@ -201,6 +212,11 @@ class _Held:
             return None
 
 
-def _settled(before: _Step, after: _Step, floor: float) -> bool:
-    stays = abs(after.prior - before.prior) <= _STAYS * after.prior
-    return stays and before.misfit - after.misfit <= _SETTLED * max(after.misfit, floor)
+def _change(steps: list[_Step]) -> float:
+    """Of the misfit in the last step."""
+    return steps[-2].misfit - steps[-1].misfit
+
+
+def _stays(steps: list[_Step], share: float) -> bool:
+    """Whether the last step left the prior where it was."""
+    return abs(steps[-1].prior - steps[-2].prior) <= share * steps[-1].prior
