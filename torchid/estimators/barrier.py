@@ -22,6 +22,7 @@ _INSIDE = 1e-6  # least slack of a good starting point, _ROOM of any
 _ROOM = 1e-9
 _DEEP = 0.01  # and the most that is looked for
 _LOOSE = 1e-6  # relative gap worth a warning
+_SHORTEST = 1e-6  # step, as a share of what should stay inside, at which rounding rules
 
 
 def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
@@ -65,19 +66,23 @@ def _follow(problem: ConicProblem, tolerance: float) -> Solution:
     return best
 
 
-def interior(problem: ConicProblem) -> tuple[Array, int]:
+def interior(problem: ConicProblem, patience: int = _STEPS * _STAGES) -> tuple[Array, int]:
     """A strictly feasible x, near 0 if that is one, and the Newton steps it took to find.
 
+    Args:
+        problem: whose conditions.
+        patience: Newton steps after which the search is given up.
+
     Raises:
-        InputError: there is none.
+        InputError: there is none, or none was found.
     """
-    x = problem.E.T @ problem.e
+    x = problem.E.T @ problem.e if problem.start is None else problem.start
     worst = float(problem.slack(x).min(initial=np.inf))
     if worst > _INSIDE:
         return x, 0
     z, kappa, steps = np.append(x, 1.0 - worst), 1.0, 0
-    while kappa * (problem.degree + 1) > 0.1 * _ROOM:
-        point = _Path(_relaxed(problem, kappa)).centre(z, kappa)
+    while kappa * (problem.degree + 1) > 0.1 * _ROOM and steps < patience:
+        point = _Path(_relaxed(problem, kappa)).centre(z, kappa, patience - steps)
         z, steps = point.x, steps + point.steps
         if problem.slack(z[:-1]).min() > _INSIDE:
             return z[:-1], steps
@@ -101,7 +106,8 @@ def _relaxed(problem: ConicProblem, kappa: float) -> ConicProblem:
     variables = np.concatenate([problem.variables, np.full((blocks, 1), n)], axis=1)
     return replace(
         problem,
-        root=np.sqrt(0.5 * kappa) * np.eye(n, n + 1),
+        start=None,
+        root=np.sqrt(0.5 * kappa) * np.hstack([problem.deviations, np.zeros((n, 1))]),
         target=np.zeros(n),
         linear=np.eye(n + 1)[n],
         slopes=slopes,
@@ -133,17 +139,19 @@ class _Path:
         self.G, self.h = torch.from_numpy(problem.G), torch.from_numpy(problem.h)
         self.H, self.moves = torch.from_numpy(problem.hessian), torch.from_numpy(problem.moves)
 
-    def centre(self, start: Array, kappa: float) -> _Point:
+    def centre(self, start: Array, kappa: float, patience: int = _STEPS) -> _Point:
         """The point of the path at barrier weight `kappa`, from `start`, (n,), inside.
 
         The last step is a full one: with the multipliers that Newton's equations give it, the dual residual is zero.
         """
         x, weights = torch.from_numpy(start), self.weights + kappa
-        for steps in range(1, _STEPS + 1):
-            blocks = self.base + (x[self.variables, None, None] * self.slopes).sum(1)
-            slack = self.G @ x - self.h
+        factors = self._factors(x)
+        if factors is None:
+            raise np.linalg.LinAlgError("a starting point that rounding puts outside the conditions")
+        most = min(_STEPS, patience)
+        for steps in range(1, most + 1):
+            root, slack = factors
             smooth = torch.from_numpy(self.problem.gradient(x.numpy()))
-            root = torch.linalg.cholesky(blocks)
             half = torch.linalg.solve_triangular(root[:, None], self.slopes, upper=False)
             inside = torch.linalg.solve_triangular(root[:, None], half.mT, upper=False)  # (K, V, 4, 4), C^-1 E C^-T
             gradient, hessian = self._derivatives(smooth, inside, slack, weights, kappa)
@@ -151,18 +159,32 @@ class _Path:
             change = (move[self.variables, None, None] * inside).sum(1)  # of the blocks, relative
             growth = self.G @ move / slack
             decrement = float(-gradient @ move) / kappa
-            if decrement <= _CENTRED or steps == _STEPS:
+            if decrement <= _CENTRED or steps == most:
                 break
             rates = torch.cat([torch.linalg.eigvalsh(change).ravel(), growth]).numpy()
             shares = torch.cat([weights.repeat_interleave(4), torch.full_like(slack, kappa)]).numpy()
-            x = x + _length(float(smooth @ move), float(move @ self.H @ move), rates, shares) * move
-        if decrement <= _CENTRED:
+            length = _length(float(smooth @ move), float(move @ self.H @ move), rates, shares)
+            after = self._factors(x + length * move)
+            while after is None and length > _SHORTEST:  # rounding: the step's length keeps it inside
+                length *= 0.5
+                after = self._factors(x + length * move)
+            if after is None:
+                break
+            x, factors = x + length * move, after
+        if decrement <= _CENTRED and self._factors(x + move) is not None:
             x = x + move
         else:
             change, growth = torch.zeros_like(change), torch.zeros_like(growth)
         inverse = torch.linalg.solve_triangular(root, torch.eye(4, dtype=root.dtype), upper=False)
         Z = weights[:, None, None] * inverse.mT @ (torch.eye(4, dtype=root.dtype) - change) @ inverse
         return _Point(x.numpy(), Z.numpy(), (kappa / slack * (1.0 - growth)).numpy(), steps)
+
+    def _factors(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Cholesky factors (K, 4, 4) of the blocks and slacks (M,) of the rows; None outside."""
+        blocks = self.base + (x[self.variables, None, None] * self.slopes).sum(1)
+        root, failed = torch.linalg.cholesky_ex(blocks)
+        slack = self.G @ x - self.h
+        return None if failed.any() or not (slack > 0.0).all() else (root, slack)
 
     def _derivatives(
         self, smooth: Tensor, inside: Tensor, slack: Tensor, weights: Tensor, kappa: float

@@ -17,6 +17,7 @@ _LOOSE = 1e-6  # relative gap that is worth another try, and in the end a warnin
 _OUTSIDE = 1e-7  # how far conditions may be missed, in units of the scale; most solutions are within 1e-8
 _TRIES = ((1.0, 1.0), (0.1, 1.0), (0.01, 10.0), (10.0, 10.0), (0.1, 100.0), (100.0, 1000.0))
 """Units of the objective and of the tolerance: Clarabel stalls on one in 300 problems with an entropic prior."""
+_AGAIN = ((0.1, 1.0), (1.0, 1.0), (0.01, 10.0), (0.1, 100.0))  # units of the objective before anything is explained
 
 
 def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution:
@@ -29,10 +30,12 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
         NumericalWarning: the solver stopped short.
     """
     size = max(problem.constant, problem.floor, 10.0 * float(problem.weights.max(initial=0.0)))
+    whole = max(problem.constant + float(problem.target @ problem.target), size)
+    tries = [(unit * size, share) for unit, share in _TRIES] + [(unit * whole, share) for unit, share in _AGAIN]
     found, status = [], ""
-    for unit, share in _TRIES:
+    for unit, share in tries:
         try:
-            found.append(_solve(problem, unit * size, share * tolerance))
+            found.append(_solve(problem, unit, share * tolerance))
         except cp.SolverError as error:
             status = str(error)
             continue

@@ -13,7 +13,8 @@ from torchid.parameters import Array
 SAME = 1e-9
 """Numbers closer than this share of their scale are one."""
 
-_REACH = 1e3  # scales of the parameters: no better point is looked for further away, where the data say nothing
+REACH = 1e3
+"""Scales of the parameters: no better point is looked for further away, where the data say nothing."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ class ConicProblem:
         E, e: (Q, n), (Q,), rows of E orthonormal.
         names: (K,) and then (M,): what each condition says, for messages.
         floor: > 0, an objective that is as good as none: below, gaps are relative to this.
+        deviations: (n, n): `deviations @ x` is what parameters deviate by from nominal, in units of their scale.
+        start: (n,), a point that is known to be inside all conditions; None where they are not known to leave room.
     """
 
     root: Array
@@ -72,6 +75,8 @@ class ConicProblem:
     e: Array
     names: tuple[str, ...]
     floor: float
+    deviations: Array
+    start: Array | None = None
 
     @property
     def degree(self) -> int:
@@ -142,11 +147,11 @@ class ConicProblem:
         # A Newton step says what the quadratic and the log-determinants can take up of it, at least cost.
         values, vectors = np.linalg.eigh(self.moves.T @ hessian @ self.moves)
         modes = vectors.T @ (self.moves.T @ residual)
-        seen = np.abs(modes) <= 2.0 * _REACH * values
+        seen = np.abs(modes) <= 2.0 * REACH * values
         step = -self.moves @ (vectors[:, seen] @ (modes[seen] / np.maximum(values[seen], np.finfo(float).tiny)))
         taken = np.einsum("kv,kvij->kij", step[self.variables], turned)
         left = self.moves.T @ (residual + self.hessian @ step + self._gathered(taken))
-        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + _REACH * np.abs(left).sum()
+        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + REACH * np.abs(left).sum()
         products = blocks @ (Z - taken)
         gap += np.trace(products[~weighted], axis1=1, axis2=2).sum()
         weights = self.weights[weighted, None]

@@ -15,7 +15,8 @@ from torchid.estimators.conditions import Conditions, check_parameters
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.estimators.formulate import Prior, conic_problem
 from torchid.estimators.least_squares import LeastSquares
-from torchid.estimators.result import BoundEstimate
+from torchid.estimators.result import BoundEstimate, rounding_reported
+from torchid.estimators.vanishing import vanishing_ridge
 from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 
@@ -77,6 +78,7 @@ class Consistent:
             raise InputError("estimator", "certified", found, f"{install('certified')}, or barrier alone")
         LeastSquares(self.ridge, self.rank_tolerance)
 
+    @rounding_reported("consistent")
     def solve(self, problem: LinearProblem) -> ConsistentEstimate:
         """Fit the free parameters.
 
@@ -86,19 +88,25 @@ class Consistent:
             InputError: the conditions exclude each other, or a prior of matter starts from bodies that cannot exist.
         """
         plain = LeastSquares(self.ridge, self.rank_tolerance).solve(problem)
-        conic = conic_problem(problem, self.conditions, self.ridge, self.prior)
+        data = conic = conic_problem(problem, self.conditions, self.ridge, self.prior)
+        vanishing = None
+        if self.ridge == 0.0 and len(data.linear):
+            vanishing = vanishing_ridge(problem, self.conditions, self.prior, self.rank_tolerance)
+            conic = vanishing.conic
         solution = _solve(conic, self.method)
         certified_gap = None
         if self.certify:
             other = _solve(conic, "certified" if self.method == "barrier" else "barrier")
             compared = max(solution.objective, conic.floor)
             certified_gap = abs(other.objective - solution.objective) / compared
+        if vanishing is not None:
+            solution = vanishing.judged(solution, data)
         phi = problem.nominal.copy()
-        phi[problem.free] += problem.scale[problem.free] * solution.x
+        phi[problem.free] += problem.scale[problem.free] * (data.deviations @ solution.x)
         return ConsistentEstimate(
             **(vars(plain) | {"phi": phi, "cost": problem.cost(phi)}),
             objective=solution.objective,
-            unconstrained=conic.unconstrained,
+            unconstrained=data.unconstrained,
             distance=problem.distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, problem.scale),
             gap=solution.gap,
@@ -107,6 +115,7 @@ class Consistent:
         )
 
 
+@rounding_reported("projection")
 def project(
     phi: Array,
     scale: Array,
@@ -141,9 +150,10 @@ def project(
     nothing = np.zeros((0, phi.size))
     problem = LinearProblem(nothing, np.zeros(0), 0.0, 1, phi.flatten(), scale.flatten(), free.flatten())
     reference = None if nominal is None else nominal.flatten()
-    solution = _solve(conic_problem(problem, conditions, 1.0, prior, reference), method)
+    conic = conic_problem(problem, conditions, 1.0, prior, reference)
+    solution = _solve(conic, method)
     out = phi.copy()
-    out[free] += scale[free] * solution.x
+    out[free] += scale[free] * (conic.deviations @ solution.x)
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,7 +31,10 @@ class _Block:
 
 
 class _Variables:
-    """Which entry of x every free parameter is, and what the others are worth, all in units of their scale."""
+    """Which entry of x every free parameter is, and what the others are worth, all in units of their scale.
+
+    `deviations @ x` is the deviation of the free parameters from nominal, (n,).
+    """
 
     def __init__(self, problem: LinearProblem, conditions: Conditions) -> None:
         self.called = conditions.called
@@ -39,17 +43,27 @@ class _Variables:
         self.scale = problem.scale.reshape(-1, PER_BODY)
         self.nominal = problem.nominal.reshape(-1, PER_BODY) / self.scale
         self.bodies = [int(body) for body in problem.free_bodies()]
+        self.deviations = np.eye(self.count)
 
     def ten(self, body: int) -> np.ndarray:
         """Variables of a body's inertial parameters, (10,)."""
         return self.place[body, parameters.INERTIAL]
+
+    def measure(self, roots: Mapping[int, Array]) -> None:
+        """Measure deviations of bodies' pseudo-inertias by their roots, (4, 4): J = J_0 + L U L^T with x the numbers of U.
+
+        A prior of matter is then as stiff in all directions; in units of the scale it is 1e20 times stiffer across a
+        flat body than along, and rounding hides all else.
+        """
+        for body, root in roots.items():
+            self.deviations[np.ix_(self.ten(body), self.ten(body))] = parameters.change_of_frame(root)
 
     def row(self, body: int, weights: Array) -> tuple[Array, float]:
         """`weights @ phi` of a body, (12,), as a row on x and a constant."""
         scaled = weights * self.scale[body]
         row, free = np.zeros(self.count), self.free[body]
         row[self.place[body][free]] = scaled[free]
-        return row, float(scaled @ self.nominal[body])
+        return row @ self.deviations, float(scaled @ self.nominal[body])
 
 
 def conic_problem(
@@ -66,6 +80,10 @@ def conic_problem(
     """
     conditions.check_bodies(len(problem.nominal) // PER_BODY)
     x = _Variables(problem, conditions)
+    if prior != "euclidean":
+        measured = problem.nominal if reference is None else reference
+        scaled = measured.reshape(-1, PER_BODY) / x.scale
+        x.measure({body: _root(scaled[body], x.called(body), prior) for body in x.bodies})
     blocks = [_matter(x, body, conditions.margin) for body in x.bodies]
     enclosures = [enclosure for enclosure in conditions.enclosures if enclosure.body in x.bodies]
     blocks += [_ellipsoid(x, enclosure) for enclosure in enclosures if enclosure.kind == "ellipsoid"]
@@ -74,7 +92,7 @@ def conic_problem(
     rows = with_room([*_bounds(x, conditions), *sum(boxes, [])], E, e)
     weights, linear, pull = np.zeros(len(blocks)), np.zeros(x.count), np.eye(x.count)
     if prior == "pullback":
-        pull = _pull_back(x, problem.nominal if reference is None else reference)
+        pull = _pull_back(x)
     elif prior == "entropic":
         relative = [_relative(x, body) for body in x.bodies]
         for block in relative:
@@ -82,7 +100,7 @@ def conic_problem(
             linear[block.variables] = ridge * np.trace(block.slopes, axis1=1, axis2=2)
         blocks += relative
         weights = np.append(weights, np.full(len(relative), ridge))
-    root, target, unexplained = _compressed(problem, np.sqrt(ridge) * pull)
+    root, target, unexplained = _compressed(problem, x.deviations, np.sqrt(ridge) * pull)
     return ConicProblem(
         root=root,
         target=target,
@@ -98,13 +116,14 @@ def conic_problem(
         e=e,
         names=(*(block.name for block in blocks), *(row.name for row in rows)),
         floor=_floor(problem, ridge),
+        deviations=x.deviations,
     )
 
 
-def _compressed(problem: LinearProblem, pull: Array) -> tuple[Array, Array, float]:
+def _compressed(problem: LinearProblem, deviations: Array, pull: Array) -> tuple[Array, Array, float]:
     """Data and quadratic prior as ||root x - target||^2 + constant, with no more rows than columns."""
     free, rows = problem.free, max(problem.rows, 1)
-    A = problem.A[:, free] * problem.scale[free] / np.sqrt(rows)
+    A = (problem.A[:, free] * problem.scale[free]) @ deviations / np.sqrt(rows)
     b = (problem.b - problem.A @ problem.nominal) / np.sqrt(rows)
     right = np.concatenate([b, np.zeros(len(pull))])
     triangle = np.asarray(np.linalg.qr(np.column_stack([np.concatenate([A, pull]), right]), mode="r"))
@@ -122,7 +141,14 @@ def _floor(problem: LinearProblem, ridge: float) -> float:
 def _matter(x: _Variables, body: int, margin: float) -> _Block:
     """Scaled pseudo-inertia of a body, less the margin."""
     base = parameters.pseudo_inertia(x.nominal[body]) - margin * np.eye(4)
-    return _Block(f"pseudo-inertia of {x.called(body)}", base, parameters.PSEUDO_BASIS, x.ten(body))
+    return _block(x, f"pseudo-inertia of {x.called(body)}", body, base, parameters.PSEUDO_BASIS)
+
+
+def _block(x: _Variables, name: str, body: int, base: Array, slopes: Array) -> _Block:
+    """A block by its changes, (10, 4, 4), with a body's ten numbers in units of their scale."""
+    variables = x.ten(body)
+    by_variable = np.einsum("wv,wij->vij", x.deviations[np.ix_(variables, variables)], slopes)
+    return _Block(name, base, by_variable, variables)
 
 
 def _ellipsoid(x: _Variables, enclosure: Enclosure) -> _Block:
@@ -136,7 +162,7 @@ def _ellipsoid(x: _Variables, enclosure: Enclosure) -> _Block:
         slopes[number, :3, 3] = slopes[number, 3, :3] = column
     slopes /= mass
     base = np.einsum("v,vij->ij", x.nominal[body, parameters.INERTIAL], slopes)
-    return _Block(f"centre of mass of {x.called(body)}", base, slopes, x.ten(body))
+    return _block(x, f"centre of mass of {x.called(body)}", body, base, slopes)
 
 
 def _box(x: _Variables, enclosure: Enclosure) -> list[Row]:
@@ -158,8 +184,7 @@ def _bounds(x: _Variables, conditions: Conditions) -> list[Row]:
     out = []
     for bound, sign, word in ((lower, 1.0, "lower"), (upper, -1.0, "upper")):
         for body, number in zip(*np.nonzero(np.isfinite(bound) & x.free & ~_meet(x, lower, upper)), strict=True):
-            row = np.zeros(x.count)
-            row[x.place[body, number]] = sign
+            row = sign * x.deviations[x.place[body, number]]
             limit = sign * (bound[body, number] / x.scale[body, number] - x.nominal[body, number])
             out.append(Row(f"{word} bound of {parameters.PARAMETERS[number]} of {x.called(body)}", row, float(limit)))
     return out
@@ -192,32 +217,29 @@ def _equalities(x: _Variables, conditions: Conditions) -> tuple[Array, Array]:
         if least - most > SAME * scale:
             raise InputError("estimator", name, f"{least:g} above {most:g}", "a lower bound below the upper one")
         value = 0.5 * (least + most) / scale - x.nominal[body, number]
-        out.append(Row(name, np.eye(x.count)[x.place[body, number]], value))
+        out.append(Row(name, x.deviations[x.place[body, number]], value))
     return independent(out, x.count)
 
 
-def _pull_back(x: _Variables, reference: Array) -> Array:
-    """Root of the constant pull-back metric: per body J_0^-1/2 dJ J_0^-1/2, of friction the scaled deviation."""
-    scaled = reference.reshape(-1, PER_BODY) / x.scale
+def _pull_back(x: _Variables) -> Array:
+    """Root of the constant pull-back metric: per body U = J_0^-1/2 dJ J_0^-1/2, of friction the scaled deviation."""
     rows = [np.eye(x.count)[x.place[:, parameters.FRICTION][x.free[:, parameters.FRICTION]]]]
     for body in x.bodies:
         row = np.zeros((16, x.count))
-        row[:, x.ten(body)] = _whitened(scaled[body], x.called(body), "pullback").reshape(10, 16).T
+        row[:, x.ten(body)] = parameters.PSEUDO_BASIS.reshape(10, 16).T
         rows.append(row)
     return np.concatenate(rows)
 
 
 def _relative(x: _Variables, body: int) -> _Block:
     """J_0^-1/2 J J_0^-1/2 of a body."""
-    slopes = _whitened(x.nominal[body], x.called(body), "entropic")
-    return _Block(f"pseudo-inertia of {x.called(body)}", np.eye(4), slopes, x.ten(body))
+    return _Block(f"pseudo-inertia of {x.called(body)}", np.eye(4), parameters.PSEUDO_BASIS, x.ten(body))
 
 
-def _whitened(scaled: Array, called: str, prior: Prior) -> Array:
-    """L^-1 dJ L^-T for each of ten numbers, (10, 4, 4), of the pseudo-inertia J = L L^T of scaled parameters (12,)."""
+def _root(scaled: Array, called: str, prior: Prior) -> Array:
+    """L, (4, 4), of the pseudo-inertia J = L L^T of scaled parameters (12,)."""
     J = parameters.pseudo_inertia(scaled)
-    if np.linalg.eigvalsh(J)[0] <= 0.0:
+    if np.linalg.eigvalsh(J)[0] <= np.finfo(float).eps * np.trace(J):
         found = f"{prior}, but no density of matter has the parameters of {called} that it measures from"
         raise InputError("estimator", "prior", found, "euclidean, or bodies that can exist")
-    inverse = np.linalg.inv(np.linalg.cholesky(J))
-    return np.asarray(inverse @ parameters.PSEUDO_BASIS @ inverse.T)
+    return np.asarray(np.linalg.cholesky(J))

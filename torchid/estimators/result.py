@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from torchid.errors import InputError
 from torchid.parameters import Array
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
@@ -105,3 +109,18 @@ class BoundEstimate(Estimate):
     def relative_price(self) -> float | None:
         """The price as a share of the unconstrained objective; None where that is not known or 0."""
         return None if self.price is None or not self.unconstrained else self.price / self.unconstrained
+
+
+@contextmanager
+def rounding_reported(estimator: str) -> Iterator[None]:
+    """Run an estimator, whose linear algebra fails on numbers that no rounding allows for.
+
+    Raises:
+        InputError: it failed.
+    """
+    try:
+        yield
+    except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
+        found = f"{estimator} comes to no result: rounding hides it ({error})"
+        accepted = "a larger ridge, fewer free parameters, or nominal bodies of plausible masses and sizes"
+        raise InputError("estimator", "name", found, accepted) from error

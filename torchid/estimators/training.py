@@ -19,7 +19,7 @@ from torchid.estimators.learnable import FreeParameters, LearnableParameters, Lo
 from torchid.estimators.least_squares import LeastSquares
 from torchid.estimators.loss import Loss, Terms
 from torchid.estimators.optimizers import make_optimizer, make_schedule, step_schedule
-from torchid.estimators.result import BoundEstimate
+from torchid.estimators.result import BoundEstimate, rounding_reported
 from torchid.estimators.sgd import Sgd
 from torchid.parameters import Array
 from torchid.problem.batches import Batch, MiniBatches
@@ -79,6 +79,7 @@ class Trainer:
     new trainer.
     """
 
+    @rounding_reported("sgd")
     def __init__(
         self,
         settings: Sgd,
