@@ -145,7 +145,7 @@ class Disagreement:
 
 @one_thread()
 def disagreements(
-    parts: Sequence[Part], builder: RowBuilder, in_contact: Sequence[ExtraEstimate]
+    parts: Sequence[Part], builder: RowBuilder, in_contact: Sequence[ExtraEstimate], noise: float = 1.0
 ) -> list[Disagreement]:
     """Offsets whose readings in the air contradict all other rows, largest contradiction first.
 
@@ -153,6 +153,7 @@ def disagreements(
         parts: of the logs.
         builder: of their rows.
         in_contact: unknowns that a fit without the unloaded parts found.
+        noise: standard deviation of whitened rows, correlation counted.
     """
     out = []
     for source in dict.fromkeys(part.source for part in parts if part.unloaded):
@@ -163,12 +164,12 @@ def disagreements(
             if extra.what == "offset" and extra.contact is not None and offset is not None and column.any():
                 weight = float(column @ column)
                 read, scale = float(column @ R[:, -1].numpy()) / weight, own.get(("scale", extra.contact))
-                expected, variance = offset.value, offset.standard_error**2 + 1.0 / weight
+                expected, variance = offset.value, offset.standard_error**2 + noise**2 / weight
                 if scale is not None:
                     expected, variance = expected / (1.0 + scale.value), variance + (read * scale.standard_error) ** 2
                 out.append(Disagreement(extra, source, read, expected, float(np.sqrt(variance))))
-    noise = builder.sensors.noise.wrench
-    return sorted((x for x in out if x.matters(noise)), key=lambda x: -x.standard_errors)
+    sensors = builder.sensors.noise.wrench
+    return sorted((x for x in out if x.matters(sensors)), key=lambda x: -x.standard_errors)
 
 
 def _labels(found: Elimination) -> list[str]:

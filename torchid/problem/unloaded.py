@@ -31,8 +31,8 @@ class UnloadedChannel:
         scale: number of the channel's unknown scale, None if that is known.
         gated: whether readings in the air are exactly 0, as masked, clamped or missing ones are: no equation.
         mean: of the readings, outliers left out [N, N m].
-        deviation: standard deviation of the mean: of independent readings with the stated noise, or more if they change
-            more over longer spans of time.
+        deviation: standard deviation of the mean, that of independent readings with the stated noise, or more if they
+            scatter more, one by one or over longer spans of time.
     """
 
     offset: int
@@ -85,5 +85,5 @@ def _mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
     away = (y - y.median()).abs()
     y = y[away <= _OUTLYING * max(float(away.median()) / _NORMAL, noise)]
     batches = y[: len(y) // _BATCHES * _BATCHES].view(_BATCHES, -1).mean(1)
-    slow = float(batches.var()) / _BATCHES / oversampling
-    return float(y.mean()), max(noise**2 / len(y), slow) ** 0.5
+    seen = max(float(y.var()) / len(y), float(batches.var()) / _BATCHES) / oversampling
+    return float(y.mean()), max(noise**2 / len(y), seen) ** 0.5

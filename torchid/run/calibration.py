@@ -181,7 +181,8 @@ def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: ob
     assembly = assembled(on_ground, builder, scene.robot, settings, source)
     estimate = LeastSquares(settings.ridge, settings.rank_tolerance).solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, scene.robot.body_names, settings.rank_tolerance)
-    found = disagreements(fit.parts, builder, extras)
+    noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
+    found = disagreements(fit.parts, builder, extras, noise)
     for log in dict.fromkeys(x.log for x in found):
         own = [x for x in found if x.log == log]
         named = "; ".join(
