@@ -13,9 +13,13 @@ from torchid.estimators.result import Estimate
 from torchid.parameters import Array
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
+from torchid.problem.rows import RowBuilder
+from torchid.problem.streaming import Part, merged
 from torchid.problem.threads import one_thread
 
 _NAMED = 4  # parameters, at most, that a message names
+_CONTRADICTS = 5.0  # standard errors between a reading in the air and what the ground says of it; noise is seldom white
+_NOTICEABLE = 3.0  # standard deviations of the sensor's noise: what no single reading shows is not worth a word
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,65 @@ def _found(
         value, nominal = (float(x[k]) for x in values)
         out.append(ExtraEstimate(extra, found.log, value, nominal, error, inflation, mixed))
     return out
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """An offset that is one thing in the air and another on the ground.
+
+    Attributes:
+        extra: the offset.
+        log: in which.
+        in_the_air: what the sensor reads while nothing touches, in its unit.
+        in_contact: what it would read there with the offset, and scale, that suit the rest of the data best.
+        standard_error: of the difference.
+    """
+
+    extra: Extra
+    log: str
+    in_the_air: float
+    in_contact: float
+    standard_error: float
+
+    @property
+    def standard_errors(self) -> float:
+        """How many of them the two are apart."""
+        return abs(self.in_the_air - self.in_contact) / self.standard_error
+
+    def matters(self, noise: Array) -> bool:
+        """Whether the two contradict each other, beside the noise (6,) of contact sensors [N, N m]."""
+        axis = 0 if self.extra.contact is None else self.extra.contact[1]
+        apart = abs(self.in_the_air - self.in_contact)
+        return self.standard_errors > _CONTRADICTS and apart > _NOTICEABLE * float(noise[axis])
+
+
+@one_thread()
+def disagreements(
+    parts: Sequence[Part], builder: RowBuilder, in_contact: Sequence[ExtraEstimate], noise: float = 1.0
+) -> list[Disagreement]:
+    """Offsets whose readings in the air contradict all other rows, largest contradiction first.
+
+    Args:
+        parts: of the logs.
+        builder: of their rows.
+        in_contact: unknowns that a fit without the unloaded parts found.
+        noise: standard deviation of whitened rows, correlation counted.
+    """
+    out = []
+    for source in dict.fromkeys(part.source for part in parts if part.unloaded):
+        own = {(x.extra.what, x.extra.contact): x for x in in_contact if x.log in ("", source)}
+        R = merged((part.factor for part in parts if part.unloaded and part.source == source), builder).triangle()
+        for number, extra in enumerate(builder.extras, start=builder.columns.count):
+            column, offset = R[:, number].numpy(), own.get((extra.what, extra.contact))
+            if extra.what == "offset" and extra.contact is not None and offset is not None and column.any():
+                weight = float(column @ column)
+                read, scale = float(column @ R[:, -1].numpy()) / weight, own.get(("scale", extra.contact))
+                expected, variance = offset.value, offset.standard_error**2 + noise**2 / weight
+                if scale is not None:
+                    expected, variance = expected / (1.0 + scale.value), variance + (read * scale.standard_error) ** 2
+                out.append(Disagreement(extra, source, read, expected, float(np.sqrt(variance))))
+    sensors = builder.sensors.noise.wrench
+    return sorted((x for x in out if x.matters(sensors)), key=lambda x: -x.standard_errors)
 
 
 def _labels(found: Elimination) -> list[str]:

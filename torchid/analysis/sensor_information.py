@@ -16,6 +16,7 @@ from torchid.problem.chunks import by_state, spread_by_state
 from torchid.problem.measured import measured_components
 from torchid.problem.plan import State
 from torchid.problem.threads import one_thread
+from torchid.problem.unloaded import unloaded_channels
 
 SAMPLES = 2000
 """Whose rows stand for those of all, about."""
@@ -100,6 +101,9 @@ def sensor_information(
         for place, limb in enumerate(limbs, start=1 + len(joints)):
             C = units[(base + n + 6 * limb + np.flatnonzero(in_limbs[limb])).tolist()]
             total[place] += information_in(_span(C.expand(len(samples), *C.shape), W) @ K, weight)
+        for contact, H in _in_the_air(builder, samples, count):
+            total[0] += weight * H
+            total[first + contacts.index(contact)] += weight * H
         if any(state[contact] for contact in contacts):
             J = builder.contact_jacobian(samples.to(builder.device))
             for place, contact in enumerate(contacts, start=first):
@@ -115,6 +119,16 @@ def sensor_information(
         dict(zip(limbs, found[1 + len(joints) :], strict=False)),
         dict(zip(contacts, found[first:], strict=True)),
     )
+
+
+def _in_the_air(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
+    """Contacts, and the information (count, count) that their readings in the air hold on offsets."""
+    for channel in unloaded_channels(builder, samples):
+        if not channel.gated and (place := builder.extras[channel.offset].contact):
+            columns, row = channel.row(builder)
+            wide = row.new_zeros(count)
+            wide[list(columns)] = row[0, :-1]
+            yield place[0], torch.outer(wide, wide)
 
 
 def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State, float]]:

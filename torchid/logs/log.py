@@ -48,6 +48,8 @@ class Log:
         imu_angular_acceleration: (N, 3) [rad/s^2], in that frame.
         contact_share: (N, C), what the filter makes of a reading that is 1 while the contact is active and 0 else; None
             in a log that was not filtered, where it is `contact_active`. No part of a file.
+        contact_unloaded: (N, C, 6), as recorded even in a filtered log: what the sensors read in the air, NaN
+            elsewhere (see `unloaded_readings`); None where `preprocess` found no such sample. No part of a file.
         noise_bandwidth_hz: [Hz], up to where `preprocess` has left the sensors' noise white; None if it did not filter.
             No part of a file.
 
@@ -79,6 +81,7 @@ class Log:
     imu_angular_velocity: FloatArray | None = None
     imu_angular_acceleration: FloatArray | None = None
     contact_share: FloatArray | None = None
+    contact_unloaded: FloatArray | None = None
     noise_bandwidth_hz: float | None = None
 
     def __post_init__(self) -> None:
@@ -110,6 +113,7 @@ class Log:
     def select(self, index: slice | NDArray[np.intp] | BoolArray) -> Log:
         """The log of the chosen samples: a slice (no data is copied), sample numbers (M,) or a mask (N,)."""
         chosen: dict[str, Any] = {name: array[index] for name, array in self.arrays().items()}
-        if self.contact_share is not None:
-            chosen["contact_share"] = self.contact_share[index]
+        for name in ("contact_share", "contact_unloaded"):
+            if (array := getattr(self, name)) is not None:
+                chosen[name] = array[index]
         return dataclasses.replace(self, **chosen)

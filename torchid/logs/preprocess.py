@@ -16,6 +16,7 @@ from torchid.logs.measured import Coverage, carry_measured, check_coverage, cove
 from torchid.logs.plan import plan
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, sign_continuous
 from torchid.logs.timeline import Timeline
+from torchid.logs.transitions import unloaded_readings
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
 CHAINS = (
@@ -47,6 +48,7 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     while its contact is inactive, and a torque or wrench channel that is NaN in some samples becomes NaN throughout.
     In a filtered log a contact is active from 1/cutoff_hz before it truly is until 1/cutoff_hz after, for the filter
     spreads its force that far: to project out a force that is 0 costs data, to overlook one that is not costs truth.
+    What a contact's sensor reads while nothing touches, its offset, is kept as recorded (`contact_unloaded`).
 
     Args:
         log: the log.
@@ -111,6 +113,8 @@ def on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) 
         if timeline.low_pass is not None or timeline.output is not None:
             share = log.contact_active if log.contact_share is None else log.contact_share
             fields["contact_share"] = timeline.evaluate(timeline.smooth(share.astype(np.float64)), (0,))[0]
+    if (readings := unloaded_readings(log)) is not None:
+        fields["contact_unloaded"] = timeline.held(readings)
     if timeline.bandwidth_hz is not None:
         fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
     return dataclasses.replace(log, **fields)

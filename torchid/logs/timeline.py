@@ -115,6 +115,14 @@ class Timeline:
             return [smoothed[self.kept], *rest]
         return spline_derivatives(self.grid, smoothed, self.at, orders)
 
+    def held(self, values: FloatArray) -> FloatArray:
+        """Values (N, ...) as recorded, at the output's stamps (K, ...): each holds until the next sample."""
+        if self.keeps_stamps:
+            return values[self.kept]
+        slack = JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
+        last = np.searchsorted(self.native, self.at + slack, side="right") - 1
+        return values[np.maximum(last, 0)]
+
     def active(self, flags: BoolArray) -> BoolArray:
         """Flags (N, ...) at the output's stamps (K, ...): true where they are within `reach` of the stamp.
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
 from torchid.logs.fields import FloatArray
+from torchid.logs.transitions import unloaded_readings
 from torchid.problem.base_motion import BaseMotion, base_motion
 from torchid.problem.measured import read_components
 from torchid.regressor.motion import GRAVITY_WORLD, Motion, rotation_matrix
@@ -41,6 +42,8 @@ class Samples:
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
         share: (N, C), what is left of a constant contact reading, as `Log.contact_share`; None where it is `active`.
+        unloaded: (N, C, 6), what the contacts' sensors read in the air, NaN elsewhere, as `Log.contact_unloaded`; None
+            where there is no such reading.
         folder: on whose disk the tensors of a log larger than memory lie, None for one in memory.
     """
 
@@ -56,6 +59,7 @@ class Samples:
     active: Tensor
     oversampling: float = 1.0
     share: Tensor | None = None
+    unloaded: Tensor | None = None
     folder: Path | None = None
 
     def __len__(self) -> int:
@@ -142,6 +146,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
         accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
         raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
     wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    in_the_air = unloaded_readings(log) if contacts else None
     samples = Samples(
         log.source,
         torch.from_numpy(log.time),
@@ -155,6 +160,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
         torch.from_numpy(active),
         oversampling(log.time, log.noise_bandwidth_hz),
         None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
+        None if in_the_air is None else torch.from_numpy(_columns(in_the_air, chosen)),
     )
     if required is not None:
         _check_limbs(log, robot, required)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 
@@ -19,20 +19,28 @@ from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
 from torchid.problem.triangular import TriangularFactor
+from torchid.problem.unloaded import unloaded_channels
 from torchid.problem.workspace import Workspace
 from torchid.robot import Robot
 
 Weighing = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
+_Key = tuple[str, State, bool]
 
 
 @dataclass
 class Part:
-    """What is kept of the samples of one log, by its source, in one contact state."""
+    """What is kept of the samples of one log, by its source, in one contact state.
+
+    Equations of sensors whose contact is in the air are in a part of their own, `unloaded`, which counts no samples;
+    `gated`: numbers, among the extras, of the offsets that have none because the readings there are exactly 0.
+    """
 
     source: str
     state: State
     factor: TriangularFactor
     samples: int
+    unloaded: bool = False
+    gated: set[int] = field(default_factory=set)
 
 
 def compress(
@@ -71,8 +79,9 @@ def compress_parts(
 ) -> list[Part]:
     """As `compress`, but with a factor for every contact state in every log, in the order of the logs.
 
-    Logs of one source count as one. `weigh` may change rows before they are added: called with the samples they come
-    from, their columns and themselves.
+    Logs of one source count as one. Unknown offsets of contact sensors have further parts: readings in the air.
+    `weigh` may change other rows before they are added: called with the samples they come from, their columns and
+    themselves.
     """
     fold = partial(_fold, builder, by_log=True, weigh=weigh)
     parts = _together(over_chunks(logs, builder, fold, chunk, threads, progress))
@@ -84,27 +93,40 @@ def _fold(
     builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weigh: Weighing | None = None
 ) -> list[Part]:
     """Parts of some chunks, all logs together unless `by_log`."""
-    parts: dict[tuple[str, State], Part] = {}
+    parts: dict[_Key, Part] = {}
     workspace = Workspace()
-    for samples, state in chunks:
-        key = samples.source if by_log else "", state
+
+    def part(source: str, state: State, unloaded: bool) -> Part:
+        key = source, state, unloaded
         if key not in parts:
-            parts[key] = Part(*key, TriangularFactor(builder.width), 0)
-        parts[key].samples += len(samples)
+            parts[key] = Part(source, state, TriangularFactor(builder.width), 0, unloaded)
+        return parts[key]
+
+    for samples, state in chunks:
+        source = samples.source if by_log else ""
+        own = part(source, state, False)
+        own.samples += len(samples)
         for support, rows in builder.rows(samples, state, workspace):
             weighed = rows if weigh is None else weigh(samples, support, rows)
-            parts[key].factor.add(support, weighed, samples.oversampling)
+            own.factor.add(support, weighed, samples.oversampling)
+        for channel in unloaded_channels(builder, samples):
+            of_air = part(source, state, by_log)
+            if channel.gated:
+                of_air.gated.add(channel.offset)
+            else:
+                of_air.factor.add(*channel.row(builder), samples.oversampling)
     return list(parts.values())
 
 
 @one_thread()
 def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
     """The parts that workers have made of their chunks."""
-    total: dict[tuple[str, State], Part] = {}
+    total: dict[_Key, Part] = {}
     for part in chain.from_iterable(of_workers):
-        same = total.setdefault((part.source, part.state), part)
+        same = total.setdefault((part.source, part.state, part.unloaded), part)
         if same is not part:
             same.samples += part.samples
+            same.gated |= part.gated
             same.factor.merge(part.factor)
     return list(total.values())
 

@@ -53,6 +53,13 @@ class TriangularFactor:
         for support, block in other._blocks.items():
             self._absorb(support, block)
 
+    def times(self, factor: float) -> TriangularFactor:
+        """The factor of the same rows, larger by a factor."""
+        out = TriangularFactor(self.columns)
+        out.rows, out.independent_rows = self.rows, self.independent_rows
+        out._blocks = {support: factor * block for support, block in self._blocks.items()}
+        return out
+
     def triangle(self) -> Tensor:
         """Upper triangular R, (columns + 1, columns + 1), float64 on the CPU."""
         total = torch.zeros(self.columns + 1, self.columns + 1, dtype=torch.float64)

@@ -10,8 +10,9 @@ from functools import cached_property
 import numpy as np
 from torch import Tensor
 
-from torchid.analysis.calibration import ExtraEstimate
+from torchid.analysis.calibration import ExtraEstimate, disagreements, estimate_extras
 from torchid.errors import ConfoundedWarning, LogError, TorchidWarning
+from torchid.estimators import LeastSquares
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.calibrate import calibrated
@@ -20,7 +21,9 @@ from torchid.problem.extras import Extra
 from torchid.problem.samples import check_forces
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import Evaluation, Metrics
+from torchid.run.estimation import assembled
 from torchid.run.experiment import Scene
+from torchid.run.fit import Fit
 from torchid.run.robust import loss_of, robust_unknowns
 from torchid.sensing import SensorSet
 from torchid.text import listed
@@ -157,6 +160,39 @@ def warn_of_confounded(found: Sequence[ExtraEstimate], source: object) -> None:
             message = f"{log or source}: {named} cannot be told from {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
             warnings.warn(f"{message}; {advice}", ConfoundedWarning, stacklevel=3)
+
+
+def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: object) -> None:
+    """Name contact sensors whose readings in the air say nothing of their offsets, or contradict the rest of the data.
+
+    Warns:
+        TorchidWarning: one for each log that has some of the one or the other.
+    """
+    on_ground = [part for part in fit.parts if not part.unloaded]
+    if len(on_ground) == len(fit.parts):
+        return
+    for log in dict.fromkeys(part.source for part in fit.parts):
+        gated = {number for part in fit.parts if part.source == log for number in part.gated}
+        if gated:
+            named = _grouped(builder.extras[number].label for number in sorted(gated))
+            message = f"{log}: in the air, the readings with the {named} are exactly 0, as if masked or clamped"
+            warnings.warn(f"{message}; they say nothing of these offsets", TorchidWarning, stacklevel=3)
+    settings = scene.config.estimator
+    assembly = assembled(on_ground, builder, scene.robot, settings, source)
+    estimate = LeastSquares(settings.ridge, settings.rank_tolerance).solve(assembly.problem)
+    extras = estimate_extras(assembly, estimate, scene.robot.body_names, settings.rank_tolerance)
+    noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
+    found = disagreements(fit.parts, builder, extras, noise)
+    for log in dict.fromkeys(x.log for x in found):
+        own = [x for x in found if x.log == log]
+        named = "; ".join(
+            f"{x.extra.name} {x.extra.component} reads {x.in_the_air:.4g} {x.extra.unit} in the air, where "
+            f"{x.in_contact:.4g} +- {x.standard_error:.2g} suits the rest of the data"
+            for x in own[:_NAMED]
+        )
+        more = f"; and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
+        advice = "look for drift, a gain, cross talk, wrong contact_active, or noise in the base's motion"
+        warnings.warn(f"{log}: {named}{more}; {advice}", TorchidWarning, stacklevel=3)
 
 
 def _grouped(labels: Iterable[str]) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from torch import Tensor
 
 from torchid.analysis.calibration import ExtraEstimate, estimate_extras
-from torchid.estimators import Estimate
+from torchid.estimators import Estimate, LeastSquares
 from torchid.problem import LinearProblem, RowBuilder
 from torchid.problem.elimination import Assembly
 from torchid.problem.streaming import Part
@@ -51,6 +51,20 @@ def fitted(
     """
     settings, robot = scene.config.estimator, scene.robot
     assembly = assembled(parts, builder, robot, settings, source)
+    if any(part.unloaded for part in parts):
+        first = LeastSquares(settings.ridge, settings.rank_tolerance).solve(assembly.problem)
+        parts = [_with_own_noise(part, first.residual_std) for part in parts]
+        assembly = assembled(parts, builder, robot, settings, source)
     estimate = solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, robot.body_names, settings.rank_tolerance)
     return Fit(parts, assembly, estimate, extras)
+
+
+def _with_own_noise(part: Part, residual_std: float) -> Part:
+    """A part whose readings in the air keep the noise that they show, where all others have more than is stated.
+
+    What accelerations and models get wrong on the ground says nothing of a sensor that nothing touches.
+    """
+    if not part.unloaded or residual_std <= 1.0:
+        return part
+    return replace(part, factor=part.factor.times(residual_std))

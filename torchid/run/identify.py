@@ -24,7 +24,7 @@ from torchid.problem.plan import State, state_name
 from torchid.problem.states import check_base, state_reports
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
-from torchid.run.calibration import Calibration, errors, warn_of_confounded
+from torchid.run.calibration import Calibration, errors, warn_of_confounded, warn_of_disagreement
 from torchid.run.claim import claimed
 from torchid.run.estimation import assembled, batch_estimator, stated_conditions
 from torchid.run.experiment import Experiment, set_up
@@ -100,6 +100,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             estimate, problem = fit.estimate, fit.assembly.problem
             _check_sense(estimate, source)
             warn_of_confounded(fit.extras, source)
+            warn_of_disagreement(fit, experiment, builder, source)
         with clock("identifiability"):
             alone = _by_state(experiment, builder, fit.parts, source)
             adds = _contributions(experiment, builder, fit.parts, logs["train"], problem, bars)

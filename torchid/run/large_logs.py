@@ -23,7 +23,7 @@ from torchid.logs.preprocess import differentiates, gapless_fields, on_timeline,
 from torchid.logs.spill import Spill
 from torchid.logs.spline import BLOCK
 from torchid.logs.timeline import Timeline
-from torchid.logs.transitions import away_from_changes
+from torchid.logs.transitions import away_from_changes, unloaded, unloaded_readings
 from torchid.problem import Samples, bind
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.samples import check_forces, oversampling
@@ -68,10 +68,14 @@ class LargeLog:
             timeline = timeline_of(blocks.source, blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
             coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
             time = blocks.time if timeline is None else blocks.time[0] + timeline.at
-            kept = self._away_from_changes(blocks, first, time)
+            contacts = self._contacts(blocks, first)
+            kept = None if contacts is None else self._away_from_changes(contacts, time)
+            in_the_air = None if contacts is None else _in_the_air(contacts)
             stored = _Stored(blocks.source, self.folder)
             for piece in self._pieces(blocks, len(time)):
-                samples = self._bound(_preprocessed(blocks, piece, timeline, coverage), piece)
+                samples = self._bound(_preprocessed(blocks, piece, timeline, coverage, in_the_air), piece)
+                if in_the_air is None:
+                    samples = replace(samples, unloaded=None)
                 stored.add(samples, None if kept is None else np.flatnonzero(kept[piece]))
             bandwidth = None if timeline is None else timeline.bandwidth_hz
             return stored.samples(samples, oversampling(time, bandwidth))
@@ -94,18 +98,21 @@ class LargeLog:
             check_coverage(first, name, coverage)
         return found
 
-    def _away_from_changes(self, blocks: Blocks, first: Log, time: FloatArray) -> BoolArray | None:
-        """Which samples are further than the margin from changes of contact, None for all."""
-        margin = self.settings.contact_margin_s
-        if margin is None or first.contact_active is None:
+    def _contacts(self, blocks: Blocks, first: Log) -> Log | None:
+        """The log with nothing but the contacts' flags, which takes a pass over it; None if there are none."""
+        if first.contact_active is None:
             return None
         flags = [
             blocks.read(piece, only=("contact_active",)).contact_active for piece in self._pieces(blocks, len(blocks))
         ]
         nothing = np.empty((len(blocks), 0))
         active = np.concatenate([x for x in flags if x is not None])
-        log = Log(blocks.source, blocks.time, (), nothing, contact_names=first.contact_names, contact_active=active)
-        return away_from_changes(log, time, margin)
+        return Log(blocks.source, blocks.time, (), nothing, contact_names=first.contact_names, contact_active=active)
+
+    def _away_from_changes(self, contacts: Log, time: FloatArray) -> BoolArray | None:
+        """Which samples are further than the margin from changes of contact, None for all."""
+        margin = self.settings.contact_margin_s
+        return None if margin is None else away_from_changes(contacts, time, margin)
 
     def _bound(self, log: Log, piece: slice) -> Samples:
         """The samples of a part; errors count from the beginning."""
@@ -118,12 +125,27 @@ class LargeLog:
         return samples
 
 
-def _preprocessed(blocks: Blocks, piece: slice, timeline: Timeline | None, coverage: Mapping[str, Coverage]) -> Log:
+def _in_the_air(contacts: Log) -> BoolArray | None:
+    """Which contacts are in the air for sure in which samples of the log, None if none ever is."""
+    if contacts.contact_active is None:
+        return None
+    found = unloaded(contacts.time, contacts.contact_active)
+    return found if found.any() else None
+
+
+def _preprocessed(
+    blocks: Blocks,
+    piece: slice,
+    timeline: Timeline | None,
+    coverage: Mapping[str, Coverage],
+    in_the_air: BoolArray | None,
+) -> Log:
     """A part of the preprocessed log."""
-    if timeline is None:
-        return blocks.read(piece)
-    samples, part = timeline.part(piece.start, piece.stop)
-    return on_timeline(blocks.read(samples), part, coverage)
+    samples, part = (piece, None) if timeline is None else timeline.part(piece.start, piece.stop)
+    log = blocks.read(samples)
+    if in_the_air is not None:
+        log = replace(log, contact_unloaded=unloaded_readings(log, in_the_air[samples]))
+    return log if part is None else on_timeline(log, part, coverage)
 
 
 class _Stored:
