@@ -9,7 +9,7 @@ import numpy as np
 from torchid.errors import InputError
 from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped
 from torchid.hygiene.mistakes import mistakes
-from torchid.hygiene.model import TRIED, ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
+from torchid.hygiene.model import DIFFERENTIATED_TO_TRY, TRIED, ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES, FloatArray
 from torchid.robot import Robot
@@ -63,7 +63,7 @@ def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: floa
         if not _may_explain(mistake.field, fit):
             continue
         try:
-            samples = bound(filtered(mistake.mended(log), cutoff), robot, contacts, TRIED)
+            samples = bound(filtered(mistake.mended(log), cutoff, DIFFERENTIATED_TO_TRY), robot, contacts, TRIED)
         except InputError:  # a mended log may be too fast for the filter: then that was not the mistake
             continue
         found = model_fit(samples, robot, contacts).misfit
