@@ -139,10 +139,9 @@ def _feet(case: Case) -> Log | None:
 
 def _joints(case: Case) -> Log | None:
     """Left for right; of an arm, which has no sides, two neighbours."""
-    log = case.log
-    order = [0, 2, 1, *range(3, len(log.joint_names))] if case.machine.bolted else _swapped(log.joint_names)
-    torque = None if log.joint_torque is None else log.joint_torque[:, order]
-    return replace(log, joint_position=log.joint_position[:, order], joint_torque=torque)
+    names = case.log.joint_names
+    order = [0, 2, 1, *range(3, len(names))] if case.machine.bolted else _swapped(names)
+    return replace(case.log, joint_names=tuple(names[place] for place in order))
 
 
 def _rates(case: Case) -> Log | None:
@@ -219,17 +218,17 @@ MISTAKES = (
     Mistake("wrenches world for local", _in_world, "contact_wrench", "axes"),
     Mistake("wrenches about another point", _elsewhere, "contact_wrench", "point"),
     Mistake("wrenches moment first", _moment_first, "contact_wrench", "moment.* first"),
-    Mistake("contact flags left for right", _flags, "contact_active", "other|swap|force without contact"),
-    Mistake("feet left for right", _feet, "contact", "other|swap"),
-    Mistake("joints swapped", _joints, "joint_names|joint_position", "other|swap|order"),
+    Mistake("contact flags left for right", _flags, "contact_", "exchanged|force without contact"),
+    Mistake("feet left for right", _feet, "contact_", "exchanged"),
+    Mistake("joints swapped", _joints, "joint_names", "exchanged"),
     Mistake("positions in degrees", _scaled("joint_position", 180.0 / np.pi), "joint_position", "degrees"),
     Mistake("velocities in deg/s", _rates, "joint_velocity", "degrees"),
     Mistake("world downward", _world_downward, "base_quat", "down"),
     Mistake("quaternion w first for last", _quaternion(lambda q: np.roll(q, 1, axis=1)), "base_quat", "w first"),
     Mistake("quaternion w last for first", _quaternion(lambda q: np.roll(q, -1, axis=1)), "base_quat", "w first"),
     Mistake("quaternion inverse", _quaternion(lambda q: q * [-1, -1, -1, 1]), "base_quat", "world to base"),
-    Mistake("time x 2", _time(2.0), "time", "times|unit|scale"),
-    Mistake("time in minutes", _time(1.0 / 60.0), "time", "minutes|unit|scale"),
+    Mistake("time x 2", _time(2.0), "time", "unit"),
+    Mistake("time in minutes", _time(1.0 / 60.0), "time", "minutes"),
     Mistake("base velocity base for world", _base_velocity, "base_linear_velocity", "frame"),
     Mistake("acceleration with gravity", _gravity, "base_linear_acceleration", "gravity"),
     Mistake("accelerometer reversed", _imu, "imu_specific_force", "revers"),

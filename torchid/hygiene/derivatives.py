@@ -53,7 +53,7 @@ def judged(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -
     lost = ~follows & np.isfinite(found.correlation)
     named = np.zeros(len(channels), bool)
     for ratio, meaning in (LENGTHS if name.startswith("base_linear") else ANGLES).items():
-        here = follows & (np.abs(found.ratio / ratio - 1.0) < _CLOSE)
+        here = follows & (np.abs(found.ratio / ratio - 1.0) < _CLOSE) & ~named
         if here.any():
             named |= here
             text = f"{found.ratio[here][0]:.4g} times the derivative of {base}: {meaning.format(base=base)}"

@@ -92,6 +92,11 @@ class ModelFit:
         return max((part for part in (self.base_force, self.base_moment) if part is not None), default=None)
 
     @property
+    def known(self) -> tuple[bool, ...]:
+        """Which of torques, base force and base moment could be compared."""
+        return tuple(part is not None for part in (self.torque, self.base_force, self.base_moment))
+
+    @property
     def misfit(self) -> float:
         """Rms of all that there are."""
         known = [x for x in (self.of_torques, self.base_force, self.base_moment) if x is not None]
