@@ -228,7 +228,7 @@ MISTAKES = (
     Mistake("quaternion w last for first", _quaternion(lambda q: np.roll(q, -1, axis=1)), "base_quat", "w first"),
     Mistake("quaternion inverse", _quaternion(lambda q: q * [-1, -1, -1, 1]), "base_quat", "world to base"),
     Mistake("time x 2", _time(2.0), "time", "unit"),
-    Mistake("time in minutes", _time(1.0 / 60.0), "time", "minutes"),
+    Mistake("time in minutes", _time(1.0 / 60.0), "time|velocity", "minutes"),
     Mistake("base velocity base for world", _base_velocity, "base_linear_velocity", "frame"),
     Mistake("acceleration with gravity", _gravity, "base_linear_acceleration", "gravity"),
     Mistake("accelerometer reversed", _imu, "imu_specific_force", "revers"),

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchid.errors import InputError
 from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding
-from torchid.hygiene.scales import Gains, gains, motion_cutoff, stretch
+from torchid.hygiene.scales import Gains, Stretch, gains, motion_cutoff, stretch
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES, BoolArray, FloatArray
 from torchid.problem import Samples
@@ -34,18 +34,27 @@ SAME = 0.5
 _KNOWN, _ENOUGH = 0.1, 3
 
 
-def time_finding(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Finding | None:
-    """That time is in another unit, if gravity and inertia only make up the forces in that unit."""
+def time_fit(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Stretch | None:
+    """What time is worth by the forces; None where nothing moves, or the log is too short."""
     cutoff = motion_cutoff(log)
-    if cutoff is None:
-        return None
     try:
-        found = stretch(log, robot, contacts, cutoff)
-    except InputError:  # too short for a filter, or too fast
+        return None if cutoff is None else stretch(log, robot, contacts, cutoff)
+    except InputError:
+        return None
+
+
+def time_finding(found: Stretch | None) -> Finding | None:
+    """That time is in another unit, if gravity and inertia only make up the forces in that unit.
+
+    Noise in positions makes accelerations that no force answers to, which looks like time that is too short: so inertia
+    must matter at the mended time.
+    """
+    if found is None:
         return None
     factor, log_factor = found.factor, np.log(found.factor)
     agree = np.log(found.blocks) * np.sign(log_factor) > SAME * abs(log_factor)
-    if abs(log_factor) < np.log(STRETCHED) or not agree.all() or found.recorded < WORSE * found.mended:
+    other = min(found.recorded, found.still)
+    if abs(log_factor) < np.log(STRETCHED) or not agree.all() or other < WORSE * found.mended:
         return None
     unit = next((name for size, name in UNITS.items() if abs(factor / size - 1.0) < _UNIT_WITHIN), None)
     text = f"in {unit}: " if unit else ""

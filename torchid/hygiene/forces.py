@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from torchid.errors import InputError
-from torchid.hygiene.factors import factor_findings, time_finding
+from torchid.hygiene.factors import factor_findings, time_finding, time_fit
 from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped
 from torchid.hygiene.mistakes import mistakes
 from torchid.hygiene.model import DIFFERENTIATED_TO_TRY, TRIED, ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
@@ -19,6 +19,9 @@ from torchid.text import listed
 
 #: Misfit above which usual mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
 WRONG = 0.4
+#: What no URDF near the given one explains, in `UNMODELLED` of the forces, below which there is nothing to complain of:
+#: moments about the base of a robot that stands are small, so that a centre of mass 1 cm off is a large share of them.
+NEAR = 1.0
 #: Share of the misfit that a mistake must leave to be the explanation; of 1 at most, which no forces at all leave: what
 #: is far too large fits better by any factor that makes it small.
 BETTER = 0.5
@@ -38,8 +41,8 @@ def forces(
     cutoff = cutoff_hz or usual_cutoff(log)
     try:
         logs = filtered(log, cutoff)
-    except InputError as error:
-        yield Skipped(_NAME, f"{error.field}: {error.found}")
+    except InputError as error:  # too short, or too fast: by its stamps
+        yield time_finding(time_fit(log, robot, contacts)) or Skipped(_NAME, f"{error.field}: {error.found}")
         return
     try:
         samples = bound(logs, robot, contacts)
@@ -51,9 +54,9 @@ def forces(
         return
     fit = model_fit(samples, robot, contacts)
     wrong = _explained(log, robot, contacts, cutoff, fit) if fit.misfit > WRONG else None
-    if wrong is None:
-        wrong = time_finding(log, robot, contacts)
-    if wrong is None and fit.misfit > WRONG:
+    timed = time_fit(log, robot, contacts) if wrong is None else None
+    wrong = wrong or time_finding(timed)
+    if wrong is None and fit.misfit > WRONG and (timed is None or timed.recorded > NEAR):
         text = f"{_apart(fit)}, and no usual mistake explains it"
         advice = "look at units, frames, the order of joints and contacts, friction, the URDF's base link and masses"
         wrong = Finding("forces", SUSPICIOUS, "all", text, advice)

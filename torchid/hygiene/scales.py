@@ -35,12 +35,17 @@ _GAIN, _POINT = 0.5, 0.3
 
 @dataclass(frozen=True)
 class Stretch:
-    """What time should be multiplied by: of all samples, of each block, and what is left unexplained with and without."""
+    """What time should be multiplied by, of all samples and of each block, and what stays unexplained.
+
+    `mended`, `recorded`, `still`: rms of what no URDF near the given one explains, in `UNMODELLED` of the forces, with
+    time so multiplied, as it is, and if nothing moved.
+    """
 
     factor: float
     blocks: FloatArray
     mended: float
     recorded: float
+    still: float
 
 
 def stretched(log: Log, factor: float) -> Log:
@@ -112,8 +117,8 @@ def _best(found: Terms) -> Stretch:
     every = cost(None)
     blocks = np.array([_STRETCHES[np.argmin(cost(block))] for block in range(BLOCKS)])
     best, one = int(np.argmin(every)), int(np.argmin(np.abs(np.log(_STRETCHES))))
-    mended, recorded = (float(np.sqrt(max(every[i], 0.0) / max(found.rows, 1))) for i in (best, one))
-    return Stretch(float(_STRETCHES[best]), blocks, mended, recorded)
+    left = np.sqrt(np.maximum(every, 0.0) / max(found.rows, 1))
+    return Stretch(float(_STRETCHES[best]), blocks, *(float(left[i]) for i in (best, one, -1)))
 
 
 @dataclass(frozen=True, eq=False)
