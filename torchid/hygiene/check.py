@@ -17,6 +17,7 @@ from torchid.hygiene.missing import absurd, missing
 from torchid.hygiene.repair import condemned, repaired
 from torchid.hygiene.spikes import spikes
 from torchid.hygiene.stamps import stamps
+from torchid.hygiene.standing import standing
 from torchid.hygiene.touching import touching, without_offsets
 from torchid.hygiene.turning import turning
 from torchid.hygiene.weight import accelerometer, weight
@@ -103,6 +104,8 @@ def check(
     mended = repaired(log, _findings(found))
     if (lost := _lost(found)) is None or lost.field != "time":
         found += [*derivatives(mended), *turning(mended, robot), *accelerometer(mended, robot)]
+    if _lost(found) is None:
+        found += standing(mended, robot, contacts)
     lost = _lost(found)
     if lost is None:
         found += forces(without_offsets(mended), robot, contacts, cutoff_hz)

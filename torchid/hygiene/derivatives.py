@@ -28,6 +28,8 @@ WRONG, BETTER = 0.15, 0.3
 ANGLES = {-1.0: "the sign is reversed", 180.0 / np.pi: "it is in degrees", np.pi / 180.0: "{base} is in degrees"}
 LENGTHS = {-1.0: "the sign is reversed", 1e3: "it is in mm", 1e-3: "{base} is in mm"}
 _CLOSE = 0.15
+#: Ratio of every derivative where time is in minutes: 5 % from that of degrees.
+MINUTES = 1.0 / 60.0
 _TINY = 1e-300
 _NAME = "velocities and accelerations against positions"
 
@@ -51,11 +53,12 @@ def judged(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -
     """Findings about one derivative, given with the names of its channels."""
     follows = np.abs(found.correlation) >= FOLLOWS  # so written, NaN does not follow
     lost = ~follows & np.isfinite(found.correlation)
-    named = np.zeros(len(channels), bool)
-    for ratio, meaning in (LENGTHS if name.startswith("base_linear") else ANGLES).items():
-        here = follows & (np.abs(found.ratio / ratio - 1.0) < _CLOSE)
+    meanings = {**(LENGTHS if name.startswith("base_linear") else ANGLES), MINUTES: "time is in minutes"}
+    away = np.array([np.abs(found.ratio / ratio - 1.0) for ratio in meanings])  # (meanings, c)
+    named = follows & (away.min(axis=0) < _CLOSE)
+    for number, (ratio, meaning) in enumerate(meanings.items()):
+        here = named & (away.argmin(axis=0) == number)
         if here.any():
-            named |= here
             text = f"{found.ratio[here][0]:.4g} times the derivative of {base}: {meaning.format(base=base)}"
             yield _finding("unit or sign", CONDEMNED, name, channels, here, text, "convert it, or leave the field out")
     off = follows & ~named & (np.abs(found.ratio - 1.0) > RATIO)

@@ -11,15 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.hygiene.angles import TWO_TURNS
+from torchid.hygiene.exchanges import exchanges, neighbours
 from torchid.hygiene.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES
-from torchid.logs.quaternion import inverse, sign_continuous
+from torchid.logs.quaternion import compose, inverse, sign_continuous
 from torchid.text import listed
 
 #: What follows from positions and orientation, whoever gives it.
 _JOINT_RATES = ("joint_velocity", "joint_acceleration")
 _BASE_RATES = ("base_angular_velocity_base", "base_angular_acceleration_base")
+#: What is given along the world's axes, and what half a turn about x makes of such a vector.
+_WORLD = (
+    "base_position_world",
+    "base_linear_velocity_world",
+    "base_linear_acceleration_world",
+    "contact_wrench_world",
+)
+_HALF_TURN = np.array([1.0, -1.0, -1.0])
 _MOMENTS_IN_MILLI = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 
 
@@ -45,11 +54,17 @@ def mistakes(log: Log) -> Iterator[Mistake]:
     if 0 < len(far) < len(log.joint_names):
         some = f"{listed([log.joint_names[joint] for joint in far])} in degrees"
         yield Mistake("joint_position", some, "convert to radians", lambda log: _in_degrees(log, far))
+    yield from _of_orders(log)
     if log.base_quat_xyzw is not None:
+        down, up = "in a world whose z axis points down", "turn positions, orientations and vectors so that z points up"
+        yield Mistake("base_quat_xyzw", down, up, turned_over)
         order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, -1, axis=1)))
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, 1, axis=1)))
         yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _quaternions(inverse))
+    if log.imu_specific_force is not None:
+        given = "reversed: gravity minus acceleration"
+        yield Mistake("imu_specific_force", given, "reverse it: it points up at rest", _scaled("imu_specific_force", -1.0))
     if log.joint_torque is not None:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
         yield Mistake("joint_torque", "all reversed", reverse, _scaled("joint_torque", -1.0))
@@ -60,6 +75,40 @@ def mistakes(log: Log) -> Iterator[Mistake]:
             yield from _of_wrenches(field, other)
 
 
+def _of_orders(log: Log) -> Iterator[Mistake]:
+    """Names of joints and contacts exchanged, flags that belong to other contacts."""
+    for what, other in (*exchanges(log.joint_names), *neighbours(log.joint_names)):
+        text, advice = f"{what} exchanged", "give joint_names in the order of the columns"
+        yield Mistake("joint_names", text, advice, _renamed("joint_names", other))
+    for what, other in exchanges(log.contact_names):
+        order = [log.contact_names.index(name) for name in other]
+        text = f"{what} exchanged"
+        advice = "give contact_names in the order of the columns"
+        yield Mistake("contact_names", text, advice, _renamed("contact_names", other))
+        flags = _reordered(("contact_active",), order)
+        yield Mistake("contact_active", text, "give the flags in the order of contact_names", flags)
+
+
+def _renamed(field: str, names: tuple[str, ...]) -> Callable[[Log], Log]:
+    return _change(lambda _: {field: names})
+
+
+def _reordered(fields: Sequence[str], order: list[int]) -> Callable[[Log], Log]:
+    return _change(lambda log: {field: getattr(log, field)[:, order] for field in fields})
+
+
+def turned_over(log: Log) -> Log:
+    """The log in a world half a turn about x from the one that it has."""
+    half = np.array([1.0, 0.0, 0.0, 0.0])
+    fields: dict[str, Any] = {}
+    if log.base_quat_xyzw is not None:
+        fields["base_quat_xyzw"] = compose(half, log.base_quat_xyzw)
+    for name in _WORLD:
+        if (given := getattr(log, name)) is not None:
+            fields[name] = given * (_HALF_TURN if given.shape[-1] == 3 else np.tile(_HALF_TURN, 2))
+    return dataclasses.replace(log, **fields)
+
+
 def _of_wrenches(field: str, other: str) -> Iterator[Mistake]:
     reverse = "reverse it: wrenches are what the ground exerts on the robot"
     yield Mistake(field, "all reversed", reverse, _scaled(field, -1.0))
@@ -67,6 +116,8 @@ def _of_wrenches(field: str, other: str) -> Iterator[Mistake]:
         yield Mistake(field, f"in {unit}", f"multiply by {factor:g}", _scaled(field, factor))
     moments = _change(lambda log: {field: getattr(log, field) * _MOMENTS_IN_MILLI})
     yield Mistake(field, "moments in N mm", "multiply moments by 0.001", moments)
+    first = _change(lambda log: {field: np.roll(getattr(log, field), 3, axis=2)})
+    yield Mistake(field, "with the moment first", "give the force first, then the moment", first)
     axes = "along the world's axes" if other == WRENCHES[1] else "along the contact frames' axes"
     moved = _change(lambda log: {other: getattr(log, field), field: None})
     yield Mistake(field, axes, f"call it {other}", moved)

@@ -23,6 +23,8 @@ from torchid.sensing import Contact, SensorSet, named_sensors
 DIFFERENTIATED, PIECES = 40000, 4
 #: Of these, evenly spread ones are compared; fewer to see which of many mistakes explains what does not fit.
 COMPARED, TRIED = 800, 150
+#: Of a long log, as many samples are differentiated to try a mistake.
+DIFFERENTIATED_TO_TRY = 10000
 #: Cutoff [Hz] where nobody asked for one: robots move below 5 Hz. At most this share of the sample rate.
 CUTOFF, _OF_RATE = 10.0, 0.2
 #: How much larger a torque's own part in the projected forces must be than what the model leaves of these, for its sign
@@ -90,6 +92,11 @@ class ModelFit:
         return max((part for part in (self.base_force, self.base_moment) if part is not None), default=None)
 
     @property
+    def known(self) -> tuple[bool, ...]:
+        """Which of torques, base force and base moment could be compared."""
+        return tuple(part is not None for part in (self.torque, self.base_force, self.base_moment))
+
+    @property
     def misfit(self) -> float:
         """Rms of all that there are."""
         known = [x for x in (self.of_torques, self.base_force, self.base_moment) if x is not None]
@@ -106,14 +113,14 @@ def usual_cutoff(log: Log) -> float:
     return min(CUTOFF, _OF_RATE / median_step(log))
 
 
-def filtered(log: Log, cutoff_hz: float) -> list[Log]:
-    """The log with velocities and accelerations; of a long one, runs of samples from all over it.
+def filtered(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) -> list[Log]:
+    """The log with velocities and accelerations; of one longer than `most`, runs of samples from all over it.
 
     Raises:
         InputError: the log cannot be filtered.
     """
-    count = 1 if len(log) <= DIFFERENTIATED else PIECES
-    length = min(len(log), DIFFERENTIATED) // count
+    count = 1 if len(log) <= most else PIECES
+    length = min(len(log), most) // count
     starts = np.linspace(0, len(log) - length, count).astype(int)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # of what findings say better

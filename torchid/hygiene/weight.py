@@ -113,12 +113,16 @@ def _in_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
 
 
 def accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
-    """Findings about the IMU's specific force."""
+    """Findings about the IMU's specific force, at rest; its direction also on average over a long log."""
     if log.imu_specific_force is None:
         return
     still = at_rest(log)
-    if still.sum() < 10:
+    rests = still.sum() >= 10
+    if not rests:
         yield Skipped(_IMU, f"the robot never rests for {_REST:g} s")
+        if log.base_quat_xyzw is None or log.time[-1] - log.time[0] < _LONG:
+            return
+        yield from _tilt(log, robot, np.ones(len(log), bool), "on average")
         return
     mean = log.imu_specific_force[still].mean(axis=0)
     size = float(np.linalg.norm(mean))
@@ -131,27 +135,47 @@ def accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     elif abs(size / GRAVITY - 1.0) > _ACCELEROMETER:
         yield Finding("gravity", SUSPICIOUS, name, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
     if size > 0.5 * GRAVITY or abs(size - 1.0) < 0.1:
-        yield from _tilt(log, robot, still)
+        yield from _tilt(log, robot, still, "at rest")
 
 
-def _tilt(log: Log, robot: Robot | None, still: BoolArray) -> Iterator[Finding | Skipped]:
+def _tilt(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterator[Finding | Skipped]:
     """Whether gravity points where the base's orientation says."""
     if log.base_quat_xyzw is None or log.imu_specific_force is None:
         return
     if robot is None or robot.links.get(log.imu_frame, (1, None))[0] != 0:
         yield Skipped("gravity against orientation", "no robot that says where the IMU is on the base")
         return
-    T_base_imu = robot.links[log.imu_frame][1]
-    world = rotate(log.base_quat_xyzw[still], log.imu_specific_force[still] @ T_base_imu[:3, :3].T)
-    up = world.mean(axis=0)
+    in_base = log.imu_specific_force[still] @ robot.links[log.imu_frame][1][:3, :3].T
+    up = rotate(log.base_quat_xyzw[still], in_base).mean(axis=0)
     angle = float(np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1.0, 1.0))))
-    if angle > 90.0:
-        text = f"{angle:.0f} degrees from up at rest"
-        advice = (
-            "reverse it if it is gravity minus acceleration; else look at the IMU's frame and the quaternion's order"
-        )
-        yield Finding("gravity", CONDEMNED, "imu_specific_force", text, advice)
-    elif angle > _TILT:
-        text = f"{angle:.1f} degrees from up at rest, by base_quat"
-        advice = "look at the IMU's frame in the URDF and the order of the quaternion"
-        yield Finding("gravity", SUSPICIOUS, "imu_specific_force", text, advice)
+    name, text = "imu_specific_force", f"{angle:.3g} degrees from up {when}, by base_quat"
+    if angle <= 90.0:
+        if angle > _TILT:
+            advice = "look at the IMU's frame in the URDF and the order of the quaternion"
+            yield Finding("gravity", SUSPICIOUS, name, text, advice)
+        return
+    above = _above_feet(log.select(np.flatnonzero(still)), robot, in_base)
+    if above is None or above < 0.0:
+        below = "" if above is None else ", and the base hangs below the feet that carry it"
+        advice = "reverse it if it is gravity minus acceleration; else look at the IMU's frame and the quaternion's order"
+        yield Finding("gravity", CONDEMNED, name, f"{text}{below}: reversed?", advice)
+    else:
+        text = f"the accelerometer reads {text}, and the base is above the feet that carry it: a world whose z axis points down?"
+        advice = "turn the world so that z points up; else look at the order of the quaternion"
+        yield Finding("gravity", CONDEMNED, "base_quat_xyzw", text, advice)
+
+
+def _above_feet(log: Log, robot: Robot, upward: FloatArray) -> float | None:
+    """Mean height [m] of the base's origin above the active contacts, up being along vectors (N, 3) of the base."""
+    if log.contact_active is None or set(log.joint_names) != set(robot.joint_names):
+        return None
+    known = [index for index, name in enumerate(log.contact_names) if name in robot.links]
+    some = np.linspace(0, len(log) - 1, min(_POSES, len(log))).astype(int)
+    order = [log.joint_names.index(name) for name in robot.joint_names]
+    poses = robot.link_poses(torch.from_numpy(log.joint_position[some][:, order]))
+    mean = upward.mean(axis=0)
+    heights = [
+        -(poses[log.contact_names[index]][:, :3, 3].numpy() @ mean)[log.contact_active[some, index]] for index in known
+    ]
+    found = np.concatenate(heights) if heights else np.zeros(0)
+    return float(found.mean() / np.linalg.norm(mean)) if len(found) else None

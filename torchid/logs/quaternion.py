@@ -38,6 +38,13 @@ def inverse(quat_xyzw: FloatArray) -> FloatArray:
     return quat_xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
+def compose(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The rotations (N, 4) by `second` and then by `first`, unit quaternions (N, 4) or (4,)."""
+    v, w, v2, w2 = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
+    scalar = w * w2 - np.sum(v * v2, axis=-1, keepdims=True)
+    return np.concatenate([w * v2 + w2 * v + np.cross(v, v2), scalar], axis=-1)
+
+
 def rotate_back(quat_xyzw: FloatArray, vector_world: FloatArray) -> FloatArray:
     """Components (N, 3) in the base frame of vectors (N, 3) given in the world, for unit quaternions (N, 4)."""
     return rotate(inverse(quat_xyzw), vector_world)
