@@ -42,16 +42,16 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "ASGD": Method({"lr": 1.0}),
-    "Adadelta": Method({"lr": 10.0}),
-    "Adafactor": Method({"lr": 0.05}),
+    "Adadelta": Method({"lr": 30.0}),
+    "Adafactor": Method({"lr": 0.1, "eps": (None, 1.0)}),  # steps count in units of the second, not of parameters
     "Adagrad": Method({"lr": 0.5}),
     "Adam": Method({"lr": 0.05}),
     "AdamW": Method({"lr": 0.05}),
-    "Adamax": Method({"lr": 0.1}),
+    "Adamax": Method({"lr": 0.3}),
     "LBFGS": Method({"line_search_fn": "strong_wolfe"}, whole=True),
-    "NAdam": Method({"lr": 0.05}),
-    "RAdam": Method({"lr": 0.1}),
-    "RMSprop": Method({"lr": 0.02}),
+    "NAdam": Method({"lr": 0.1}),
+    "RAdam": Method({"lr": 0.3}),
+    "RMSprop": Method({"lr": 0.05}),
     "Rprop": Method({"lr": 0.05}, whole=True),
     "SGD": Method({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
 }

@@ -100,7 +100,8 @@ def residual_effect(
     with loss.evaluating(), torch.no_grad():
         gradient, square = _correlation(loss, batches)
         rms, shares = _by_group(loss.residual, loss.learnable().cpu().numpy(), batches)
-    lacking = np.linalg.lstsq(problem.A.T, gradient, rcond=None)[0]  # A^T lacking = sum of K^T W W^T r
+    free = problem.free
+    lacking = np.linalg.lstsq(problem.A[:, free].T, gradient[free], rcond=None)[0]  # A^T lacking = K^T W W^T r, summed
     plain, rest = (estimator.solve(x) for x in (problem, replace(problem, b=problem.b - lacking)))
     moved = rest.phi - plain.phi
     with np.errstate(divide="ignore", invalid="ignore"):

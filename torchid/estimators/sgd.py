@@ -27,8 +27,8 @@ class Sgd:
         consistency: "log_cholesky", every step's parameters are physical; "penalties", steps are pulled there.
         margin: least eigenvalue of every body's scaled pseudo-inertia, kept or aimed at.
         penalties: their weights, with "penalties".
-        optimizer, optimizer_options: a class of `torch.optim`, one of `optimizer_names()`, and what it takes; what is not
-            given is as in `METHODS`.
+        optimizer, optimizer_options: one of `optimizer_names()`, classes of `torch.optim`, and what it takes; what is
+            not given is as in `METHODS`.
         schedule, schedule_options: a class of `torch.optim.lr_scheduler`, stepped once per epoch; None for none.
         epochs: passes over the logs, at most.
         patience: epochs without a better loss on the held-out logs after which to stop; None: never.

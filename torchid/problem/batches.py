@@ -98,7 +98,7 @@ class MiniBatches:
         return [self.of(piece) for piece in pieces if len(piece)]
 
     def hold_out(self, count: int, every: int) -> tuple[MiniBatches, list[MiniBatches]]:
-        """All samples but some of about `count` blocks, and these: one, drawn by the seed, of `every` successive ones."""
+        """All samples but some of about `count` blocks, and these: of every so many, one that the seed draws."""
         blocks, generator = self.blocks(count), self._generator(-1)
         held_out = [
             start + int(torch.randint(every, (), generator=generator))
