@@ -52,7 +52,7 @@ METHODS: dict[str, Method] = {
     "NAdam": Method({"lr": 0.1}),
     "RAdam": Method({"lr": 0.3}),
     "RMSprop": Method({"lr": 0.05}),
-    "Rprop": Method({"lr": 0.05}, whole=True),
+    "Rprop": Method({"lr": 0.2}, whole=True),
     "SGD": Method({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
 }
 """The optimizers that come near the closed form; docs/estimators.md says how near."""
