@@ -3,12 +3,14 @@
     python scripts/train_residual.py                                     # on the log that comes with torchid
     python scripts/train_residual.py my.yaml estimator.friction=false    # yours; friction is left to the network
 
-The logs under `test` are only looked at in the end. Curves go to TensorBoard: `tensorboard --logdir runs/residual`.
+How strongly the networks are held back is chosen by held-out blocks of the training logs, unless --weight says it. The
+logs under `test` are only looked at in the end. Curves go to TensorBoard: `tensorboard --logdir runs/residual`.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -21,7 +23,7 @@ import torchid
 from torchid.cli import guarded
 from torchid.config import load_config
 from torchid.errors import ConfigError
-from torchid.estimators import Sgd, Trainer
+from torchid.estimators import ResidualEffect, Sgd, Trainer
 from torchid.problem import MiniBatches
 from torchid.report.tensorboard import RunEvents
 from torchid.run.experiment import set_up
@@ -55,6 +57,7 @@ def main() -> int:
     parser.add_argument("overrides", nargs="*", help="key.subkey=value")
     parser.add_argument("--mode", choices=["joint", "parameters_first", "alternating"], default="joint")
     parser.add_argument("--epochs", type=int, default=100, help="passes over the training logs")
+    parser.add_argument("--weight", type=float, help="of the networks' force in the loss; chosen if not given")
     parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="folder for TensorBoard")
     options = parser.parse_args()
     return guarded("train_residual", lambda: compare(options))
@@ -71,7 +74,13 @@ def compare(options: argparse.Namespace) -> None:
     reader = LogReader(experiment)
     train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))
     problem = torchid.linear_problem(torchid.compress(train, builder), builder, robot, config.estimator.friction)
-    settings = Sgd(ridge=config.estimator.ridge, epochs=options.epochs, residual=options.mode, residual_lr=0.01)
+    settings = Sgd(
+        ridge=config.estimator.ridge,
+        epochs=options.epochs,
+        residual=options.mode,
+        residual_lr=0.01,
+        residual_weight=options.weight,
+    )
     torch.manual_seed(0)
 
     table = Table(title="rms of the projected residual, in standard deviations of the stated sensor noise")
@@ -87,6 +96,25 @@ def compare(options: argparse.Namespace) -> None:
         shares = (f"{100.0 * epoch.shares.get(of, 0.0):.3g} %" for of in ("rigid_body", "residual"))
         table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)
     Console(width=100).print(table)
+    print_effect(trainer.estimate().residual, robot.body_names)
+
+
+def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
+    """Say what the networks took of the force, and from which bodies."""
+    if effect is None:
+        return
+    if effect.choice is not None:
+        losses = ", ".join(
+            f"{x:.4g} with {w:g}" for w, x in zip(effect.choice.candidates, effect.choice.losses, strict=True)
+        )
+        print(f"residual weight {effect.weight:g}: held-out loss {effect.choice.alone:.4g} without networks, {losses}")
+        print(f"  (the largest within one standard error, {effect.choice.standard_error:.2g}, of the least)")
+    for name, share in effect.shares.items():
+        print(f"{name.replace('_', ' ')}: the networks give {100.0 * share:.3g} %, rms {effect.rms[name]:.3g}")
+    print(f"of the networks' force rigid bodies could give {100.0 * effect.rigid_share:.3g} %")
+    most = sorted(zip(effect.moved_scaled, effect.moved_errors, bodies, strict=True), reverse=True)[:3]
+    moved = (f"{body} ({scaled:.2g} of its size, {errors:.2g} standard errors)" for scaled, errors, body in most)
+    print(f"parameters moved most: {', '.join(moved)}")
 
 
 if __name__ == "__main__":

@@ -18,9 +18,10 @@ from hostile_settings import DOCUMENTS
 from matplotlib.figure import Figure
 
 from torchid.cli import main
+from torchid.estimators.state import check_alike
 from torchid.report.parameters_json import read_parameters
 from torchid.robot import load_robot
-from torchid.run.checkpoint import CHECKPOINT, check_alike, load_checkpoint
+from torchid.run.checkpoint import CHECKPOINT, load_checkpoint
 
 FIGURES = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
 SGD = "estimator={name: sgd, ridge: 0.001, training: {epochs: 2}}"

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from test_training import demo
 from torch.optim import Optimizer, lr_scheduler
 from torch.optim.lr_scheduler import LRScheduler
 
 from torchid.errors import InputError, UnknownNameError
-from torchid.estimators import Sgd
+from torchid.estimators import Sgd, Trainer
 from torchid.estimators.optimizers import (
     make_optimizer,
     make_schedule,
@@ -21,7 +22,8 @@ from torchid.estimators.optimizers import (
     step_schedule,
 )
 
-NOT_OURS = {"SparseAdam": "does not support dense gradients", "Muon": "only supports 2D parameters"}
+REFUSED = {"SparseAdam", "Muon"}  # the latter since torch 2.9
+SLOWER = {"ASGD": 2.0, "RAdam": 1.7, "Rprop": 1.4}
 SCHEDULES: dict[str, dict[str, Any]] = {
     "ConstantLR": {"total_iters": 3},
     "CosineAnnealingLR": {},
@@ -78,30 +80,23 @@ def test_the_names_are_those_of_torch() -> None:
         (schedule_names(), lr_scheduler, LRScheduler),
     ):
         found = {n for n, x in vars(module).items() if inspect.isclass(x) and issubclass(x, base) and x is not base}
-        assert {n for n in found if not n.startswith("_")} == set(names)
+        assert {n for n in found if not n.startswith("_")} == {*names, *(REFUSED if base is Optimizer else ())}
     assert {"Adam", "SGD", "RMSprop", "LBFGS"} <= set(optimizer_names())
     assert {*SCHEDULES, *ONLY_CODE} == set(schedule_names())
 
 
+@pytest.mark.parametrize("name", sorted(REFUSED))
+def test_an_optimizer_of_torch_that_cannot_do_it_is_refused_by_those_that_can(name: str) -> None:
+    accepted = refused(optimizer=name).split("; accepted: ")[1]
+    assert accepted.split(", ") == optimizer_names()
+
+
 @pytest.mark.parametrize("name", optimizer_names())
-def test_every_optimizer_of_torch_goes_downhill_by_its_name_or_is_refused(name: str) -> None:
-    if name in NOT_OURS:
-        message = refused(optimizer=name, optimizer_options={})
-        assert f"optimizer {name}" in message
-        assert NOT_OURS[name] in message
-        return
-    Sgd(optimizer=name, optimizer_options={})
-    optimizer, x = parabola(name)
-
-    def loss() -> torch.Tensor:
-        optimizer.zero_grad()
-        value = x.square().sum()
-        value.backward()
-        return value.detach()
-
-    for _ in range(5):
-        optimizer.step(loss)
-    assert x.square().sum().item() < 14.0
+def test_every_supported_optimizer_comes_near_the_closed_form_by_its_name_alone(name: str) -> None:
+    """52 times the closed form at the nominal parameters; after so few epochs most are within 2 %."""
+    w = demo()
+    estimate = Trainer(Sgd(0.001, optimizer=name, epochs=4 if name == "LBFGS" else 25), w.problem, w.batches).run()
+    assert 1.0 < estimate.objective / estimate.unconstrained < SLOWER.get(name, 1.1)
 
 
 @pytest.mark.parametrize(

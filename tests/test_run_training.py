@@ -6,6 +6,7 @@ import json
 import os
 import random
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -476,6 +477,35 @@ def test_a_file_of_tensors_that_is_no_checkpoint_is_not_gone_on_with(
 ) -> None:
     torch.save(state, training_of(output) / CHECKPOINT)
     assert f"{training_of(output) / CHECKPOINT}: file: " in resume_refused(experiment, output, capsys)
+
+
+@pytest.mark.parametrize("epoch", [10**9, -5])
+def test_an_epoch_edited_by_hand_is_not_gone_on_from(
+    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], epoch: int
+) -> None:
+    folder = training_of(output)
+    state = load_checkpoint(folder)
+    state["trainer"]["epoch"] = epoch
+    save_checkpoint(folder, state)
+    line = resume_refused(experiment, output, capsys)
+    assert f"{folder / CHECKPOINT}: file: " in line
+    assert f"epoch: found {epoch}; accepted: a whole number from 0 to {EPOCHS}" in line
+    torch.save(state, folder / CHECKPOINT)
+    assert "not the values that were written" in resume_refused(experiment, output, capsys)
+
+
+def test_a_full_disk_is_told_as_such_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, {"epoch": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))  # what a file may hold; longer ones fail as on a disk
+    try:
+        with pytest.raises(OSError, match="File too large") as raised:
+            save_checkpoint(tmp_path, {"epoch": 2, "x": torch.zeros(1000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert raised.value.filename == str(tmp_path / CHECKPOINT)
+    assert load_checkpoint(tmp_path) == {"epoch": 1}
+    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
 
 
 def test_whatever_bit_of_a_checkpoint_flips_it_is_refused_or_says_the_same(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def run(mode: str | None) -> Run:
     """Without a module if there is no mode."""
     w = with_cable()
     residual = None if mode is None else Springs(w.robot.n)
-    settings = Sgd(RIDGE, epochs=EPOCHS, optimizer_options={"lr": 0.1}, residual=mode or "joint")
+    settings = Sgd(RIDGE, epochs=EPOCHS, optimizer_options={"lr": 0.1}, residual=mode or "joint", residual_weight=0.0)
     trainer = Trainer(settings, w.problem, w.batches, unseen().batches, residual)
     record = Run(trainer.estimate(), [], [], [])
 
@@ -150,7 +150,7 @@ def test_only_those_change_in_an_epoch_whose_turn_it_is(mode: str) -> None:
 
 def test_patience_waits_until_a_module_that_comes_last_had_its_turn() -> None:
     w, residual = arm(), Springs(arm().robot.n)
-    settings = Sgd(epochs=20, patience=3, optimizer_options={"lr": 0.05}, residual="parameters_first")
+    settings = Sgd(epochs=20, patience=3, residual="parameters_first", residual_weight=0.0)
     trainer = Trainer(settings, w.problem, w.batches, half_way().batches, residual)
     seen: list[tuple[int, bool]] = []
     trainer.run(lambda epoch: seen.append((epoch.number, bool(residual.strength.detach().any()))))
@@ -165,7 +165,7 @@ def test_a_module_is_left_as_it_was_found_and_can_be_trained_again(mode: str) ->
     residual.offset = nn.Parameter(torch.ones(3, dtype=torch.float64), requires_grad=False)
     for _ in range(2):
         before = residual.strength.detach().clone()
-        Trainer(Sgd(epochs=3, residual=mode), w.problem, w.batches, residual=residual).run()
+        Trainer(Sgd(epochs=3, residual=mode, residual_weight=0.0), w.problem, w.batches, residual=residual).run()
         assert not torch.equal(residual.strength, before)
         assert residual.strength.requires_grad
         assert not residual.offset.requires_grad
@@ -174,7 +174,8 @@ def test_a_module_is_left_as_it_was_found_and_can_be_trained_again(mode: str) ->
 
 def test_a_module_may_learn_at_a_rate_of_its_own() -> None:
     w, residual = arm(), Springs(arm().robot.n)
-    trainer = Trainer(Sgd(optimizer_options={"lr": 0.05}, residual_lr=0.5), w.problem, w.batches, residual=residual)
+    settings = Sgd(optimizer_options={"lr": 0.05}, residual_lr=0.5, residual_weight=0.0)
+    trainer = Trainer(settings, w.problem, w.batches, residual=residual)
     assert [group["lr"] for group in trainer.optimizer.param_groups] == [0.05, 0.5]
     assert trainer.run_epoch().learning_rate == 0.05
 
@@ -227,7 +228,7 @@ def test_the_module_evaluates_on_held_out_logs_and_trains_on_the_others() -> Non
     residual = nn.Sequential()  # a container, so that the mode reaches the dropout
     residual.springs, residual.dropout = springs, nn.Dropout(0.5)
     residual.forward = lambda q, v, a: residual.dropout(springs(q, v, a))  # type: ignore[method-assign]
-    trainer = Trainer(Sgd(**still()), w.problem, w.batches, held_out.batches, residual)
+    trainer = Trainer(Sgd(**still(residual_weight=0.0)), w.problem, w.batches, held_out.batches, residual)
     found = trainer.run_epoch()
     total, phi = 0.0, torch.from_numpy(trainer.phi())
     for batch in held_out.batches.chunks():

@@ -5,6 +5,7 @@ from torchid.estimators.consistent import Consistent, ConsistentEstimate, projec
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
 from torchid.estimators.least_squares import LeastSquares
 from torchid.estimators.penalties import PenaltyWeights
+from torchid.estimators.residual import ResidualEffect, WeightChoice
 from torchid.estimators.result import BoundEstimate, Estimate
 from torchid.estimators.sgd import Sgd
 from torchid.estimators.training import Epoch, SgdEstimate, Trainer
@@ -23,10 +24,12 @@ __all__ = [
     "LogCholeskyParameters",
     "Mirror",
     "PenaltyWeights",
+    "ResidualEffect",
     "Sgd",
     "SgdEstimate",
     "Trainer",
     "Violation",
+    "WeightChoice",
     "project",
     "violations",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -25,6 +27,11 @@ class Terms:
         """Sum of the terms."""
         return torch.stack(list(self.losses.values())).sum()
 
+    def plus(self, other: Terms, share: float) -> Terms:
+        """These and those of another batch, which holds this share of the samples, without their gradients."""
+        losses = {name: self.losses.get(name, 0.0) + share * x.detach() for name, x in other.losses.items()}
+        return Terms(losses, {name: self.squares.get(name, 0.0) + x for name, x in other.squares.items()})
+
 
 class Loss(nn.Module):
     """The loss of a batch, such that its mean over an epoch is the loss of all samples.
@@ -32,6 +39,7 @@ class Loss(nn.Module):
     Attributes:
         learnable: parameters of the bodies.
         residual: module r(q, v, a) -> (B, nv) [N, N m] whose output adds to K phi, or None.
+        residual_weight: of the mean square of the module's whitened force; None, which counts as 0, until it is chosen.
     """
 
     def __init__(
@@ -46,6 +54,7 @@ class Loss(nn.Module):
         super().__init__()
         self.settings = settings
         self.learnable, self.residual = learnable, residual
+        self.residual_weight = settings.residual_weight
         self._columns = batches.columns
         self._per_row = batches.samples / max(problem.rows, 1)
         self.register_buffer(
@@ -68,8 +77,8 @@ class Loss(nn.Module):
         forces = {"rigid_body": rigid, "measured": batch.f}
         if other is not None:
             forces["residual"] = other
-            if settings.residual_weight:
-                losses["residual"] = settings.residual_weight * share * other.square().sum()
+            if self.residual_weight:
+                losses["residual"] = self.residual_weight * share * other.square().sum()
         return Terms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
 
     def forces(self, batch: Batch, phi: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -85,12 +94,20 @@ class Loss(nn.Module):
     @torch.no_grad()
     def mean_square(self, batches: MiniBatches) -> float:
         """Mean squared whitened residual over all rows of some logs, the module evaluating."""
-        training, total, rows = self.training, 0.0, 0
-        self.eval()
-        phi = self.learnable()
-        for batch in batches.chunks():
-            rigid, other = self.forces(batch, phi)
-            misfit = (rigid if other is None else rigid + other) - batch.f
-            total, rows = total + float(misfit.square().sum()), rows + batch.rows
-        self.train(training)
+        total, rows, phi = 0.0, 0, self.learnable()
+        with self.evaluating():
+            for batch in batches.chunks():
+                rigid, other = self.forces(batch, phi)
+                misfit = (rigid if other is None else rigid + other) - batch.f
+                total, rows = total + float(misfit.square().sum()), rows + batch.rows
         return total / max(rows, 1)
+
+    @contextmanager
+    def evaluating(self) -> Iterator[None]:
+        """The module evaluates, and trains again afterwards if it did before."""
+        training = self.training
+        self.eval()
+        try:
+            yield
+        finally:
+            self.train(training)

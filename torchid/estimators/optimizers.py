@@ -6,6 +6,7 @@ import inspect
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -17,13 +18,49 @@ from torchid.errors import InputError, UnknownNameError
 Group = dict[str, Any]
 
 _WHOLE_RUN = ("T_max", "total_steps")  # lengths that are the number of epochs unless given
+_UNSUITED = {"SparseAdam": "takes sparse gradients alone", "Muon": "takes matrices alone"}
 _FAILURES = (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 """What torch's classes have been seen to raise at options that cannot be."""
 
 
+@dataclass(frozen=True)
+class Method:
+    """How an optimizer of torch is used here.
+
+    Attributes:
+        defaults: options for those that are not given. Torch's own suit networks, whose curvature nobody knows; that of
+            preconditioned parameters is near one.
+        alone: further options where none at all is given.
+        whole: whether a step takes all samples at once, an epoch being one step: a line search or a memory of signs
+            compares gradients from step to step, which mini-batches make differ by chance. Gradients are not clipped.
+    """
+
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    alone: Mapping[str, Any] = field(default_factory=dict)
+    whole: bool = False
+
+
+METHODS: dict[str, Method] = {
+    "ASGD": Method({"lr": 1.0}),
+    "Adadelta": Method({"lr": 30.0}),
+    "Adafactor": Method({"lr": 0.1, "eps": (None, 1.0)}),  # steps count in units of the second, not of parameters
+    "Adagrad": Method({"lr": 0.5}),
+    "Adam": Method({"lr": 0.05}),
+    "AdamW": Method({"lr": 0.05}),
+    "Adamax": Method({"lr": 0.3}),
+    "LBFGS": Method({"line_search_fn": "strong_wolfe"}, whole=True),
+    "NAdam": Method({"lr": 0.1}),
+    "RAdam": Method({"lr": 0.3}),
+    "RMSprop": Method({"lr": 0.05}),
+    "Rprop": Method({"lr": 0.2}, whole=True),
+    "SGD": Method({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
+}
+"""The optimizers that come near the closed form; docs/estimators.md says how near."""
+
+
 def optimizer_names() -> list[str]:
-    """Names of the classes in `torch.optim`."""
-    return sorted(name for name, _ in _classes(torch.optim, Optimizer))
+    """Names of the classes in `torch.optim` that are supported: those in `METHODS` that this torch has."""
+    return sorted(name for name, _ in _classes(torch.optim, Optimizer) if name in METHODS)
 
 
 def schedule_names() -> list[str]:
@@ -32,17 +69,26 @@ def schedule_names() -> list[str]:
 
 
 def make_optimizer(name: str, options: Mapping[str, Any], groups: Sequence[Group]) -> Optimizer:
-    """An optimizer of parameter groups.
+    """An optimizer of parameter groups; options that are not given are those of `METHODS`.
 
     Raises:
-        UnknownNameError: `torch.optim` has no such class.
+        UnknownNameError: no class of `torch.optim`, or one that is not supported.
         InputError: an option it does not take.
     """
     found = dict(_classes(torch.optim, Optimizer)).get(name)
+    if found is not None and name not in METHODS:
+        accepted = ", ".join(optimizer_names())
+        raise InputError("estimator", f"optimizer {name}", _UNSUITED.get(name, "not supported"), accepted)
     if found is None:
         raise _unknown("optimizer", name, optimizer_names())
+    if name == "LBFGS" and len(groups) > 1:  # it takes one group
+        if any("lr" in group for group in groups):
+            raise InputError(
+                "estimator", "residual_lr", "set, but LBFGS has one lr for all", "None, or another optimizer"
+            )
+        groups = [{"params": [x for group in groups for x in group["params"]]}]
     try:
-        return found(list(groups), **options)
+        return found(list(groups), **{**_defaults(METHODS[name], options), **options})
     except _FAILURES as error:
         raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(found)) from error
 
@@ -102,13 +148,17 @@ def try_out(
                 tried.step(loss)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
     except _FAILURES as error:
         found = f"cannot take a step: {_short(error)}"
-        raise InputError("estimator", f"optimizer {optimizer}", found, "another, for example Adam") from error
+        raise InputError("estimator", f"optimizer {optimizer}", found, "other options") from error
     try:
         for _ in range(epochs):
             step_schedule(schedule_of, 1.0)
     except _FAILURES as error:
         found = f"does not last {epochs} epochs: {_short(error)}"
         raise InputError("estimator", f"schedule {schedule}", found, "other options, or another schedule") from error
+
+
+def _defaults(method: Method, options: Mapping[str, Any]) -> dict[str, Any]:
+    return dict(method.defaults) if options else {**method.defaults, **method.alone}
 
 
 def _classes(module: Any, base: type) -> list[tuple[str, Any]]:

@@ -27,7 +27,8 @@ class Sgd:
         consistency: "log_cholesky", every step's parameters are physical; "penalties", steps are pulled there.
         margin: least eigenvalue of every body's scaled pseudo-inertia, kept or aimed at.
         penalties: their weights, with "penalties".
-        optimizer, optimizer_options: a class of `torch.optim` and what it takes.
+        optimizer, optimizer_options: one of `optimizer_names()`, classes of `torch.optim`, and what it takes; what is
+            not given is as in `METHODS`.
         schedule, schedule_options: a class of `torch.optim.lr_scheduler`, stepped once per epoch; None for none.
         epochs: passes over the logs, at most.
         patience: epochs without a better loss on the held-out logs after which to stop; None: never.
@@ -36,7 +37,8 @@ class Sgd:
         residual: with a residual module: train it and the parameters together, the parameters for the first half of the
             epochs and then the module, or each in every other epoch.
         residual_lr: learning rate of the module; None: the optimizer's.
-        residual_weight: of the mean square of the module's whitened force in the loss.
+        residual_weight: of the mean square of the module's whitened force in the loss; None: the largest whose loss on
+            held-out samples is not significantly above the least.
     """
 
     ridge: float = 0.0
@@ -45,7 +47,7 @@ class Sgd:
     margin: float = 1e-4
     penalties: PenaltyWeights = field(default_factory=PenaltyWeights)
     optimizer: str = "Adam"
-    optimizer_options: Mapping[str, Any] = field(default_factory=lambda: {"lr": 0.05})
+    optimizer_options: Mapping[str, Any] = field(default_factory=dict)
     schedule: str | None = "CosineAnnealingLR"
     schedule_options: Mapping[str, Any] = field(default_factory=dict)
     epochs: int = 200
@@ -54,7 +56,7 @@ class Sgd:
     damping: float = 1.0
     residual: ResidualMode = "joint"
     residual_lr: float | None = None
-    residual_weight: float = 0.0
+    residual_weight: float | None = None
 
     def __post_init__(self) -> None:
         """Check names and numbers.
@@ -67,8 +69,9 @@ class Sgd:
             if getattr(self, name) not in accepted:
                 raise ValueError(f"{name}: found {getattr(self, name)!r}; accepted: {', '.join(accepted)}")
         for name in ("ridge", "residual_weight"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ValueError(f"{name}: found {getattr(self, name)}; accepted: a finite number of at least 0")
+            value = getattr(self, name)
+            if not (value is None and name == "residual_weight") and not (np.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}: found {value}; accepted: a finite number of at least 0")
         for name in ("clip", "damping", "epochs", "patience", "residual_lr"):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0.0):

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import copy
-import operator
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,14 +17,19 @@ from torchid.errors import InputError
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
 from torchid.estimators.least_squares import LeastSquares
 from torchid.estimators.loss import Loss, Terms
-from torchid.estimators.optimizers import make_optimizer, make_schedule, step_schedule
+from torchid.estimators.optimizers import METHODS, make_optimizer, make_schedule, step_schedule
+from torchid.estimators.residual import WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
 from torchid.estimators.result import BoundEstimate, rounding_reported
 from torchid.estimators.sgd import Sgd
+from torchid.estimators.state import check_state
 from torchid.parameters import Array
 from torchid.problem.batches import Batch, MiniBatches
 from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
 
+_BLOCKS, _EVERY = 20, 4  # a quarter of the samples is held out to choose the weight of a residual module, in 5 blocks
+_FEWEST = 2  # blocks that a standard error can be had from
+_SMALLER = "a smaller lr"
 _BETTER = 1e-5  # relative: less is no improvement
 _DIVERGED = 1e6  # times the loss at the nominal parameters, or that of stated noise if more
 
@@ -66,10 +70,12 @@ class SgdEstimate(BoundEstimate):
     Attributes:
         epochs: that were run.
         best_epoch: whose parameters these are.
+        residual: what the residual module took, None without one.
     """
 
     epochs: int
     best_epoch: int
+    residual: ResidualEffect | None
 
 
 class Trainer:
@@ -99,15 +105,21 @@ class Trainer:
                 K phi; arguments as in `Batch`.
         """
         self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out
-        self.closed_form = LeastSquares(settings.ridge, settings.rank_tolerance).solve(problem)
+        self._least_squares = LeastSquares(settings.ridge, settings.rank_tolerance)
+        self.closed_form = self._least_squares.solve(problem)
         device = batches.columns.device
         self.loss = Loss(settings, problem, batches, _learnable(settings, problem).to(device), residual)
-        groups: list[dict[str, Any]] = [{"params": [self.loss.learnable.raw]}]
+        self._trained: list[list[nn.Parameter]] = [[self.loss.learnable.raw]]
         if residual is not None:
-            own = {} if settings.residual_lr is None else {"lr": settings.residual_lr}
-            groups.append({"params": [x for x in residual.parameters() if x.requires_grad]} | own)
+            self._trained.append([x for x in residual.parameters() if x.requires_grad])
+        groups: list[dict[str, Any]] = [{"params": trained} for trained in self._trained]
+        if residual is not None and settings.residual_lr is not None:
+            groups[1]["lr"] = settings.residual_lr
         self.optimizer = make_optimizer(settings.optimizer, settings.optimizer_options, groups)
         self.schedule = make_schedule(settings.schedule, settings.schedule_options, self.optimizer, settings.epochs)
+        if not any(self._trained[1:]):
+            self.loss.residual_weight = settings.residual_weight or 0.0  # there is nothing to hold back
+        self.weight_choice: WeightChoice | None = None
         self.epoch, self.best_epoch, self.best_loss = 0, 0, float("inf")
         self._best = self._learned()
 
@@ -142,6 +154,8 @@ class Trainer:
         Raises:
             InputError: the loss has grown beyond all bounds.
         """
+        if self.loss.residual_weight is None:
+            self.choose_residual_weight()
         self.epoch += 1
         self._choose_trained()
         self.loss.train()
@@ -149,9 +163,9 @@ class Trainer:
         losses: dict[str, float] = {}
         squares: dict[str, float] = {}
         with one_thread():
-            for batch in self.batches.epoch(self.epoch):
-                terms = self._step(batch)
-                weight = len(batch) / self.batches.samples
+            for batches, samples in self._steps():
+                terms = self._step(batches, samples)
+                weight = samples / self.batches.samples
                 for sums, found, factor in ((losses, terms.losses, weight), (squares, terms.squares, 1.0)):
                     for name, value in found.items():
                         sums[name] = sums.get(name, 0.0) + factor * float(value)
@@ -162,6 +176,8 @@ class Trainer:
         with np.errstate(over="ignore", invalid="ignore"):
             self._check(self._objective(phi))  # no batch has seen the last step yet
         self._check(0.0 if held_out is None else held_out)
+        if not all(bool(x.isfinite().all()) for group in self._trained for x in group):
+            self._check(float("nan"))  # of a module, in the last step
         self._learn_all()
         step_schedule(self.schedule, losses["total"] if held_out is None else held_out)
         if held_out is None or held_out < self.best_loss * (1.0 - _BETTER):
@@ -178,6 +194,51 @@ class Trainer:
             learning_rate=rate,
             samples_per_second=self.batches.samples / elapsed,
         )
+
+    def choose_residual_weight(self) -> WeightChoice:
+        """Choose the weight of the residual module by held-out samples; the first epoch does so if none is given.
+
+        From where rigid bodies alone arrive, a copy of the module is trained under each of `WEIGHTS` for half of the
+        epochs. What is held out are the held-out logs or, without any, a quarter of the training samples, in blocks.
+
+        Raises:
+            InputError: too few samples, or no weight under which the loss does not diverge.
+        """
+        train, blocks = self.batches, [] if self.held_out is None else self.held_out.blocks(_BLOCKS)
+        if self.held_out is None:
+            train, blocks = self.batches.hold_out(_BLOCKS, _EVERY)
+        if len(blocks) < _FEWEST:
+            found = f"{self.batches.samples} samples are too few to choose it"
+            raise InputError("estimator", "residual_weight", found, "a number, or longer logs")
+        with torch.random.fork_rng():
+            alone = self._trial(train, None, 0.0, self.settings.epochs)
+            alone.run()
+            start = alone.loss.learnable.state_dict()
+            losses = [self._trial_losses(train, weight, start, blocks) for weight in WEIGHTS]
+        if not np.isfinite(losses).any():
+            raise InputError("estimator", "training", "a loss that diverges under every residual_weight", _SMALLER)
+        without = float(np.mean([alone.loss.mean_square(block) for block in blocks]))
+        self.weight_choice = choose_weight(WEIGHTS, np.array(losses), without)
+        self.loss.residual_weight = self.weight_choice.weight
+        return self.weight_choice
+
+    def _trial(self, train: MiniBatches, residual: nn.Module | None, weight: float, epochs: int) -> Trainer:
+        """A descent on some of the samples."""
+        settings = replace(self.settings, residual_weight=weight, epochs=epochs, patience=None)
+        return Trainer(settings, self.problem.share(train.samples / self.batches.samples), train, residual=residual)
+
+    def _trial_losses(
+        self, train: MiniBatches, weight: float, start: Mapping[str, Tensor], blocks: Sequence[MiniBatches]
+    ) -> list[float]:
+        """Losses by block, after a descent with a copy of the module, infinite if that diverges."""
+        trial = self._trial(train, copy.deepcopy(self.loss.residual), weight, max(self.settings.epochs // 2, 1))
+        trial.loss.learnable.load_state_dict(start)
+        try:
+            while not trial.finished:
+                trial.run_epoch()
+        except InputError:
+            return [float("inf")] * len(blocks)
+        return [trial.loss.mean_square(block) for block in blocks]
 
     def phi(self) -> Array:
         """The parameters as they are now, (12 L,)."""
@@ -199,6 +260,7 @@ class Trainer:
             eigenvalues=parameters.least_eigenvalues(phi, self.problem.scale),
             epochs=self.epoch,
             best_epoch=self.best_epoch,
+            residual=residual_effect(self.loss, self.problem, self.batches, self._least_squares, self.weight_choice),
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -212,14 +274,18 @@ class Trainer:
             "epoch": self.epoch,
             "best_epoch": self.best_epoch,
             "best_loss": self.best_loss,
+            "residual_weight": self.loss.residual_weight,
+            "weight_choice": None if self.weight_choice is None else vars(self.weight_choice),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where `state_dict` was called.
 
         Raises:
-            TypeError: numbers of epochs that are none; what else is no such state raises whatever torch does.
+            ValueError: something in the state cannot be; what is wrong inside an optimizer's or a schedule's own state
+                raises whatever torch does.
         """
+        check_state(state, self.state_dict(), self.settings.epochs)
         self._learn(state["learned"])
         self._best = state["best"]
         self._load_optimizer(copy.deepcopy(state["optimizer"]))
@@ -227,8 +293,10 @@ class Trainer:
             self.schedule.load_state_dict(copy.deepcopy(state["schedule"]))
         torch.set_rng_state(state["random"][0])
         torch.cuda.set_rng_state_all(state["random"][1:])
-        self.epoch, self.best_epoch = (operator.index(state[name]) for name in ("epoch", "best_epoch"))
+        self.epoch, self.best_epoch = state["epoch"], state["best_epoch"]
         self.best_loss = float(state["best_loss"])
+        self.loss.residual_weight, choice = state["residual_weight"], state["weight_choice"]
+        self.weight_choice = None if choice is None else WeightChoice(**choice)
 
     def _load_optimizer(self, state: dict[str, Any]) -> None:
         """Load an optimizer's state, scalars in the precision they had (torch would widen those of NAdam)."""
@@ -260,33 +328,46 @@ class Trainer:
             "parameters_first": (first, not first),
             "alternating": (self.epoch % 2 == 1, self.epoch % 2 == 0),
         }[self.settings.residual]
-        for group, trained in zip(self.optimizer.param_groups, (ours, theirs), strict=True):
-            for x in group["params"]:
+        for group, trained in zip(self._trained, (ours, theirs), strict=True):
+            for x in group:
                 x.requires_grad_(trained)
 
     def _learn_all(self) -> None:
         """Leave nothing frozen: another trainer may take the residual module up."""
-        for group in self.optimizer.param_groups:
-            for x in group["params"]:
+        for group in self._trained:
+            for x in group:
                 x.requires_grad_(True)
 
     def _check(self, loss: float) -> None:
         if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
-            raise InputError("estimator", "training", f"a loss of {loss:.3g} in epoch {self.epoch}", "smaller steps")
+            rate = float(self.optimizer.param_groups[0]["lr"])
+            found = f"a loss of {loss:.3g} in epoch {self.epoch}, with {self.settings.optimizer} at lr {rate:.3g}"
+            raise InputError("estimator", "training", found, _SMALLER)
 
-    def _step(self, batch: Batch) -> Terms:
+    def _steps(self) -> Iterator[tuple[Callable[[], Iterable[Batch]], int]]:
+        """The batches that each step of an epoch is taken on, with the number of their samples."""
+        if METHODS[self.settings.optimizer].whole:
+            yield self.batches.chunks, self.batches.samples
+        else:
+            for batch in self.batches.epoch(self.epoch):
+                yield lambda batch=batch: [batch], len(batch)
+
+    def _step(self, batches: Callable[[], Iterable[Batch]], samples: int) -> Terms:
         """One step of the optimizer; terms are those before it."""
         found: list[Terms] = []
 
         def closure() -> Tensor:
             self.optimizer.zero_grad()
-            terms = self.loss(batch)
-            total = terms.total()
-            total.backward()
-            for group in self.optimizer.param_groups:
-                nn.utils.clip_grad_norm_(group["params"], self.settings.clip)
-            found.append(Terms({name: x.detach() for name, x in terms.losses.items()}, terms.squares))
-            return total
+            terms = Terms({}, {})
+            for batch in batches():
+                part, share = self.loss(batch), len(batch) / samples
+                (share * part.total()).backward()
+                terms = terms.plus(part, share)
+            if not METHODS[self.settings.optimizer].whole:
+                for group in self.optimizer.param_groups:
+                    nn.utils.clip_grad_norm_(group["params"], self.settings.clip)
+            found.append(terms)
+            return terms.total()
 
         try:
             self.optimizer.step(closure)  # type: ignore[arg-type]  # torch's own documentation returns a tensor

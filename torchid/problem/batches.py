@@ -8,7 +8,9 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from torchid.parameters import Array
 from torchid.problem.chunks import by_state
+from torchid.problem.predict import predicted_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
@@ -79,12 +81,35 @@ class MiniBatches:
         self.builder, self.batch_size, self.seed = builder, batch_size, seed
         self.columns = torch.from_numpy(builder.columns.from_parameters()).to(builder.device)
         self.samples = sum(map(len, logs))
-        self._logs = tuple(logs)
+        self._logs, self._memory = tuple(logs), memory
         self._starts = torch.tensor([0, *(len(log) for log in logs)]).cumsum(0).tolist()
         chunk = max(_CHUNK // batch_size, 1) * batch_size
         self._chunks = torch.randperm(self.samples, generator=self._generator(0)).split(chunk)
         self._kept: dict[int, Batch] = {}
         self._left = memory
+
+    def blocks(self, count: int) -> list[MiniBatches]:
+        """About so many blocks of successive samples, none across two logs, at least one of each log."""
+        pieces: list[Samples] = []
+        for log in self._logs:
+            parts = min(max(round(count * len(log) / max(self.samples, 1)), 1), max(len(log), 1))
+            cuts = [round(k * len(log) / parts) for k in range(parts + 1)]
+            pieces += [log[start:end] for start, end in zip(cuts, cuts[1:], strict=False)]
+        return [self.of(piece) for piece in pieces if len(piece)]
+
+    def hold_out(self, count: int, every: int) -> tuple[MiniBatches, list[MiniBatches]]:
+        """All samples but some of about `count` blocks, and these: of every so many, one that the seed draws."""
+        blocks, generator = self.blocks(count), self._generator(-1)
+        held_out = [
+            start + int(torch.randint(every, (), generator=generator))
+            for start in range(0, len(blocks) - every + 1, every)
+        ]
+        kept = [block._logs[0] for number, block in enumerate(blocks) if number not in held_out]
+        return self.of(*kept), [blocks[number] for number in held_out]
+
+    def of(self, *logs: Samples) -> MiniBatches:
+        """Mini-batches like these of other samples."""
+        return MiniBatches(logs, self.builder, self.batch_size, self.seed, self._memory)
 
     def epoch(self, number: int) -> Iterator[Batch]:
         """All samples in the order of an epoch, numbered from 1."""
@@ -98,6 +123,15 @@ class MiniBatches:
     def chunks(self) -> Iterator[Batch]:
         """All samples, chunk by chunk, always the same."""
         return (self._rows(chunk) for chunk in range(len(self._chunks)))
+
+    @torch.no_grad()
+    def generalized_forces(self, phi: Array) -> Iterator[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
+        """Coordinates (q, v, a) of samples, log by log, with K phi, (B, nv) [N, N m], of parameters (12 L,)."""
+        columns = self.builder.columns_of(phi[None])[0]
+        for log in self._logs:
+            for start in range(0, len(log), _CHUNK):
+                samples = log[start : start + _CHUNK].to(self.builder.device)
+                yield samples.coordinates(), predicted_forces(self.builder, self.builder.terms(samples), columns).T
 
     def _generator(self, number: int) -> torch.Generator:
         return torch.Generator().manual_seed((self.seed * 1_000_003 + number) % 2**63)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,6 +65,12 @@ class LinearProblem:
         """Sum of squared whitened residuals over all rows at parameters `phi`, (P,)."""
         misfit = self.A @ phi - self.b
         return float(misfit @ misfit + self.residual)
+
+    def share(self, of: float) -> LinearProblem:
+        """The problem as if of this share of its rows, which say the same as all: an estimate of that of a part."""
+        root = float(np.sqrt(of))
+        rows = max(round(of * self.rows), 1)
+        return replace(self, A=root * self.A, b=root * self.b, residual=of * self.residual, rows=rows)
 
     def distance(self, phi: Array, other: Array) -> float:
         """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""

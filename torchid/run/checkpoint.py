@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import os
 import warnings
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +20,36 @@ from torchid.text import shown
 
 CHECKPOINT = "checkpoint.pt"
 
+_ACCEPTED = "a checkpoint that torchid wrote"
+_DIGEST = "digest"
 _MOST_ENTRIES = 10_000  # files in the archive, and values in the state: a few for each parameter group
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
-    """Write a state of plain types and tensors, under a temporary name first."""
-    temporary = folder / f".{CHECKPOINT}"
-    with temporary.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(folder / CHECKPOINT)
+    """Write a state of plain types and tensors, under a temporary name first, with a digest of its values.
+
+    Raises:
+        OSError: names the file, if the disk is full or cannot be written.
+    """
+    temporary, path, content = folder / f".{CHECKPOINT}", folder / CHECKPOINT, io.BytesIO()
+    torch.save(state | {_DIGEST: _digest(state)}, content)  # not to the file: torch hides why that cannot be written
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.getbuffer())
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def load_checkpoint(folder: Path) -> dict[str, Any]:
     """The state that `save_checkpoint` wrote; no code in the file is run.
 
     Raises:
-        InputError: the file is damaged or none of ours.
+        InputError: the file is damaged, was changed by others than `save_checkpoint`, or is none of ours.
     """
     path = folder / CHECKPOINT
     with damage_refused(folder):
@@ -45,36 +59,30 @@ def load_checkpoint(folder: Path) -> dict[str, Any]:
             state = torch.load(path, weights_only=True)
         _check_values(state)
     if not isinstance(state, dict):
-        raise InputError(path, "file", f"holds a {type(state).__name__}", "a checkpoint that torchid wrote")
+        raise InputError(path, "file", f"holds a {type(state).__name__}", _ACCEPTED)
+    if state.pop(_DIGEST, None) != _digest(state):
+        raise InputError(path, "file", "not the values that were written, by their digest", _ACCEPTED)
     return state
 
 
-def check_alike(found: Any, expected: Any, place: str = "state") -> None:
-    """Compare the state of a checkpoint with that of a trainer that has not begun: what it is made of, not its values.
-
-    A mapping that is empty in `expected`, an optimizer's state before its first step, may hold mappings.
-
-    Raises:
-        ValueError: something else stands in some place.
-    """
-    if isinstance(expected, torch.Tensor):
-        alike = isinstance(found, torch.Tensor) and (found.shape, found.dtype) == (expected.shape, expected.dtype)
-    elif isinstance(expected, (int, float)):
-        alike = isinstance(found, (int, float)) and found == found
-    else:
-        alike = isinstance(found, type(expected))
-    if alike and expected == {}:
-        alike = all(isinstance(value, dict) for value in found.values())
-    if not alike:
-        raise ValueError(f"{place} is of another kind")
-    if isinstance(expected, dict) and expected:
-        for key in expected:
-            check_alike(found.get(key), expected[key], f"{place}.{key}")
-    elif isinstance(expected, (list, tuple)) and expected:
-        if len(found) != len(expected):
-            raise ValueError(f"{place} is of another length")
-        for index, (one, other) in enumerate(zip(found, expected, strict=True)):
-            check_alike(one, other, f"{place}.{index}")
+def _digest(value: Any) -> str:
+    """Of all values in a state, with their types and their order."""
+    digest, left = hashlib.sha256(), [value]
+    while left:
+        value = left.pop()
+        digest.update(type(value).__name__.encode())
+        if isinstance(value, torch.Tensor):
+            digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
+            digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+        elif isinstance(value, dict):
+            digest.update(f"{len(value)}".encode())
+            left += [x for pair in value.items() for x in pair]
+        elif isinstance(value, (list, tuple)):
+            digest.update(f"{len(value)}".encode())
+            left += value
+        else:
+            digest.update(f"{value!r};".encode())
+    return digest.hexdigest()
 
 
 @contextmanager
@@ -90,7 +98,7 @@ def damage_refused(folder: Path) -> Iterator[None]:
         raise
     except Exception as error:  # noqa: B902 - an unpickler, torch and its optimizers raise what they like
         found = f"not readable ({shown(str(error) or type(error).__name__, 200)})"
-        raise InputError(folder / CHECKPOINT, "file", found, "a checkpoint that torchid wrote") from error
+        raise InputError(folder / CHECKPOINT, "file", found, _ACCEPTED) from error
 
 
 def _check_archive(path: Path) -> None:

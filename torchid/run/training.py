@@ -28,14 +28,13 @@ from torchid.problem.linear import parameter_scale
 from torchid.report.metrics import Metrics
 from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
-from torchid.run.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
+from torchid.run.checkpoint import CHECKPOINT, damage_refused, load_checkpoint, save_checkpoint
 from torchid.run.folder import EVENTS, TRAINING, check_free, clear_leftovers, new_folder, refuse_inputs, refuse_link
 from torchid.run.manifest import Manifest, inspect, read_manifest
 
 Evaluate = Callable[[Array], Mapping[str, Metrics]]
 
 _FREE_TO_CHANGE = ("output", "overwrite")
-_FOREIGN = (AttributeError, TypeError, ValueError, LookupError, RuntimeError, OverflowError)
 _SAME = 1e-9  # relative: the logs of a checkpoint, up to rounding
 
 
@@ -124,8 +123,7 @@ class Training:
                 self._evaluate(0, trainer.phi(), evaluate, events)
                 self._save(trainer, events)
             self._train(trainer, evaluate, events, lambda text: bars.update(bar, advance=1, description=text))
-        with self._foreign_state():
-            return trainer.estimate()
+        return trainer.estimate()
 
     def copy_curves(self, folder: Path) -> None:
         """Copy the training's event files into the finished run's folder."""
@@ -167,7 +165,7 @@ class Training:
         """Start a new folder, or take up what is in it."""
         if resume and (self.folder / CHECKPOINT).is_file():
             state = load_checkpoint(self.folder)
-            with self._foreign_state():
+            with damage_refused(self.folder):
                 self._check(state, trainer)
                 trainer.load_state_dict(state["trainer"])
             self._saved = trainer.epoch
@@ -194,17 +192,6 @@ class Training:
         rows, cost = _fingerprint(trainer)
         if state["logs"][0] != rows or abs(state["logs"][1] - cost) > _SAME * cost:
             raise ConfigError(self.source, "logs", "not those of the checkpoint", "the same files, unchanged")
-
-    @contextmanager
-    def _foreign_state(self) -> Iterator[None]:
-        """Turn whatever torch makes of a state that was edited into one line."""
-        try:
-            yield
-        except InputError:
-            raise
-        except _FOREIGN as error:
-            found = f"holds no state of this training ({type(error).__name__})"
-            raise InputError(self.folder / CHECKPOINT, "file", found, "one that torchid identify wrote") from error
 
     @contextmanager
     def _interruptible(self, trainer: Trainer) -> Iterator[None]:
