@@ -146,6 +146,8 @@ def _identify(options: argparse.Namespace) -> None:
         from torchid.report.tables import (
             contribution_table,
             error_tables,
+            noise_advice,
+            noise_table,
             print_tables,
             state_table,
             verdict_counts_table,
@@ -162,6 +164,7 @@ def _identify(options: argparse.Namespace) -> None:
         contribution_table(run.adds),
         verdict_table(robot.body_names, estimate.verdict),
         verdict_counts_table(run.by_state, estimate),
+        noise_table([asdict(one) for one in run.noise.groups]),
     )
     if run.extras:
         print_tables(extra_table(run.extras))
@@ -172,7 +175,9 @@ def _identify(options: argparse.Namespace) -> None:
     mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
-    print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
+    print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise")
+    for line in noise_advice(run.noise.suggested):
+        print(fill(line, 100, subsequent_indent=" " * 14))
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
     if isinstance(estimate, BoundEstimate) and estimate.relative_price is not None:
