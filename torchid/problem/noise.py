@@ -33,17 +33,20 @@ BASE = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "
 GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE, "ft_force", "ft_moment")
 """Groups of one standard deviation each; base rows along the axes of the levelled base."""
 
-_SAMPLES, _BYTES, _CHUNK = 2000, 2**27, 256  # whose rows are kept: 2000 show a standard deviation to a few per cent
+_SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # whose rows are kept: 1000 show a standard deviation to 2 to 3 %
+_THINNED = 4  # one in so many of these shows the leverage
 _NORMAL = 0.6745  # median of |x| of standard normal x
 _CLIP = 3.0  # residuals are clipped at three robust standard deviations: impacts count as no more
 _CLIPPED = 0.99501  # E[min(x^2, 9)] of standard normal x
-_HELD = 0.02  # weight of the variances so far against what residuals say: settles what these cannot tell apart
+_HELD = 0.005  # weight of the variances so far against what residuals say: settles what these cannot tell apart
 _LEAST_STEP = 0.05  # of a variance, by which factor it may fall in one step
 _SHARE = 0.01  # least share of a group in the variance along its own directions: a tenth of the deviation there
 _SMALLEST = 1e-3  # of the guess, least standard deviation: what is left of exact logs is rounding
 _LEFT = 0.1  # least share of the residual's degrees of freedom that a group is taken to have
 _FEW = 20.0  # independent readings, fewer of which say nothing: a standard deviation to 16 %
-_STEADY, _STEPS = 0.01, 40  # relative change of a variance, most steps
+_UNSEEN = 1e-9  # share of a source's variance in the rows below which it is projected out
+_STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions of any group, most steps
+_CONFOUNDED = 0.5  # relative standard error of a standard deviation
 
 
 def by_group(noise: SensorNoise) -> dict[str, float]:
@@ -56,8 +59,8 @@ def by_group(noise: SensorNoise) -> dict[str, float]:
 def of_groups(values: Mapping[str, float]) -> SensorNoise:
     """The noise of standard deviations by group."""
     force, moment = ((values[names[0]], values[names[1]], values[names[2]]) for names in (BASE[:3], BASE[3:]))
-    sensors = (values[name] for name in GROUPS[:3])
-    return SensorNoise(*sensors, force, moment, values["ft_force"], values["ft_moment"])
+    plain = {name: values[name] for name in GROUPS if name not in BASE}
+    return SensorNoise(**plain, base_force=force, base_moment=moment)
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,12 @@ class SampledRows:
         found = by_group(self.builder.sensors.noise)
         return np.array([found[name] for name in self.groups])
 
+    @property
+    def oversampling(self) -> float:
+        """Rows per independent row."""
+        counts = np.array([[len(chunk.rows), len(chunk.rows) / chunk.oversampling] for chunk in self.chunks]).sum(0)
+        return float(counts[0] / counts[1])
+
     def _chunk(self, samples: Samples, state: State) -> _Chunk:
         rows, W = self.builder.rows_by_sample(samples.to(self.builder.device), state)
         sources = (self._ways(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
@@ -128,6 +137,9 @@ class SampledRows:
 
     def whitened(self, variance: Array) -> Iterator[_Chunk]:
         """The chunks, whitened with variances of the groups relative to the guess, (G,)."""
+        if (variance == 1.0).all():
+            yield from self.chunks
+            return
         scale = torch.from_numpy(np.sqrt(variance)[self.group_of])[:, None]
         for chunk in self.chunks:
             sources = chunk.sources * scale
@@ -164,13 +176,10 @@ def _source_names(builder: RowBuilder) -> list[str]:
 
 def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State]]:
     """About so many samples, at random so that no gait is in step with them, log by log and state by state."""
-    total, rng = sum(map(len, logs)), np.random.default_rng(0)
+    rng, share = np.random.default_rng(0), min(1.0, most / max(sum(map(len, logs)), 1))
     for log in logs:
-        share = min(1.0, most / max(total, 1))
-        count = min(len(log), max(round(share * len(log)), 1)) if len(log) else 0
-        index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False))) if count else []
-        if not count:
-            continue
+        count = min(len(log), max(round(share * len(log)), 1))
+        index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
         some = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
         for state, where in by_state(some, _CHUNK):
             yield some[where], state
@@ -178,19 +187,31 @@ def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State]]
 
 @dataclass(frozen=True)
 class Components:
-    """Variances of the groups relative to the guess of `SampledRows`, (G,).
+    """Variances of the groups relative to the guess of `SampledRows`.
 
-    `share`, (G,): of the variance along a group's own directions that is its own, between 0 and 1. `told`, (G,) bool:
-    whether residuals say anything of it; where not, it stays what it was.
+    Attributes:
+        variance: (G,).
+        share: (G,), of the variance along a group's own directions that is its own, between 0 and 1.
+        told: (G,) bool, whether there are readings enough; where not, the variance stays what it was.
+        error: (G,), relative standard error of the standard deviation, large where groups are confounded.
+        change: largest relative change, since the start, of the noise along the directions of a group, whosever it is.
     """
 
     variance: Array
     share: Array
     told: np.ndarray
+    error: Array
+    change: float
 
+    @property
     def at_most(self) -> np.ndarray:
         """Groups whose noise drowns in that of others, of which only an upper bound is known, (G,) bool."""
         return self.told & (self.share <= 1.5 * _SHARE)
+
+    @property
+    def confounded(self) -> np.ndarray:
+        """Groups of which residuals show little but their sum with others, (G,) bool."""
+        return self.told & ~self.at_most & (self.error > _CONFOUNDED)
 
 
 @dataclass(frozen=True)
@@ -235,18 +256,21 @@ class VarianceComponents:
             columns: parameters in the builder's columns, (width,), by log.
             problem: of the fit.
         """
-        found = self._residuals(variance, columns, problem)
+        found, start = self._residuals(variance, columns, problem), variance
         told = (found.independent > _FEW) @ self._blocks > 0.0
+        first, *_ = M, q, t, count = self._moments(found, variance)
         for _ in range(_STEPS):
-            M, q, t, count = self._moments(found, variance)
             share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
             step = self._step(M, q, told)
             least = np.maximum(_SHARE / np.maximum(share, 1e-12), _SMALLEST**2 / variance)
             step = np.where(told, np.maximum(step, _block_max(least, self._blocks)), 1.0)
-            variance = variance * (self._blocks @ step)
-            if np.abs(step - 1.0).max(initial=0.0) < _STEADY:
+            factor = self._blocks @ step
+            variance = variance * factor
+            if _change(M, factor) < _STEADY:
                 break
-        return Components(variance, share, self._blocks @ told > 0.0)
+            M, q, t, count = self._moments(found, variance)
+        error = _relative_errors(M * np.sqrt(np.outer(found.left, found.left)) / self.rows.oversampling)
+        return Components(variance, share, self._blocks @ told > 0.0, error, _change(first, variance / start))
 
     def _step(self, M: Array, q: Array, told: np.ndarray) -> Array:
         """Factors of the unknown variances, so that the squares are those expected; where M cannot tell, near 1."""
@@ -265,7 +289,7 @@ class VarianceComponents:
         return out
 
     def _moments(self, found: _Residuals, variance: Array) -> tuple[Array, Array, Array, Array]:
-        """M (G, G) and q (G,) of the equations M x = q, the groups' variance in the rows and number of readings (G,)."""
+        """M (G, G) and q (G,) of the equations M x = q; variance of the groups in the rows and number of readings."""
         of, count = self.rows.group_of, len(variance)
         member = torch.zeros(len(of), count, dtype=torch.float64)
         member[torch.arange(len(of)), torch.from_numpy(of)] = 1.0
@@ -285,30 +309,44 @@ class VarianceComponents:
         q, t, n = (np.zeros(count) for _ in range(3))
         for group in range(count):
             own, scores = size[:, of == group], score[:, of == group]
-            seen = own > 1e-9
+            seen = own > _UNSEEN
             t[group], n[group] = own.sum(), seen.sum()
             if seen.any():
                 q[group] = t[group] * _clipped_variance(scores[seen] / np.sqrt(own[seen]), own[seen])
         return M.numpy(), q / found.left, t, n
 
     def _residuals(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> _Residuals:
-        directions = _fitted_directions(problem, self.rows.builder)
-        rows, of = self.rows, self.rows.group_of
+        rows, of, directions = self.rows, self.rows.group_of, _fitted_directions(problem, self.rows.builder)
         taken, size, readings = (np.zeros(len(variance)) for _ in range(3))
         for chunk in rows.whitened(variance):
-            leverage = (chunk.sources @ (chunk.rows[..., :-1] @ directions)).square().sum(2)
             own = chunk.sources.square().sum(2)
-            np.add.at(taken, of, chunk.oversampling * leverage.sum(0).numpy())
-            np.add.at(size, of, own.sum(0).numpy())
-            np.add.at(readings, of, (own > 1e-9).sum(0).numpy() / chunk.oversampling)
+            some = slice(None, None, _THINNED)
+            leverage = (chunk.sources[some] @ (chunk.rows[some, :, :-1] @ directions)).square().sum((0, 2))
+            np.add.at(taken, of, chunk.oversampling * leverage.numpy())
+            np.add.at(size, of, own[some].sum(0).numpy())
+            np.add.at(readings, of, (own > _UNSEEN).sum(0).numpy() / chunk.oversampling)
         left = 1.0 - np.divide(taken, size, out=np.zeros_like(size), where=size > 0.0)
         r = [
-            chunk.rows[..., :-1] @ columns[chunk.log].to(chunk.rows).cpu() - chunk.rows[..., -1]
+            chunk.rows[..., :-1] @ columns[chunk.log].to("cpu", torch.float64) - chunk.rows[..., -1]
             for chunk in rows.chunks
         ]
-        return _Residuals(
-            r, [c.sources for c in rows.chunks], np.maximum(left, _LEFT), readings * np.maximum(left, 0.0)
-        )
+        U = [chunk.sources for chunk in rows.chunks]
+        return _Residuals(r, U, np.maximum(left, _LEFT), readings * np.maximum(left, 0.0))
+
+
+def _relative_errors(M: Array) -> Array:
+    """Of the standard deviations, (G,), of normal noise whose variances are told by the equations of M / 2."""
+    seen = np.diag(M) > 0.0
+    size = np.where(seen, np.diag(M), 1.0) ** -0.5
+    values, V = np.linalg.eigh(M * size * size[:, None])
+    return np.where(seen, size * np.sqrt(0.5 * (np.square(V) / np.maximum(values, 1e-9)).sum(1)), np.inf)
+
+
+def _change(M: Array, factor: Array) -> float:
+    """Largest relative change of the standard deviation along a group's directions, if variances change by factors."""
+    before = M.sum(1)
+    after = np.divide(M @ factor, before, out=np.ones_like(before), where=before > 0.0)
+    return float(np.abs(np.sqrt(after) - 1.0).max(initial=0.0))
 
 
 def _block_max(values: Array, blocks: Array) -> Array:

@@ -179,9 +179,8 @@ class RowBuilder(nn.Module):
         return J
 
     def noise_axes(self, rotation_world_base: Tensor | None) -> Tensor | None:
-        """Axes that the floors of the base rows are along, (B, 3, 3); None: the base's own, for want of its attitude."""
-        known = rotation_world_base is not None and self.tree.base_rows
-        return levelled(rotation_world_base) if known else None
+        """Axes of the floors of the base rows, (B, 3, 3), as `levelled`; None without attitude: the base's own."""
+        return None if rotation_world_base is None or not self.tree.base_rows else levelled(rotation_world_base)
 
     def local_wrench(self, samples: Samples, contact: int, terms: ChunkTerms) -> Tensor:
         """Recorded wrench of a contact along its frame's axes, (B, 6)."""

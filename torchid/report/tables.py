@@ -98,17 +98,14 @@ def noise_table(groups: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def noise_advice(suggested: Mapping[str, Any]) -> list[str]:
-    """What to state instead of noise that residuals contradict, as a line or none."""
-    if not suggested:
-        return []
-    keys = ", ".join(
-        f"{key}: " + (f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{one:g}" for one in x) + "]")
-        for key, x in suggested.items()
-    )
-    return [
-        f"noise         residuals contradict what sensors.noise states; they show {{{keys}}}: state that, or nothing"
-    ]
+def noise_advice(suggested: Mapping[str, Any]) -> str:
+    """What to state instead of noise that residuals contradict."""
+
+    def text(x: float | Sequence[float]) -> str:
+        return f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{one:g}" for one in x) + "]"
+
+    keys = ", ".join(f"{key}: {text(x)}" for key, x in suggested.items())
+    return f"noise         stated values contradict the residuals: state sensors.noise {{{keys}}}, or none of these"
 
 
 def legend_of_marks() -> str:

@@ -38,9 +38,7 @@ from torchid.run.robust import RobustSummary, loss_of, robust_fit
 from torchid.run.training import Training, check_training, training_folder
 
 _IMPLAUSIBLE = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
-_UNEXPLAINED = (
-    0.5  # of the forces' rms, with any noise: recorded logs stay below 0.35, the worst that of motor currents
-)
+_UNEXPLAINED = 0.5  # of the weighted forces' rms: recorded logs stay below 0.35
 
 
 @dataclass

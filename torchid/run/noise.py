@@ -19,7 +19,7 @@ from torchid.run.experiment import Experiment, Scene
 from torchid.run.fit import fitted
 from torchid.sensing import SensorNoise, SensorSet
 
-_SETTLED = 0.05  # relative change of a standard deviation: weights that are 10 % off cost 0.2 % of the efficiency
+_SETTLED = 0.05  # change of the deviation along any group's directions: weights 10 % off cost 0.2 % of efficiency
 _PASSES = 6
 _DIGITS = 3
 _APART = 2.0  # where a standard deviation is half of what it should be, 95 % intervals hold the truth in 67 %
@@ -31,8 +31,9 @@ C = TypeVar("C", ExperimentConfig, AnalyzeConfig)
 class GroupNoise:
     """Noise of a group of readings, or of base rows along an axis of the levelled base.
 
-    `origin`: "stated", "estimated", "at most" (drowned in other noise: an upper bound), "assumed" (too few readings).
-    `used`: standard deviation that rows were weighed with; `residual`: that of the residuals, None if they cannot tell.
+    `origin`: "stated", "estimated", "at most" (drowned in other noise: an upper bound), "confounded" (residuals show
+    little but its sum with other noise) or "assumed" (too few readings). `used`: standard deviation that rows were
+    weighed with; `residual`: that of the residuals, None if they cannot tell.
     """
 
     group: str
@@ -84,9 +85,8 @@ def estimated_noise(
         if len(tied) == len(rows.groups):
             break
         found = estimator.estimate(variance, *fit)
-        change = np.abs(np.sqrt(found.variance / variance) - 1.0).max()
         variance = found.variance
-        if change < _SETTLED or passes == _PASSES:
+        if found.change < _SETTLED or passes == _PASSES:
             break
     free = VarianceComponents(rows).estimate(variance, *fit) if tied else found
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
@@ -101,6 +101,21 @@ def weighed(
     found = estimated_noise(experiment, experiment.sensors, logs, source)
     sensors = replace(experiment.sensors, noise=found.noise)
     return replace(experiment, config=stating(experiment.config, found), sensors=sensors), found
+
+
+def recorded_sensors(scene: Scene, logs: Sequence[Samples]) -> SensorSet:
+    """All sensors whose every value is in every log."""
+    torque = np.ones(scene.robot.dofs, dtype=bool)
+    wrench = np.ones((len(scene.contacts), 6), dtype=bool)
+    for log in logs:
+        torque &= log.torque is not None and log.torque.isfinite().all(0).numpy()
+        if log.wrench is None:
+            wrench[:] = False
+        else:
+            wrench &= (log.wrench.isfinite() | ~log.active[..., None]).all(0).numpy()
+            if log.wrench_in_world:  # components along a frame's axes take whole vectors
+                wrench = np.repeat(wrench.reshape(-1, 2, 3).all(axis=2), 3, axis=1)
+    return SensorSet(torque, wrench, scene.noise)
 
 
 def stating(config: C, found: NoiseSummary) -> C:
@@ -132,16 +147,26 @@ def _rounded(values: Array) -> Array:
 def _summary(
     guess: SensorNoise, rows: SampledRows, tied: Sequence[str], used: Array, free: Components, passes: int
 ) -> NoiseSummary:
-    deviation, at_most = _rounded(rows.guess * np.sqrt(free.variance)), free.at_most()
+    deviation = _rounded(rows.guess * np.sqrt(free.variance))
     groups = []
     for place, name in enumerate(rows.groups):
         told = bool(free.told[place])
-        origin = "stated" if name in tied else "assumed" if not told else "at most" if at_most[place] else "estimated"
+        origin = "stated" if name in tied else _origin(free, place)
         unit = "N" if "force" in name else "N m"
         groups.append(GroupNoise(name, unit, origin, float(used[place]), float(deviation[place]) if told else None))
     noise = of_groups(by_group(guess) | {one.group: one.used for one in groups})
-    known = {name: float(x) for name, x, yes in zip(rows.groups, deviation, free.told & ~at_most, strict=True) if yes}
+    known = {
+        name: float(x)
+        for name, x, yes in zip(rows.groups, deviation, free.told & ~free.at_most & ~free.confounded, strict=True)
+        if yes
+    }
     return NoiseSummary(noise, groups, _suggested(guess, tied, known), passes)
+
+
+def _origin(found: Components, place: int) -> str:
+    if not found.told[place]:
+        return "assumed"
+    return "at most" if found.at_most[place] else "confounded" if found.confounded[place] else "estimated"
 
 
 def _suggested(

@@ -40,9 +40,9 @@ _PLOTTED_SAMPLES = 3000
 class Identification:
     """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
 
-    `extras`: unknowns beside the bodies' parameters. `noise`: what rows were weighed with. `robust`: how outliers were weighed down, if so. `mass`: how well
-    the total mass is known. `excluded`: condemned samples left out, by log. `adds`: what each training log, contact
-    state and sensor adds.
+    `extras`: unknowns beside the bodies' parameters. `noise`: what rows were weighed with. `robust`: how outliers were
+    weighed down, if so. `mass`: how well the total mass is known. `excluded`: condemned samples left out, by log.
+    `adds`: what each training log, contact state and sensor adds.
     """
 
     experiment: Experiment

@@ -69,9 +69,11 @@ class SensorNoise:
     def times(self, factor: float) -> SensorNoise:
         """All of them, larger by a factor."""
         scaled: dict[str, Any] = {
-            name: np.multiply(factor, x).tolist() for name, x in vars(self).items() if x is not None
+            name: tuple(factor * one for one in x) if isinstance(x, tuple) else factor * x
+            for name, x in vars(self).items()
+            if x is not None
         }
-        return SensorNoise(**{name: tuple(x) if isinstance(x, list) else x for name, x in scaled.items()})
+        return SensorNoise(**scaled)
 
     @property
     def wrench(self) -> Array:
