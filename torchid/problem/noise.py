@@ -151,8 +151,12 @@ class SampledRows:
             yield replace(chunk, rows=rows, sources=sources)
 
     @one_thread()
-    def parts(self, variance: Array) -> list[Part]:
-        """The rows, whitened anew and compressed."""
+    def parts(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
+        """The rows, whitened anew and compressed.
+
+        With parameters of an earlier fit in the builder's columns, by log, rows that are far off count less, as in
+        Huber's loss: what impacts do to the parameters would look like noise of all rows.
+        """
         parts: dict[tuple[str, State], Part] = {}
         every = tuple(range(self.builder.width))
         for chunk in self.whitened(variance):
@@ -160,6 +164,9 @@ class SampledRows:
             part = parts.setdefault(key, Part(*key, TriangularFactor(self.builder.width), 0))
             part.samples += len(chunk.rows)
             some = chunk.rows[chunk.sources.abs().sum(1) > 0.0]
+            if columns is not None:
+                off = (some[:, :-1] @ columns[chunk.log] - some[:, -1]).abs()
+                some = some * (_CLIP / off).clamp_max(1.0).sqrt()[:, None]
             part.factor.add(every, some, chunk.oversampling)
         return list(parts.values())
 
@@ -326,10 +333,7 @@ class VarianceComponents:
             np.add.at(size, of, own[some].sum(0).numpy())
             np.add.at(readings, of, (own > _UNSEEN).sum(0).numpy() / chunk.oversampling)
         left = 1.0 - np.divide(taken, size, out=np.zeros_like(size), where=size > 0.0)
-        r = [
-            chunk.rows[..., :-1] @ columns[chunk.log].to("cpu", torch.float64) - chunk.rows[..., -1]
-            for chunk in rows.chunks
-        ]
+        r = [chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1] for chunk in rows.chunks]
         U = [chunk.sources for chunk in rows.chunks]
         return _Residuals(r, U, np.maximum(left, _LEFT), readings * np.maximum(left, 0.0))
 

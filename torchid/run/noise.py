@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchid.config import AnalyzeConfig, ExperimentConfig
@@ -24,7 +25,7 @@ _PASSES = 6
 _DIGITS = 3
 _APART = 2.0  # where a standard deviation is half of what it should be, 95 % intervals hold the truth in 67 %
 
-C = TypeVar("C", ExperimentConfig, AnalyzeConfig)
+C = TypeVar("C", bound=ExperimentConfig | AnalyzeConfig)
 
 
 @dataclass(frozen=True)
@@ -77,18 +78,18 @@ def estimated_noise(
     if not (rows.groups and rows.chunks):
         return NoiseSummary(scene.noise, [], {}, 0)
     tied = [name for name in rows.groups if name in stated]
-    variance, passes = np.ones(len(rows.groups)), 0
+    variance, columns, passes = np.ones(len(rows.groups)), None, 0
     estimator = VarianceComponents(rows, tied)
     while True:
-        fit = _fitted(rows, variance, scene, builder, source)
+        columns, problem = _fitted(rows, variance, columns, scene, source)
         passes += 1
         if len(tied) == len(rows.groups):
             break
-        found = estimator.estimate(variance, *fit)
+        found = estimator.estimate(variance, columns, problem)
         variance = found.variance
         if found.change < _SETTLED or passes == _PASSES:
             break
-    free = VarianceComponents(rows).estimate(variance, *fit) if tied else found
+    free = VarianceComponents(rows).estimate(variance, columns, problem) if tied else found
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
     used = np.where(np.isin(rows.groups, tied), rows.guess, _rounded(rows.guess * np.sqrt(variance / common)))
     return _summary(scene.noise, rows, tied, used, free, passes)
@@ -131,12 +132,13 @@ def _stated(scene: Scene, group: str) -> bool:
 
 
 def _fitted(
-    rows: SampledRows, variance: Array, scene: Scene, builder: RowBuilder, source: object
+    rows: SampledRows, variance: Array, before: Mapping[str, Tensor] | None, scene: Scene, source: object
 ) -> tuple[Mapping[str, Tensor], LinearProblem]:
     """Parameters by log in the builder's columns, and the problem, by least squares without regularization."""
     estimator = LeastSquares(rank_tolerance=scene.config.estimator.rank_tolerance)
-    fit = fitted(rows.parts(variance), scene, builder, estimator.solve, source)
-    return {chunk.log: fit.columns(builder, chunk.log) for chunk in rows.chunks}, fit.assembly.problem
+    fit = fitted(rows.parts(variance, before), scene, rows.builder, estimator.solve, source)
+    columns = {chunk.log: fit.columns(rows.builder, chunk.log) for chunk in rows.chunks}
+    return {log: x.to("cpu", torch.float64) for log, x in columns.items()}, fit.assembly.problem
 
 
 def _rounded(values: Array) -> Array:
