@@ -110,6 +110,13 @@ def test_the_least_experiment_has_four_keys_and_the_documented_defaults(file: Pa
     assert (config.device, config.overwrite) == ("cpu", False)
 
 
+def test_noise_by_axis_is_read_back_as_it_was(file: Path) -> None:
+    config = load(file, LEAST, "sensors.noise.base_force=[60, 50, 3]", "sensors.noise.base_moment=2")
+    assert (config.sensors.noise.base_force, config.sensors.noise.base_moment) == ((60.0, 50.0, 3.0), 2.0)
+    file.write_text(dump_config(config))
+    assert load_config(file) == config
+
+
 def test_every_key_of_the_file_arrives(file: Path) -> None:
     config = dataclasses.asdict(load(file, ALL))
     assert config["sensors"].pop("set") is None

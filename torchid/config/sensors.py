@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import BeforeValidator, PlainValidator, TypeAdapter
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.config.types import STRICT, Positive
@@ -27,8 +27,12 @@ def _per_axis(value: object) -> float | tuple[float, float, float]:
     return x, y, z
 
 
+def _plain(value: float | tuple[float, float, float]) -> float | list[float]:
+    return list(value) if isinstance(value, tuple) else value
+
+
 _POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
-PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis)]
+PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(_plain)]
 
 
 @dataclass(config=STRICT, frozen=True)

@@ -182,10 +182,13 @@ def _source_names(builder: RowBuilder) -> list[str]:
 
 
 def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State]]:
-    """About so many samples, at random so that no gait is in step with them, log by log and state by state."""
+    """About so many samples, at random so that no gait is in step with them, log by log and state by state.
+
+    Of filtered logs, four for every independent one: more would say little more.
+    """
     rng, share = np.random.default_rng(0), min(1.0, most / max(sum(map(len, logs)), 1))
     for log in logs:
-        count = min(len(log), max(round(share * len(log)), 1))
+        count = min(len(log), max(round(min(share, 4.0 / log.oversampling) * len(log)), 1))
         index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
         some = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
         for state, where in by_state(some, _CHUNK):
