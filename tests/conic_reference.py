@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import cvxpy as cp
@@ -25,7 +26,10 @@ class Bodies:
         free = problem.free.reshape(-1, 12)
         self.M = [cp.Variable((4, 4), symmetric=True) if row[0] else None for row in free]
         scaled = self.nominal / self.scale
-        roots = [np.linalg.cholesky(pseudo(z)) if relative and row[0] else np.eye(4) for z, row in zip(scaled, free, strict=True)]
+        roots = [
+            np.linalg.cholesky(pseudo(z)) if relative and row[0] else np.eye(4)
+            for z, row in zip(scaled, free, strict=True)
+        ]
         self.J = [None if M is None else L @ M @ L.T for L, M in zip(roots, self.M, strict=True)]
         self.friction = cp.Variable((len(free), 2))
         self.held: list[Any] = []
@@ -89,14 +93,22 @@ class Bodies:
         return value
 
 
+def _solved(objective: Any, held: list[Any]) -> float:
+    """Least objective, as accurately as it comes."""
+    programme = cp.Problem(cp.Minimize(objective), held)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        programme.solve(solver=cp.CLARABEL, **ACCURACY)
+    return float(programme.value)
+
+
 def least_misfit(problem: LinearProblem, conditions: Conditions) -> float:
     """Least mean square of the residual under the conditions."""
     bodies = Bodies(problem, conditions)
     size = max(float(problem.b @ problem.b + problem.residual) / problem.rows, 1e-300)
     A, b = (x / np.sqrt(problem.rows * size) for x in (problem.A * problem.scale, problem.b))
-    programme = cp.Problem(cp.Minimize(cp.sum_squares(A @ cp.hstack(bodies.scaled) - b)), bodies.held)
-    programme.solve(solver=cp.CLARABEL, **ACCURACY)
-    return float(programme.value) * size + problem.residual / problem.rows
+    least = _solved(cp.sum_squares(A @ cp.hstack(bodies.scaled) - b), bodies.held)
+    return least * size + problem.residual / problem.rows
 
 
 def least_prior(problem: LinearProblem, conditions: Conditions, prior: str, phi: Array, tolerance: float) -> float:
@@ -107,6 +119,4 @@ def least_prior(problem: LinearProblem, conditions: Conditions, prior: str, phi:
     seen = np.zeros((int((values > tolerance * values[0]).sum()), len(problem.free)))
     seen[:, problem.free] = right[: len(seen)]
     same = seen @ (cp.hstack(bodies.scaled) - phi / problem.scale) == 0.0
-    programme = cp.Problem(cp.Minimize(bodies.prior(prior)), [*bodies.held, same])
-    programme.solve(solver=cp.CLARABEL, **ACCURACY)
-    return float(programme.value)
+    return _solved(bodies.prior(prior), [*bodies.held, same])

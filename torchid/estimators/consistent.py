@@ -16,7 +16,7 @@ from torchid.estimators.conic import ConicProblem, Solution
 from torchid.estimators.formulate import Prior, conic_problem
 from torchid.estimators.least_squares import LeastSquares
 from torchid.estimators.result import BoundEstimate, rounding_reported
-from torchid.estimators.vanishing import vanishing_ridge
+from torchid.estimators.vanishing import Vanishing, vanishing_ridge
 from torchid.parameters import Array
 from torchid.problem.linear import LinearProblem
 
@@ -28,7 +28,8 @@ class ConsistentEstimate(BoundEstimate):
     """An estimate that meets its conditions; the entropic prior, which has no other domain, has no unconstrained one.
 
     Attributes:
-        gap: to the dual objective; no parameters that meet the conditions have an objective lower by more.
+        gap: to the dual objective; no parameters that meet the conditions have an objective lower by more (with ridge
+            0, none whose prior is at most twice the estimate's).
         certified_gap: difference from the other solver's objective, None unless asked for. Relative to the objective;
             where data without noise leave next to none, relative to 1e-8 of the mean square of the data or 1e-3 of the
             ridge, whichever is larger.
@@ -43,6 +44,9 @@ class ConsistentEstimate(BoundEstimate):
 @dataclass(frozen=True)
 class Consistent:
     """min ||A phi - b||^2 / rows + ridge * prior(phi) over all phi that a physical robot can have.
+
+    With `ridge` 0 the limit for ridge -> 0, the least prior among all minimizers: what data do not determine stays
+    nominal. Where conditions are active there may be none, see `vanishing_ridge`.
 
     What is not free stays nominal, whether or not it meets the conditions: `violations` tells. "barrier" stays inside
     them; "certified" meets them to the accuracy of its solver, mostly 1e-9 of the scale, and warns beyond 1e-7.
@@ -88,19 +92,19 @@ class Consistent:
             InputError: the conditions exclude each other, or a prior of matter starts from bodies that cannot exist.
         """
         plain = LeastSquares(self.ridge, self.rank_tolerance).solve(problem)
-        data = conic = conic_problem(problem, self.conditions, self.ridge, self.prior)
-        vanishing = None
+        data = conic_problem(problem, self.conditions, self.ridge, self.prior)
+        chosen = Vanishing(data)
         if self.ridge == 0.0 and len(data.linear):
-            vanishing = vanishing_ridge(problem, self.conditions, self.prior, self.rank_tolerance)
-            conic = vanishing.conic
-        solution = _solve(conic, self.method)
+            chosen = vanishing_ridge(problem, self.conditions, self.prior, self.rank_tolerance)
+        conic = chosen.conic
+        solution = _solve(conic, self.method, chosen.tolerance)
         certified_gap = None
         if self.certify:
-            other = _solve(conic, "certified" if self.method == "barrier" else "barrier")
+            other = _solve(conic, "certified" if self.method == "barrier" else "barrier", chosen.tolerance)
             compared = max(solution.objective, conic.floor)
             certified_gap = abs(other.objective - solution.objective) / compared
-        if vanishing is not None:
-            solution = vanishing.judged(solution, data)
+        if conic is not data:
+            solution = chosen.judged(solution, data)
         phi = problem.nominal.copy()
         phi[problem.free] += problem.scale[problem.free] * (data.deviations @ solution.x)
         return ConsistentEstimate(
@@ -175,11 +179,11 @@ def _check_names(prior: str, method: str) -> None:
             raise ValueError(f"{name}: found {value!r}; accepted: {', '.join(accepted)}")
 
 
-def _solve(conic: ConicProblem, method: Method) -> Solution:
+def _solve(conic: ConicProblem, method: Method, tolerance: float = 1e-9) -> Solution:
     if not len(conic.linear):
         return Solution(np.zeros(0), conic.constant, 0.0, 0)
     if method == "barrier":
-        return solve_barrier(conic)
+        return solve_barrier(conic, tolerance)
     from torchid.estimators.certified import solve_certified  # CVXPY takes a second to import
 
     return solve_certified(conic)

@@ -50,7 +50,7 @@ class _Variables:
         return self.place[body, parameters.INERTIAL]
 
     def measure(self, roots: Mapping[int, Array]) -> None:
-        """Measure deviations of bodies' pseudo-inertias by their roots, (4, 4): J = J_0 + L U L^T with x the numbers of U.
+        """Measure deviations of bodies' pseudo-inertias by roots L, (4, 4): J = J_0 + L U L^T with x the numbers of U.
 
         A prior of matter is then as stiff in all directions; in units of the scale it is 1e20 times stiffer across a
         flat body than along, and rounding hides all else.

@@ -1,4 +1,4 @@
-"""Consistent estimates without a ridge: the limit of a vanishing one, where what data do not determine stays nominal."""
+"""Consistent estimates without a ridge: the limit of a vanishing one, so that what data leave open stays nominal."""
 
 from __future__ import annotations
 
@@ -18,40 +18,44 @@ from torchid.problem.linear import LinearProblem
 from torchid.problem.threads import one_thread
 
 _RIDGES = 10.0 ** -np.arange(0.0, 15.0, 2.0)  # of the least misfit without conditions, or of what is as good as none
-_SETTLED = 1e-5  # change of the misfit, relative, to a hundredth of the ridge; what is left is a hundredth of it or less
+_SETTLED = (
+    1e-5  # change of the misfit, relative, to a hundredth of the ridge; what is left is a hundredth of it or less
+)
 _STAYS = 0.01  # and of the prior: where parameters grow without bound it is a factor of two and more
-_BOUNDED = 0.5  # change of the prior up to which a path that rounding ends has come near its limit
+_BOUNDED = 1.25  # growth up to which a path that rounding ends has come near its limit
 _EXACT = 1e-7  # excess of a misfit that counts as none, relative
 _NEAR = 1e-3  # excess over the least misfit without conditions, relative, at which these may cost nothing at all
 _INSIDE = 1e-6  # least slack of a point that shows that what the data determine leaves the conditions room
 _SEARCH = 60  # Newton steps for such a point: one that exists is found in 10 to 40
 _CLOSE = 0.1  # of the excess: how closely it is met
 _TRIES = 12
+_RESOLVED = 1e-7  # of the prior
+_FAR = 10.0  # times the reach of the data: where no limit is looked for any more
 
 
 @dataclass(frozen=True)
 class Vanishing:
     """The problem that stands for a ridge that vanishes.
 
-    `conic`: its minimizer is the estimate. `misfit`: that of the estimate where equalities hold what the data
-    determine; None where `conic` has a small ridge instead.
+    Attributes:
+        conic: its minimizer is the estimate.
+        misfit: that of the estimate where equalities hold what the data determine; None where `conic` has a ridge.
+        tolerance: relative gap at which a small ridge's part of the objective is resolved.
     """
 
     conic: ConicProblem
     misfit: float | None = None
+    tolerance: float = 1e-9
 
     def judged(self, solution: Solution, data: ConicProblem) -> Solution:
-        """A minimizer of `conic` as one of the data's misfit: no parameters of twice its prior have a lower one by more than
-        the gap."""
+        """A minimizer of `conic` as one of the misfit: none of up to twice its prior is better by more than the gap."""
         objective = data.objective(solution.x)
         gap = objective - self.misfit if self.misfit is not None else solution.gap + solution.objective - objective
         return replace(solution, objective=objective, gap=max(gap, 0.0))
 
 
 @one_thread()
-def vanishing_ridge(
-    problem: LinearProblem, conditions: Conditions, prior: Prior, rank_tolerance: float
-) -> Vanishing:
+def vanishing_ridge(problem: LinearProblem, conditions: Conditions, prior: Prior, rank_tolerance: float) -> Vanishing:
     """The well-posed problem whose minimizer is the limit for ridge -> 0: the least prior among all of least misfit.
 
     Where conditions leave room at the misfit of least squares, what the data determine is held by equalities, and the
@@ -79,22 +83,22 @@ def vanishing_ridge(
     if (found := held.through(np.zeros(len(path.data.linear)))) is not None:
         return found
     unit, steps, searched = max(held.misfit, path.data.floor), list[_Step](), False
-    for ridge in unit * _RIDGES:
-        step = path.at(float(ridge))
+    for share in _RIDGES:
+        step = path.at(float(share * unit / max(1.0, steps[0].prior if steps else 1.0)))
         if step is None:
             break
         steps.append(step)
         found = held.through(step.x)
         if found is None and not searched and step.misfit - held.misfit <= _NEAR * unit:
-            found, searched = held.searched(), True
+            found, searched = held.searched(step.x), True
         if found is not None:
             return found
-        if path.away(step) > REACH:
+        if path.away(step) > _FAR * REACH:
             break
         if len(steps) > 1 and _change(steps) <= _SETTLED * max(step.misfit, path.data.floor) and _stays(steps, _STAYS):
-            return Vanishing(step.conic)
-    if len(steps) > 1 and _stays(steps, _BOUNDED):
-        return Vanishing(steps[-1].conic)  # as near to the limit as rounding allows
+            return step.vanishing
+    if len(steps) == 1 or (len(steps) > 1 and path.away(steps[-1]) <= _BOUNDED * path.away(steps[-2])):
+        return steps[-1].vanishing  # as near to the limit as rounding allows
     return path.near_the_least(steps, held.rank)
 
 
@@ -107,6 +111,11 @@ class _Step:
     x: Array
     misfit: float
     prior: float
+
+    @property
+    def vanishing(self) -> Vanishing:
+        share = self.ridge * self.prior / max(self.misfit, self.conic.floor)
+        return Vanishing(self.conic, tolerance=float(np.clip(_RESOLVED * share, 1e-15, 1e-9)))
 
 
 class _Path:
@@ -139,7 +148,7 @@ class _Path:
         return conic_problem(problem, self.conditions, 1.0, self.prior)
 
     def near_the_least(self, steps: list[_Step], rank: int) -> Vanishing:
-        """The least prior at the misfit that the true parameters are expected to have (Morozov's discrepancy principle).
+        """The least prior at the misfit expected of the true parameters (Morozov's discrepancy principle).
 
         That is the least, at the end of `steps`, and the noise's variance for each combination that the data determine;
         the stated noise's where no more rows than those are left to show it.
@@ -163,16 +172,18 @@ class _Path:
             if step is None:
                 break
             below, above = (step, above) if step.misfit <= target else (below, step)
-        message = "estimator: with ridge 0 the misfit goes on falling while parameters that the data do not determine grow "
+        message = (
+            "estimator: with ridge 0 the misfit goes on falling while parameters that the data do not determine grow "
+        )
         message += f"without bound ({self.away(steps[-1]):.0f} scales); taken is the least prior at the misfit "
         message += f"expected of the true parameters, as with ridge {below.ridge:.1g}; accepted: a ridge"
         warnings.warn(message, NumericalWarning, stacklevel=6)
-        return Vanishing(below.conic)
+        return below.vanishing
 
 
 @dataclass(frozen=True)
 class _Held:
-    """The prior alone, with what the `data` determine, so many combinations as have `rank`, held at the least misfit."""
+    """The prior alone, with the `rank` combinations that the `data` determine held at the least misfit."""
 
     conic: ConicProblem
     data: ConicProblem
@@ -198,16 +209,20 @@ class _Held:
 
     def through(self, x: Array) -> Vanishing | None:
         """What is held, if the nearest point to x, (n,), that meets the equalities is inside the conditions."""
-        nearest = x - self.conic.E.T @ (self.conic.E @ x - self.conic.e)
+        nearest = self.nearest(x)
         exact = self.data.objective(nearest) - self.misfit <= _EXACT * max(self.misfit, self.data.floor)
         if not exact or self.conic.slack(nearest).min(initial=np.inf) <= _INSIDE:
             return None
         return Vanishing(replace(self.conic, start=nearest), self.misfit)
 
-    def searched(self) -> Vanishing | None:
-        """What is held, if a point inside the conditions is soon found."""
+    def nearest(self, x: Array) -> Array:
+        """The point next to x, (n,), with what is held."""
+        return np.asarray(x - self.conic.E.T @ (self.conic.E @ x - self.conic.e))
+
+    def searched(self, x: Array) -> Vanishing | None:
+        """What is held, if from x, (n,), a point inside the conditions is soon found."""
         try:
-            return self.through(interior(self.conic, _SEARCH)[0])
+            return self.through(interior(replace(self.conic, start=self.nearest(x)), _SEARCH)[0])
         except (InputError, np.linalg.LinAlgError):
             return None
 
