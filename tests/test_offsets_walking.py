@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from motions import value
 from recordings import Miscalibration
 from simulated import BIPED, LIFTING, SOLES, feet_of
@@ -20,8 +21,9 @@ from unknowns import Fit, fit
 from torchid import parameters
 from torchid.analysis.calibration import ExtraEstimate
 from torchid.analysis.known import APART, total_mass
+from torchid.cli import main
 from torchid.estimators import LeastSquares
-from torchid.logs import Log, preprocess, read_log
+from torchid.logs import Log, preprocess, read_log, write_log
 from torchid.problem import Samples, bind
 from torchid.problem.extras import ExtraTerms
 from torchid.robot import Robot
@@ -196,15 +198,7 @@ def true_offset(x: ExtraEstimate) -> float:
     return float(OFF[SOLES.index(x.extra.name), COMPONENTS.index(x.extra.component)])
 
 
-@pytest.mark.parametrize(
-    ("draws", "cutoff_hz"),
-    [
-        (4, 10.0),
-        (2, None),
-        pytest.param(40, 10.0, marks=pytest.mark.slow),
-        pytest.param(40, None, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("draws", "cutoff_hz"), [(3, 10.0), (2, None), pytest.param(40, 10.0, marks=pytest.mark.slow)])
 def test_readings_in_the_air_give_the_offsets_and_the_mass_where_the_acceleration_of_the_base_is_noisy(
     biped_folder: Path, draws: int, cutoff_hz: float | None
 ) -> None:
@@ -224,5 +218,36 @@ def test_readings_in_the_air_give_the_offsets_and_the_mass_where_the_acceleratio
             assert mass_error(blind) < -0.015, "or nothing is shown: 2 to 3 %, and at 4 standard errors"
             assert total_mass(blind.assembly, blind.estimate).told_apart, "the gait alone seems enough"
     assert np.abs(masses).max() < 5e-3
-    assert np.mean(held) >= (0.9 if draws > 20 else 0.5)
-    assert np.mean(offsets) >= (0.9 if draws > 20 else 0.8)
+    assert np.mean(offsets) >= (0.92 if draws > 20 else 0.8)
+    if cutoff_hz:  # without, noise in the regressor is 0.1 % of the mass, which no standard error tells
+        assert np.mean(held) >= (0.9 if draws > 20 else 0.5)
+
+
+def test_the_command_names_sensors_that_read_another_offset_in_the_air_or_nothing(
+    biped_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gait, rng = Gait.of(biped_folder, 10.0), np.random.default_rng(1)
+    sound, wrong = gait.recorded(rng)
+    wrench, lifted = value(wrong.contact_wrench_local).copy(), ~value(wrong.contact_active)
+    wrench[lifted[:, 0], 0, 2] += 45.0
+    wrench[lifted[:, 1], 1] = 0.0
+    write_log(sound, tmp_path / "sound.npz")
+    write_log(replace(wrong, contact_wrench_local=wrench), tmp_path / "wrong.npz")
+    noise = {name: float(x) for name, x in vars(gait.sensors.noise).items() if x is not None}
+    experiment = {
+        "robot": {"urdf": str(biped_folder / "nominal.urdf")},
+        "contacts": [{"frame": frame, "type": "flat"} for frame in SOLES],
+        "logs": {"train": ["sound.npz", "wrong.npz"], "test": []},
+        "preprocessing": {"cutoff_hz": 10.0, "sample_rate_hz": 200.0},
+        "sensors": {"set": "contacts", "offsets": {"contact_force": "log", "contact_moment": "log"}, "noise": noise},
+        "estimator": {"name": "least_squares", "ridge": 1e-6},
+        "output": "run",
+    }
+    (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(experiment))
+    assert main(["identify", str(tmp_path / "experiment.yaml")]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "in the air" in line]
+    assert len(said) == 2
+    zeros, contradiction = sorted(said, key=lambda line: "exactly 0" not in line)
+    assert "wrong.npz: fx, fy, fz, mx, my, mz of r_sole read exactly 0 in the air" in zeros
+    assert "wrong.npz: l_sole fz reads 105" in contradiction
+    assert "r_sole" not in contradiction

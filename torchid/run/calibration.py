@@ -174,9 +174,10 @@ def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: ob
     for log in dict.fromkeys(part.source for part in fit.parts):
         gated = {number for part in fit.parts if part.source == log for number in part.gated}
         if gated:
-            named = _grouped(builder.extras[number].label for number in sorted(gated))
-            message = f"{log}: in the air, the readings with the {named} are exactly 0, as if masked or clamped"
-            warnings.warn(f"{message}; they say nothing of these offsets", TorchidWarning, stacklevel=3)
+            channels = (builder.extras[number] for number in sorted(gated))
+            named = _grouped(f"{x.name} {x.component}" for x in channels)
+            message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
+            warnings.warn(f"{message}, which says nothing of their offsets", TorchidWarning, stacklevel=3)
     settings = scene.config.estimator
     assembly = assembled(on_ground, builder, scene.robot, settings, source)
     estimate = LeastSquares(settings.ridge, settings.rank_tolerance).solve(assembly.problem)
