@@ -7,7 +7,18 @@ from collections.abc import Iterator, Sequence
 
 #: Parts of names that tell the sides, and the ends, of a robot apart.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH", "LR RR")
-_ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH", "FL HL")
+_ENDS = (
+    "front rear",
+    "front hind",
+    "front back",
+    "fore hind",
+    "Front Rear",
+    "FL RL",
+    "FR RR",
+    "LF LH",
+    "RF RH",
+    "FL HL",
+)
 #: Joints of a chain up to which single neighbours are tried.
 _SHORT = 12
 

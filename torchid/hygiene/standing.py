@@ -46,7 +46,9 @@ def standing(log: Log, robot: Robot | None, contacts: Sequence[Contact]) -> Iter
         if mistake.field in _FIELDS and (found := _after(mistake, log, robot, contacts)) is not None and found < least:
             best, least = mistake, found
     if best is not None:
-        share = f"standing feet move {100 * moves:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
+        share = (
+            f"standing feet move {100 * moves:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
+        )
         yield Finding("unit, sign or frame", CONDEMNED, best.field, f"{best.found}: {share}", best.advice)
 
 
