@@ -16,8 +16,8 @@ from torchid.logs.quaternion import rotate
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
-#: Motion of standing feet, in that of the base above them, from which on mistakes are tried; soft soles and rolling feet
-#: leave 0.05 to 0.2.
+#: Motion of standing feet, in that of the base above them, from which on mistakes are tried; soft soles and feet that
+#: roll leave 0.05 to 0.2.
 MOVES = 0.3
 #: Share of it that a mistake must leave to be the explanation.
 BETTER = 1.0 / 3.0

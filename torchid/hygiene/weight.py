@@ -162,7 +162,7 @@ def _tilt(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterato
         )
         yield Finding("gravity", CONDEMNED, name, f"{text}{below}: reversed?", advice)
     else:
-        text = f"the accelerometer reads {text}, and the base is above the feet that carry it: a world whose z axis points down?"
+        text = f"imu_specific_force {text}, and the base is above its feet: a world whose z axis points down?"
         advice = "turn the world so that z points up; else look at the order of the quaternion"
         yield Finding("gravity", CONDEMNED, "base_quat_xyzw", text, advice)
 
