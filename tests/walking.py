@@ -226,8 +226,11 @@ def _carried(J: Array, needed: Array, ready: Array, kind: str) -> Array:
 
 
 @cache
-def truth(machine: Machine, seed: int, seconds: float = 12.0, rate: float = 200.0, share: float = 0.15) -> Truth:
-    """What happened to a robot that is up to `share` unlike its URDF."""
+def truth(
+    machine: Machine, seed: int, heading: float | None = None, seconds: float = 12.0, rate: float = 200.0,
+    share: float = 0.15,
+) -> Truth:  # fmt: skip
+    """What happened to a robot that is up to `share` unlike its URDF and walks along a heading [rad], None for any."""
     rng, robot = np.random.default_rng(seed), robot_of(machine)
     oracle = Oracle.of(robot)
     knots = np.arange(round(seconds * KNOTS_HZ) + 1) / KNOTS_HZ
@@ -252,8 +255,9 @@ def truth(machine: Machine, seed: int, seconds: float = 12.0, rate: float = 200.
         J = np.stack([oracle.jacobian(q, foot) for foot in machine.feet], axis=1)
     _unlike(oracle, rng, share)
     if not machine.bolted:  # the world's axes are anybody's
-        heading = Rotation.from_euler("z", rng.uniform(0.4, 1.2) * rng.choice([-1.0, 1.0]))
-        q[:, :3], q[:, 3:7] = heading.apply(q[:, :3]), (heading * Rotation.from_quat(q[:, 3:7])).as_quat()
+        anywhere = rng.uniform(0.4, 1.2) * rng.choice([-1.0, 1.0])
+        turn = Rotation.from_euler("z", anywhere if heading is None else heading)
+        q[:, :3], q[:, 3:7] = turn.apply(q[:, :3]), (turn * Rotation.from_quat(q[:, 3:7])).as_quat()
     needed = oracle.frictionless_forces(q, v, a)
     if not machine.bolted:
         wrench = _carried(J, needed, ready, machine.kind)
@@ -329,7 +333,9 @@ def recorded(machine: Machine, happened: Truth, sensors: str = "full", seed: int
 
     torque = read(happened.torque, 0.01 * np.sqrt(np.square(happened.torque).mean(axis=0)) + 0.02)
     if machine.bolted:
-        return Log(machine.name, time, robot.joint_names, q + 1e-4 * noise * rng.normal(size=q.shape), joint_torque=torque)
+        return Log(
+            machine.name, time, robot.joint_names, q + 1e-4 * noise * rng.normal(size=q.shape), joint_torque=torque
+        )
     active = happened.share > 0.0
     weight = 9.81 * float(robot.nominal[:, 0].sum())
     size = weight * np.array([2e-3, 2e-3, 2e-3, 2e-4, 2e-4, 2e-4])

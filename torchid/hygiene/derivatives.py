@@ -56,7 +56,7 @@ def judged(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -
     meanings = {**(LENGTHS if name.startswith("base_linear") else ANGLES), MINUTES: "time is in minutes"}
     away = np.array([np.abs(found.ratio / ratio - 1.0) for ratio in meanings])  # (meanings, c)
     named = follows & (away.min(axis=0) < _CLOSE)
-    for number, (ratio, meaning) in enumerate(meanings.items()):
+    for number, meaning in enumerate(meanings.values()):
         here = named & (away.argmin(axis=0) == number)
         if here.any():
             text = f"{found.ratio[here][0]:.4g} times the derivative of {base}: {meaning.format(base=base)}"

@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterator, Sequence
 
 #: Parts of names that tell the sides, and the ends, of a robot apart.
-_SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH", "LR RR")
-_ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH", "FL HL")
+_SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")
+_ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH")
 #: Joints of a chain up to which single neighbours are tried.
 _SHORT = 12
 
@@ -34,12 +34,13 @@ def neighbours(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
 
 def _exchanged(names: Sequence[str], pairs: Sequence[str]) -> tuple[str, ...] | None:
     """Every name with its part exchanged for the other; None unless these are the same names again."""
-    other = {one: two for pair in pairs for one, two in (pair.split(), pair.split()[::-1])}
-    token = re.compile("|".join(f"(?<![A-Za-z0-9]){part}(?![A-Za-z0-9])" for part in other))
-    found = tuple(token.sub(lambda match: other[match[0]], name) for name in names)
-    if sorted(found) == sorted(names):
-        return found if found != tuple(names) else _by_first_letter(names)
-    return _by_first_letter(names)
+    for some in (pairs, *([pair] for pair in pairs)):  # all together, or where two share a part, each alone
+        other = {one: two for pair in some for one, two in (pair.split(), pair.split()[::-1])}
+        token = re.compile("|".join(f"(?<![A-Za-z0-9]){part}(?![A-Za-z0-9])" for part in other))
+        found = tuple(token.sub(lambda match, other=other: other[match[0]], name) for name in names)
+        if sorted(found) == sorted(names) and found != tuple(names):
+            return found
+    return _by_first_letter(names) if pairs is _SIDES else None
 
 
 def _by_first_letter(names: Sequence[str]) -> tuple[str, ...] | None:

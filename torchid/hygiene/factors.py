@@ -87,7 +87,8 @@ def _gains(found: Gains, robot: Robot) -> Iterator[Finding]:
     known = spread < _KNOWN
     usual = float(np.median(found.gain[known])) if known.sum() >= _ENOUGH else 1.0
     relative, blocks = found.gain / usual, found.blocks[:, :m] / usual
-    off = _sure(relative - 1.0, spread / usual, blocks - 1.0) & (np.abs(np.log(np.maximum(relative, 1e-9))) > np.log(GAIN))
+    large = (relative > GAIN) | (relative < 1.0 / GAIN)
+    off = large & _sure(relative - 1.0, spread / usual, blocks - 1.0)
     if off.any():
         names = [robot.joint_names[joint] for joint in found.joints[off]]
         factors = listed([f"{gain:.3g} +- {sd:.2g}" for gain, sd in zip(relative[off], spread[off], strict=True)])

@@ -10,7 +10,16 @@ from torchid.errors import InputError
 from torchid.hygiene.factors import factor_findings, time_finding, time_fit
 from torchid.hygiene.finding import CONDEMNED, SUSPICIOUS, Finding, Skipped
 from torchid.hygiene.mistakes import mistakes
-from torchid.hygiene.model import DIFFERENTIATED_TO_TRY, TRIED, ModelFit, TorqueFit, bound, filtered, model_fit, usual_cutoff
+from torchid.hygiene.model import (
+    DIFFERENTIATED_TO_TRY,
+    TRIED,
+    ModelFit,
+    TorqueFit,
+    bound,
+    filtered,
+    model_fit,
+    usual_cutoff,
+)
 from torchid.logs import Log
 from torchid.logs.fields import WRENCHES, FloatArray
 from torchid.robot import Robot

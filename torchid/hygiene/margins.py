@@ -20,6 +20,7 @@ from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import by_state
 from torchid.problem.linear import parameter_scale
 from torchid.problem.threads import one_thread
+from torchid.regressor.motion import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
@@ -64,7 +65,7 @@ def known_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[C
     """The forces that are known throughout, with what no parameters explain of each kind as their noise."""
     torque = np.zeros(robot.dofs, bool)
     wrench = np.zeros((len(contacts), 6), bool)
-    size, moment = 0.0, 0.0
+    size = 0.0
     if all(part.torque is not None for part in samples):
         values = np.concatenate([part.torque.numpy() for part in samples if part.torque is not None])[:, : robot.n]
         torque[: robot.n] = np.isfinite(values).all(axis=0) & (np.abs(values) > NOTHING).any(axis=0)
@@ -77,9 +78,9 @@ def known_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[C
                 if part.wrench is not None
             ]
             wrench[k, list(contact.components)] = np.isfinite(np.concatenate(known)).all()
-    weight = 9.81 * float(robot.nominal[:, parameters.MASS].sum())
+    weight = -GRAVITY_WORLD[2] * float(robot.nominal[:, parameters.MASS].sum())
     moment = size or 0.1 * weight
-    noise = SensorNoise(*(max(UNMODELLED * x, _TINY) for x in (size or moment, 0.5 * weight, moment)))
+    noise = SensorNoise(*(max(UNMODELLED * x, _TINY) for x in (moment, 0.5 * weight, moment)))
     return SensorSet(torque, wrench, noise)
 
 

@@ -64,7 +64,9 @@ def mistakes(log: Log) -> Iterator[Mistake]:
         yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _quaternions(inverse))
     if log.imu_specific_force is not None:
         given = "reversed: gravity minus acceleration"
-        yield Mistake("imu_specific_force", given, "reverse it: it points up at rest", _scaled("imu_specific_force", -1.0))
+        yield Mistake(
+            "imu_specific_force", given, "reverse it: it points up at rest", _scaled("imu_specific_force", -1.0)
+        )
     if log.joint_torque is not None:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
         yield Mistake("joint_torque", "all reversed", reverse, _scaled("joint_torque", -1.0))

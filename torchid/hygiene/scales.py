@@ -90,7 +90,8 @@ def stretch(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
         quadratic = 2.0 * (first - none) - 4.0 * (second - none)
         terms = [none, first - none - quadratic, quadratic]
         projected = [rows[..., -1], *(np.einsum("nvr,nv->nr", W, term) for term in terms)]
-        loose = _of_joints(builder, W, one.joint_velocity, one.joint_acceleration, torch.ones_like(one.joint_velocity))
+        rate = one.joint_velocity
+        loose = _of_joints(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
         K = np.concatenate([rows[..., :-1] @ columns, *loose], axis=2)
         parts.append((K, np.stack(projected, axis=2), equations))
     found = gathered(*(np.concatenate(part) for part in zip(*parts, strict=True)))
@@ -158,8 +159,9 @@ def gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact])
         through = np.einsum("nvr,nvk->nrk", W, moved)
         without = rows[..., -1] - through[..., : len(joints)].sum(axis=2)
         target = rows[..., :-1] @ nominal - without
-        offsets = _of_joints(builder, W, torch.ones_like(part.joint_velocity))
-        K = np.concatenate([rows[..., :-1] @ columns, *offsets], axis=2)
+        rate = part.joint_velocity
+        loose = _of_joints(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
+        K = np.concatenate([rows[..., :-1] @ columns, *loose], axis=2)
         parts.append((K, np.concatenate([target[..., None], through], axis=2), equations))
     return _solved(gathered(*(np.concatenate(part) for part in zip(*parts, strict=True))), joints)
 

@@ -16,8 +16,8 @@ from torchid.logs.quaternion import rotate
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
-#: Motion of standing feet, in that of the base above them, from which on mistakes are tried; soft soles and rolling feet
-#: leave 0.05 to 0.2.
+#: Motion of standing feet, in that of the base above them, from which on mistakes are tried; soft soles and feet that
+#: roll leave 0.05 to 0.2.
 MOVES = 0.3
 #: Share of it that a mistake must leave to be the explanation.
 BETTER = 1.0 / 3.0
@@ -46,7 +46,9 @@ def standing(log: Log, robot: Robot | None, contacts: Sequence[Contact]) -> Iter
         if mistake.field in _FIELDS and (found := _after(mistake, log, robot, contacts)) is not None and found < least:
             best, least = mistake, found
     if best is not None:
-        share = f"standing feet move {100 * moves:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
+        share = (
+            f"standing feet move {100 * moves:.3g} % as much as the base above them, {100 * least:.2g} % once corrected"
+        )
         yield Finding("unit, sign or frame", CONDEMNED, best.field, f"{best.found}: {share}", best.advice)
 
 

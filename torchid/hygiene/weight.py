@@ -157,10 +157,12 @@ def _tilt(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterato
     above = _above_feet(log.select(np.flatnonzero(still)), robot, in_base)
     if above is None or above < 0.0:
         below = "" if above is None else ", and the base hangs below the feet that carry it"
-        advice = "reverse it if it is gravity minus acceleration; else look at the IMU's frame and the quaternion's order"
+        advice = (
+            "reverse it if it is gravity minus acceleration; else look at the IMU's frame and the quaternion's order"
+        )
         yield Finding("gravity", CONDEMNED, name, f"{text}{below}: reversed?", advice)
     else:
-        text = f"the accelerometer reads {text}, and the base is above the feet that carry it: a world whose z axis points down?"
+        text = f"imu_specific_force {text}, and the base is above its feet: a world whose z axis points down?"
         advice = "turn the world so that z points up; else look at the order of the quaternion"
         yield Finding("gravity", CONDEMNED, "base_quat_xyzw", text, advice)
 
