@@ -14,19 +14,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid import guards
+from torchid.errors import LogError, during
 from torchid.interrupts import interrupt_held_back, note_written
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
-from torchid.logs.limits import check_growth
 from torchid.logs.npz import Npz, open_archive
 from torchid.logs.spill import Sliced
 from torchid.text import shown
 
 SUFFIXES = (".npz", ".h5", ".hdf5")
-
-#: Most bytes that the arrays of one file may declare: 16 GiB are 2e7 samples of a 30-joint robot with three channels
-#: a joint. A compressed file of a few kilobytes can declare far more than any memory holds.
-MAX_BYTES = 16 * 2**30
 
 #: Characters of another package's message that a message of ours repeats.
 _LONGEST_TEXT = 200
@@ -90,11 +86,11 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
                 container = Npz(stack.enter_context(open_archive(path)))
             else:
                 h5py = import_h5py(path)
-                container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py)
+                container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
             total = sum(container.sizes().values())
-        if whole and total > MAX_BYTES:
-            raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_BYTES} bytes in all")
-        check_growth(path, total)
+        if whole and total > guards.MAX_ARRAYS:
+            raise LogError(path, "file", f"arrays of {total} bytes", f"at most {guards.MAX_ARRAYS} bytes in all")
+        guards.check_growth(path, total)
         yield container
 
 
@@ -107,7 +103,8 @@ def appearing_whole(path: Path) -> Iterator[Path]:
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        yield temporary
+        with during("writing", path):
+            yield temporary
         with interrupt_held_back():
             temporary.replace(path)
             note_written(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from textwrap import fill
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchid import parameters
+from torchid.errors import during
 from torchid.parameters import Array
 from torchid.report.metrics import BASE_ROWS, GROUPS, Metrics, group_name
 
@@ -25,6 +27,13 @@ STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.frameon": False,
 }
+
+
+def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
+    """Write a figure as a file; labels of ticks are made now, and may hold dollar signs as well."""
+    with during("drawing", path), matplotlib.rc_context(STYLE):
+        figure.savefig(path, dpi=130, format=kind)
+
 
 _MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
 

@@ -11,21 +11,11 @@ from pathlib import Path
 from typing import Protocol
 
 from torchid.errors import LogError
+from torchid.guards import plain
 from torchid.logs.container import translated
-from torchid.logs.limits import MAX_LETTERS
-from torchid.text import is_plain, shown
 
-#: Most bytes of one record. A camera's image has a few million, the chunk of messages around it hardly more.
-MAX_RECORD = 2**28
 #: What bags of any kind are read with.
 _PACKAGES = ("rosbags", "mcap", "zstandard")
-
-
-def plain(text: str) -> str:
-    """A name out of a bag, ValueError where no name is like that and no message can show it."""
-    if len(text) > MAX_LETTERS or not is_plain(text):
-        raise ValueError(f"a name of {len(text)} characters: {shown(text)}")
-    return text
 
 
 @dataclass(frozen=True)
