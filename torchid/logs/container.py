@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-import struct
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid import guards
-from torchid.errors import LogError, during
+from torchid.errors import LogError, TorchidError, during
 from torchid.interrupts import interrupt_held_back, note_written
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.npz import Npz, open_archive
@@ -26,11 +23,6 @@ SUFFIXES = (".npz", ".h5", ".hdf5")
 
 #: Characters of another package's message that a message of ours repeats.
 _LONGEST_TEXT = 200
-
-_UNREADABLE = (
-    OSError, EOFError, ValueError, TypeError, KeyError, RuntimeError, MemoryError, OverflowError,
-    struct.error, zlib.error, zipfile.BadZipFile,
-)  # fmt: skip
 
 
 class Container(Protocol):
@@ -47,14 +39,13 @@ class Container(Protocol):
 
 
 @contextlib.contextmanager
-def translated(source: str, field: str, accepted: str, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn whatever the readers raise on a damaged file into one LogError; `also`: what else they raise."""
-    failures: tuple[type[Exception], ...] = (*_UNREADABLE, *also)
+def translated(source: str, field: str, accepted: str) -> Iterator[None]:
+    """Turn whatever the readers raise on a damaged file, of which no list is ever complete, into one LogError."""
     try:
         yield
-    except LogError:
+    except TorchidError:
         raise
-    except failures as error:
+    except Exception as error:
         text = shown(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
         raise LogError(source, field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
 

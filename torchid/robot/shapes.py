@@ -228,9 +228,9 @@ def _vertices(urdf: Path, filename: str) -> Array:
     except Exception as error:  # noqa: B902 - readers of several formats raise what they like
         raise MeshError(f"{shown(filename)}: {type(error).__name__}: {shown(str(error))}") from error
     units = getattr(mesh, "units", None)
-    return _checked(filename, getattr(mesh, "vertices", ())) * (
-        trimesh.units.unit_conversion(units, "meters") if units else 1.0
-    )
+    with np.errstate(all="ignore"):  # of units that no mesh has, which the check that follows refuses
+        unit = trimesh.units.unit_conversion(units, "meters") if units else 1.0
+        return _checked(filename, np.asarray(getattr(mesh, "vertices", ())) * unit)
 
 
 def _of_stl(filename: str, content: bytes) -> np.ndarray:
