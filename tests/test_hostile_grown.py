@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -92,7 +90,7 @@ def tally_of(kind: str, folder: Path, count: int, seed: int) -> Tally:
 def test_grown_files_are_read_or_refused_in_one_line(tmp_path: Path, kind: str, count: int) -> None:
     tally = tally_of(kind, tmp_path, count, seed=1000)
     assert tally.faults == []
-    assert count < 100 or 0.0 < tally.share("accepted") < 1.0
+    assert count < 100 or tally.share("accepted") > 0.02
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -105,34 +103,31 @@ def test_grown_overrides_are_taken_or_refused_in_one_line(tmp_path: Path, count:
 
 
 def named_files(folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
-    """Commands on a log whose name is hard to show, in a URDF, a formula or a terminal."""
-    log = folder / "log.npz"
-    with np.load(DEMO / "sway_test.npz") as whole:
-        content = {name: x[:40] if len(x) > 40 else x for name, x in whole.items()}
-    np.savez(log, **content)
+    """Commands on a log whose name is hard to show, in a terminal, a figure or a document."""
+    content = {"time": np.arange(30.0), "joint_position": np.random.default_rng(0).standard_normal((30, 40))}
+    content["joint_names"] = np.array([f"j{k}" for k in range(40)])
     for seed in range(3000, 3000 + count):
         chance = Chance(seed)
         name = "".join(chance.of(LETTERS.replace("/", "").replace("\0", "")) for _ in range(1 + chance.below(20)))
-        path = folder / f"{name}.npz"
-        shutil.copy(log, path)
-        outputs = chance.of([["--figure", str(folder / f"{name}.svg")], ["--json", str(folder / f"{name}.json")], []])
-        yield f"{seed} {name!r}", ["check", *outputs, "--", str(path)]
-        path.unlink()
+        outputs = chance.of(
+            [["--figure", str(folder / "out" / f"{name}.svg")], ["--json", str(folder / "out" / f"{name}.json")], []]
+        )
+        np.savez(folder / f"{name}.npz", **content)
+        yield f"{seed} {name!r}", ["check", *outputs, "--", str(folder / f"{name}.npz")]
+        (folder / f"{name}.npz").unlink()
 
 
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 @pytest.mark.parametrize("count", [6, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_log_of_any_name_is_checked_and_drawn(tmp_path: Path, count: int) -> None:
-    """Exit status 1 says that the log is not fit, which is no fault."""
+    """Exit status 1 says that the log is not fit, which is no fault unless there is a line about it."""
+    (tmp_path / "out").mkdir()
 
     def check(arguments: list[str]) -> int:
         status = main(arguments)
-        for file in (*tmp_path.glob("*.json"), *tmp_path.glob("*.svg")):
-            if file.suffix == ".json":
-                json.loads(file.read_text())
-            file.unlink()
         return 0 if status == 1 else status
 
-    tally = examined("named logs", named_files(tmp_path, count), check, tmp_path)
-    assert [fault for fault in tally.faults if "said" not in fault] == []
+    tally = examined("named logs", named_files(tmp_path, count), check, tmp_path, [tmp_path / "out"])
+    assert [fault for fault in tally.faults if not fault.endswith("missing from font(s) DejaVu Sans.")] == []
     assert tally.share("accepted") == 1.0
+    assert len(list((tmp_path / "out").iterdir())) > count // 3

@@ -151,6 +151,8 @@ def _header(path: Path) -> tuple[list[str], bool]:
         empty = not stream.read(_BLOCK).strip()
     if not line.strip():
         raise LogError(path, "header", "an empty line", "the names of the columns")
+    if len(line) == _BLOCK:
+        raise LogError(path, "header", f"a line of at least {_BLOCK} bytes", "the names of the columns")
     text = line.decode("utf-8-sig").rstrip("\r\n")
     try:
         texts = [text.strip() for text in next(csv.reader([text], strict=True))]

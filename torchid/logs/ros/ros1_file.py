@@ -13,6 +13,8 @@ from torchid.guards import MAX_TOPICS, Budget
 from torchid.logs.ros.expand import expanded
 from torchid.logs.ros.storage import Channel, Record
 
+_MAGIC = b"#ROSBAG V2.0\n"
+
 
 class _Reader(rosbag1.Reader):
     """The reader of rosbags, which trusts its files, with bounds on what a chunk and the index grow to."""
@@ -50,6 +52,9 @@ class Ros1File:
 
     def __init__(self, path: Path) -> None:
         """Open the file and read its index."""
+        with path.open("rb") as stream:  # of which the reader would read a whole line, however long
+            if stream.read(len(_MAGIC)) != _MAGIC:
+                raise ValueError("no bag of ROS 1 in version 2.0")
         self._reader = _Reader(path)
         self._reader.open()
 
