@@ -72,6 +72,12 @@ def test_bad_input_speaks_for_itself(capsys: pytest.CaptureFixture[str]) -> None
     assert (status, line.startswith("torchid: a\\x1b[31m\\u202eb c "), "reading" in line) == (2, True, False)
 
 
+def test_arguments_that_are_not_understood_are_repeated_in_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["check", "x.npz", f"--{EVIL}"])
+    assert all(map(is_plain, capsys.readouterr().err.split("\n")))
+
+
 def test_a_traceback_is_shown_to_who_asks(capsys: pytest.CaptureFixture[str]) -> None:
     assert guarded("torchid", lambda: {}["x"], debug=True) == 1
     assert "Traceback" in capsys.readouterr().err

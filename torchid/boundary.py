@@ -40,7 +40,7 @@ def guarded(program: str, command: Callable[[], int | None], debug: bool = False
         The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else, silently where nobody
         reads what is written any more.
     """
-    with _plain_streams(), warnings.catch_warnings(), _libraries_silent(debug):
+    with plain_streams(), warnings.catch_warnings(), _libraries_silent(debug):
         warnings.simplefilter("always", TorchidWarning)
         warnings.showwarning = _Warnings(program, debug)
         try:
@@ -105,7 +105,7 @@ def _forget(stream: object) -> None:
 
 
 @contextmanager
-def _plain_streams() -> Iterator[None]:
+def plain_streams() -> Iterator[None]:
     """Standard output and error without control characters in what is written."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (EscapedStream(stream) for stream in before)

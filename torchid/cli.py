@@ -10,7 +10,7 @@ from math import isfinite
 from textwrap import fill
 from typing import TYPE_CHECKING
 
-from torchid.boundary import guarded
+from torchid.boundary import guarded, plain_streams
 from torchid.errors import during
 from torchid.interrupts import interrupt_held_back as _interrupt_held_back
 
@@ -27,7 +27,8 @@ _SIMULATE = "let a robot move in simulation and write the logs of its sensors (n
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
-    options = _options(arguments)
+    with plain_streams():  # argparse repeats what it does not understand
+        options = _options(arguments)
     return guarded("torchid", lambda: _command(options), options.debug)
 
 

@@ -43,7 +43,7 @@ def translated(source: str, field: str, accepted: str) -> Iterator[None]:
     """Turn whatever the readers raise on a damaged file, of which no list is ever complete, into one LogError."""
     try:
         yield
-    except TorchidError:
+    except (TorchidError, Warning):
         raise
     except Exception as error:
         text = shown(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
