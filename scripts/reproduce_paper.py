@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from torchid.cli import guarded
+from torchid.boundary import guarded
 from torchid.config import load_simulation
 from torchid.report.tables import print_tables
 from torchid.run.folder import STUDY, check_free, new_folder

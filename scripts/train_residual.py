@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import Tensor, nn
 
 import torchid
-from torchid.cli import guarded
+from torchid.boundary import guarded
 from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.estimators import ResidualEffect, Sgd, Trainer

@@ -12,8 +12,8 @@ from hostile import examined
 from hostile_robots import WHOLE, damaged, damaged_meshes, meshes, shuffled, tree, urdfs
 
 from torchid.errors import TorchidWarning, UrdfError
+from torchid.guards import MAX_LINKS, MAX_NUMBER
 from torchid.robot import Robot, body_extents, load_robot
-from torchid.robot.urdf import MAX_LINKS, MAX_NUMBER
 
 COUNTS = [60, pytest.param(600, marks=pytest.mark.slow)]
 SHARES = [6, pytest.param(1, marks=pytest.mark.slow)]

@@ -12,11 +12,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from torchid import guards
 from torchid.errors import LogError, UnknownNameError
+from torchid.guards import MAX_COLUMNS
 from torchid.logs import Log, read_log, write_log
-from torchid.logs import container as container_module
 from torchid.logs.checks import LARGEST
-from torchid.logs.columns import MAX_COLUMNS
 
 Columns = dict[str, Sequence[Any]]
 SUFFIXES = (".csv", ".parquet")
@@ -253,12 +253,12 @@ def test_sizes_without_bounds_are_refused_before_they_fill_the_memory(
     wide = {"time": zeros, **{f"joint_position.j{i}": zeros for i in range(30)}}
     pq.write_table(pa.table(wide), tmp_path / "bomb.parquet")
     assert (tmp_path / "bomb.parquet").stat().st_size < 300_000
-    assert "times the file's size" in message_of(tmp_path / "bomb.parquet")
+    assert "in a file of this size" in message_of(tmp_path / "bomb.parquet")
     (tmp_path / "line.csv").write_bytes(b"time," * 2_000_000)
     assert "columns" in message_of(tmp_path / "line.csv")
     (tmp_path / "row.csv").write_bytes(b"time,joint_position.a\n0," + b"1" * 10_000_000)
     assert "cannot be read" in message_of(tmp_path / "row.csv")
-    monkeypatch.setattr(container_module, "MAX_BYTES", 100)
+    monkeypatch.setattr(guards, "MAX_ARRAYS", 100)
     for suffix in SUFFIXES:
         assert "at most 100 bytes" in message_of(save(tmp_path / f"z{suffix}", columns()))
 

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import traceback
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
 from math import isfinite
 from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torchid import __version__
-from torchid.errors import BaseLostError, InputError, TorchidWarning
-from torchid.interrupts import begin, ending_interrupts, written
+from torchid.boundary import guarded, plain_streams
+from torchid.errors import during
 from torchid.interrupts import interrupt_held_back as _interrupt_held_back
 
 if TYPE_CHECKING:
@@ -32,35 +28,16 @@ _SIMULATE = "let a robot move in simulation and write the logs of its sensors (n
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
-    options = _options(arguments)
-    return guarded("torchid", lambda: options.command(options), options.debug)
+    with plain_streams():  # argparse repeats what it does not understand
+        options = _options(arguments)
+    return guarded("torchid", lambda: _command(options), options.debug)
 
 
-def guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
-    """Run a command so that whatever stops it is told in one line.
-
-    Returns:
-        The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", TorchidWarning)
-        warnings.showwarning = partial(_show_warning, program)
-        try:
-            begin()
-            with ending_interrupts():
-                return command() or 0
-        except (InputError, BaseLostError) as error:
-            print(f"{program}: {error}", file=sys.stderr)
-            return 2
-        except KeyboardInterrupt as interrupt:
-            print(f"{program}: {str(interrupt) or f'interrupted; {written()} was written'}", file=sys.stderr)
-            return 1
-        except Exception as error:  # a bug or a full disk: still no wall of text unless asked for
-            if debug:
-                traceback.print_exc()
-            what = " ".join(str(error).split())
-            print(f"{program}: {type(error).__name__}: {what} (--debug shows where)", file=sys.stderr)
-            return 1
+def _command(options: argparse.Namespace) -> int | None:
+    what = getattr(options, "file", getattr(options, "run", getattr(options, "source", "")))
+    with during(options.name, what):
+        status: int | None = options.command(options)
+        return status
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -119,8 +96,9 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--topics", metavar="FILE", help="experiment file whose logs.topics says what a bag holds")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
-    for command in (identify, evaluate, analyze, check, convert, simulate):
+    for name, command in commands.choices.items():
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
+        command.set_defaults(name=name)
     return parser
 
 
@@ -280,7 +258,3 @@ def _simulate(options: argparse.Namespace) -> None:
     found = simulate(config, options.file)
     print_tables(stability_table({name: asdict(stability) for name, stability in found.items()}))
     print(f"written to    {config.output}")
-
-
-def _show_warning(program: str, message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
-    print(f"{program}: {category.__name__}: {message}", file=sys.stderr)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+from torchid.text import one_line
 
 
 class TorchidError(Exception):
@@ -20,7 +23,7 @@ class InputError(TorchidError, ValueError):
     def __init__(self, source: object, field: str, found: str, accepted: str) -> None:
         self.source, self.field, self.found, self.accepted = str(source), field, found, accepted
         message = f"{source}: {field}: {found}; accepted: {accepted}"
-        super().__init__(" ".join(message.split()))
+        super().__init__(one_line(message))
 
     def __reduce__(self) -> tuple[object, ...]:
         """Errors of worker processes reach their parent."""
@@ -89,6 +92,27 @@ class NumericalWarning(TorchidWarning):
 def install(extra: str) -> str:
     """How to install the packages of an extra; the name torchid on PyPI is not ours."""
     return f"pip install '.[{extra}]' in the clone of torchid"
+
+
+@contextmanager
+def during(doing: str, source: object) -> Iterator[None]:
+    """Let an error that leaves the block say what was being done to which file: the innermost block says it.
+
+    Args:
+        doing: such as "reading".
+        source: the file or folder.
+    """
+    try:
+        yield
+    except Exception as error:
+        if not doing_of(error):
+            error._torchid_doing = f"{doing} {source}"  # type: ignore[attr-defined]
+        raise
+
+
+def doing_of(error: BaseException) -> str:
+    """What was being done when an error came up, as `during` noted; empty if it did not."""
+    return str(getattr(error, "_torchid_doing", ""))
 
 
 def nearest(name: str, valid: Iterable[str], limit: int = 3) -> str:

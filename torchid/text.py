@@ -3,24 +3,61 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
-_CONTROL = ("Cc", "Cs", "Zl", "Zp")  # they move the cursor, break the line, or are no character at all
-_TURNING = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"  # the direction in which the rest is shown
+#: Control characters, line breaks, halves of characters, and what is not seen but changes what is: directions, joints.
+_UNPLAIN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 def is_plain(text: str) -> bool:
-    """Whether a text has neither control characters nor line breaks."""
-    return text.isprintable() or not any(
-        unicodedata.category(letter) in _CONTROL or letter in _TURNING for letter in text
-    )
+    """Whether a text has neither control characters, seen or not, nor line breaks."""
+    return text.isprintable() or not any(unicodedata.category(letter) in _UNPLAIN for letter in text)
 
 
 def shown(text: str, longest: int = 100) -> str:
     """The text as a message may repeat it: control characters as escapes, the middle of a long one left out."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 4 :]} ({len(text)} characters)"
-    return "".join(letter if is_plain(letter) else ascii(letter)[1:-1] for letter in text)
+    return escaped(text)
+
+
+def escaped(text: str, kept: str = "") -> str:
+    """The text with what is not plain as escapes, but for some characters that are kept."""
+    if is_plain(text):
+        return text
+    return "".join(letter if letter in kept or is_plain(letter) else ascii(letter)[1:-1] for letter in text)
+
+
+def one_line(text: str) -> str:
+    """The text on one line, of plain characters."""
+    return escaped(" ".join(text.split()))
+
+
+class EscapedStream:
+    """A stream for people, to which nothing is written that moves the cursor or hides: only lines of plain text."""
+
+    def __init__(self, stream: Any) -> None:
+        """Write to a stream, which `unescaped` gives back to who takes care of itself."""
+        self.plain_stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text; its length."""
+        self.plain_stream.write(escaped(text, "\n\t"))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write texts."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.plain_stream, name)
+
+
+def unescaped(stream: Any) -> Any:
+    """The stream below an `EscapedStream`."""
+    return getattr(stream, "plain_stream", stream)
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,12 +17,17 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
-from torchid.config.scan import MAX_BYTES, MAX_DEPTH, check_yaml
-from torchid.errors import ConfigError, UnknownNameError
+from torchid.config.scan import check_yaml
+from torchid.errors import ConfigError, UnknownNameError, during
+from torchid.guards import MAX_DEPTH, MAX_YAML, read_bytes
 from torchid.logs.kinds import READABLE
 from torchid.text import is_plain, shown
 
-_NO_YAML = (OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, AssertionError)
+#: What YAML and OmegaConf raise at a value that is not what its tag or its place says.
+_NO_YAML = (
+    OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, AssertionError, AttributeError, LookupError,
+    ArithmeticError, RecursionError,
+)  # fmt: skip
 _LONGEST = 300  # characters of another package's message that a message of ours repeats
 _LONGEST_NAME, _LONGEST_PATH = 255, 4095  # bytes, of file systems
 
@@ -84,6 +88,11 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
         ConfigError: unreadable file, a value of the wrong kind, a missing key.
         UnknownNameError: a key that does not exist; the message names the nearest that do.
     """
+    with during("reading", path):
+        return _load(kind, path, overrides)
+
+
+def _load(kind: FileKind[T], path: Path, overrides: Sequence[str]) -> T:
     in_file = _absolute(path, _read(kind, path), kind.paths, path.resolve().parent)
     settings = kind.prepare(_absolute(path, in_file, kind.outputs, Path.cwd()), {})
     for text in overrides:
@@ -107,14 +116,13 @@ def dump(settings: object) -> str:
 
 def _read(kind: FileKind[T], path: Path) -> Settings:
     try:
-        text = _text(path)
+        text = read_bytes(path, MAX_YAML).decode()
         check_yaml(text)
         loaded = _container(OmegaConf.create(text))
     except OSError as error:
         raise ConfigError(path, "file", f"cannot be read ({error.strerror})", f"a YAML {kind.name} file") from error
     except _NO_YAML as error:
-        why = "no text" if isinstance(error, UnicodeDecodeError) else shown(str(error), _LONGEST)
-        raise _no_settings(kind, path, f"not readable: {why}", "a YAML mapping") from error
+        raise _no_settings(kind, path, f"not readable: {_why(error)}", "a YAML mapping") from error
     if not isinstance(loaded, dict):
         raise _no_settings(kind, path, f"a {type(loaded).__name__}", f"a mapping with {kind.keys}")
     return loaded
@@ -126,12 +134,12 @@ def _no_settings(kind: FileKind[T], path: Path, found: str, accepted: str) -> Co
     return ConfigError(path, "YAML", found, accepted)
 
 
-def _text(path: Path) -> str:
-    """What a file holds, or so much of it that it is too much."""
-    if path.exists() and not path.is_file():
-        raise OSError(errno.EISDIR, "a folder" if path.is_dir() else "no file")  # a pipe could keep us waiting
-    with path.open("rb") as stream:
-        return stream.read(MAX_BYTES + 1).decode()
+def _why(error: Exception) -> str:
+    """What a reader of YAML found, in its own words where these are made for readers."""
+    if isinstance(error, UnicodeDecodeError):
+        return "no text"
+    spoken = isinstance(error, (OmegaConfBaseException, yaml.YAMLError, ValueError))
+    return shown(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
 
 
 def _parsed(text: str) -> Settings:
@@ -145,8 +153,7 @@ def _parsed(text: str) -> Settings:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         return _container(OmegaConf.from_dotlist([text]))
     except _NO_YAML as error:
-        found = shown(str(error), _LONGEST)
-        raise ConfigError("command line", shown(text), found, "key.subkey=value, in YAML") from error
+        raise ConfigError("command line", shown(text), _why(error), "key.subkey=value, in YAML") from error
 
 
 def _cleared(settings: Settings, given: Settings) -> Settings:

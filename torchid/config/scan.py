@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import yaml
 
+from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML
 from torchid.text import is_plain, shown
 
-#: Bytes of a file, nesting, entries with aliases unfolded, and characters of one entry.
-MAX_BYTES, MAX_DEPTH, MAX_NODES, MAX_LETTERS = 2**20, 30, 5000, 5000
-
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_TAG = "tag:yaml.org,2002:"
+#: Tags that settings may have; others make dates, sets or bytes, which stand nowhere in them.
+_KINDS = ("str", "int", "float", "bool", "null", "map", "seq", "merge")
+_NUMBERS = ("int", "float", "bool", "null")
 
 
 class _Count:
@@ -43,10 +45,11 @@ def check_yaml(text: str) -> None:
     Raises:
         ValueError, yaml.YAMLError: what was found.
     """
-    if len(text) > MAX_BYTES:
-        raise ValueError(f"more than {MAX_BYTES} bytes")
+    if len(text) > MAX_YAML:
+        raise ValueError(f"more than {MAX_YAML} bytes")
     count = _Count()
     for event in yaml.parse(text, Loader=_LOADER):
+        _check_tag(event)
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in count.anchored:
                 raise ValueError(f"'*{shown(str(event.anchor))}', which stands for nothing complete")
@@ -62,9 +65,23 @@ def check_yaml(text: str) -> None:
                 count.anchored[event.anchor] = 1
 
 
+def _check_tag(event: yaml.Event) -> None:
+    """Refuse a tag that says what its value is not: what builds values of it fails in ways of its own."""
+    tag = getattr(event, "tag", None)
+    if tag in (None, "!"):
+        return
+    kind = tag.removeprefix(_TAG)
+    if kind not in _KINDS:
+        raise ValueError(f"the tag '{shown(tag)}', which settings have no use for")
+    if isinstance(event, yaml.ScalarEvent) and kind in _NUMBERS:
+        resolved = yaml.resolver.Resolver().resolve(yaml.ScalarNode, event.value, (True, False)).removeprefix(_TAG)
+        if resolved != kind and (kind, resolved) != ("float", "int"):
+            raise ValueError(f"'{shown(event.value)}', which is no !!{kind}")
+
+
 def _check_scalar(value: str) -> None:
-    if len(value) > MAX_LETTERS:
-        raise ValueError(f"a text of {len(value)} characters, more than {MAX_LETTERS}")
+    if len(value) > MAX_TEXT:
+        raise ValueError(f"a text of {len(value)} characters, more than {MAX_TEXT}")
     if not is_plain(value.replace("\n", "")):
         raise ValueError(f"'{shown(value)}', with a control character")
     if "${" in value:

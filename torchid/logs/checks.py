@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
+from torchid.guards import MAX_LETTERS
 from torchid.logs.fields import SHAPES, BoolArray, FloatArray, Shape
+from torchid.text import is_plain, shown
 from torchid.wrenches import COMPONENTS
 
 #: How far a quaternion's norm may be from 1 before it is refused rather than renormalised.
@@ -107,6 +109,9 @@ def as_names(source: str, name: str, array: NDArray[Any]) -> tuple[str, ...]:
         raise LogError(source, name, f"bytes that are no text ({error})", "UTF-8 strings") from error
     seen: set[str] = set()
     for i, item in enumerate(names):
+        if len(item) > MAX_LETTERS or not is_plain(item):
+            accepted = f"printable names of at most {MAX_LETTERS} characters"
+            raise LogError(source, name, f"'{shown(item)}' at {i}", accepted)
         if not item or item in seen:
             found = f"'{item}' again at {i}" if item else f"an empty name at {i}"
             raise LogError(source, name, found, "names that are all different")

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid import guards
 from torchid.errors import LogError
-from torchid.logs import limits
+from torchid.guards import MAX_COLUMNS
 from torchid.logs.fields import NAMES, SHAPES, VARIANTS, UnknownFieldError, is_quaternion, shape_of
 from torchid.text import is_plain, shown
 from torchid.wrenches import COMPONENTS
@@ -19,8 +20,8 @@ from torchid.wrenches import COMPONENTS
 #: The one column of text: the same in every row.
 TEXT = "imu_frame"
 FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAMES)
-#: Most columns of a table, and characters in the name of one. A humanoid with every sensor has about 500 columns.
-MAX_COLUMNS, MAX_LETTERS = 20_000, 2 * limits.MAX_LETTERS
+#: Characters in the name of a column, which holds that of a joint.
+MAX_LETTERS = 2 * guards.MAX_LETTERS
 
 _UNIT = re.compile(r"\[.*\]$|\(.*\)$")
 _KIND = {"joint_names": "joint", "contact_names": "contact", "ft_names": "sensor"}

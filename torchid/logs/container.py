@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import struct
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,9 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid import guards
+from torchid.errors import LogError, TorchidError, during
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
-from torchid.logs.limits import check_growth
 from torchid.logs.npz import Npz, open_archive
 from torchid.logs.spill import Sliced
 from torchid.staging import whole_file
@@ -23,17 +20,8 @@ from torchid.text import shown
 
 SUFFIXES = (".npz", ".h5", ".hdf5")
 
-#: Most bytes that the arrays of one file may declare: 16 GiB are 2e7 samples of a 30-joint robot with three channels
-#: a joint. A compressed file of a few kilobytes can declare far more than any memory holds.
-MAX_BYTES = 16 * 2**30
-
 #: Characters of another package's message that a message of ours repeats.
 _LONGEST_TEXT = 200
-
-_UNREADABLE = (
-    OSError, EOFError, ValueError, TypeError, KeyError, RuntimeError, MemoryError, OverflowError,
-    struct.error, zlib.error, zipfile.BadZipFile,
-)  # fmt: skip
 
 
 class Container(Protocol):
@@ -50,14 +38,13 @@ class Container(Protocol):
 
 
 @contextlib.contextmanager
-def translated(source: str, field: str, accepted: str, also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn whatever the readers raise on a damaged file into one LogError; `also`: what else they raise."""
-    failures: tuple[type[Exception], ...] = (*_UNREADABLE, *also)
+def translated(source: str, field: str, accepted: str) -> Iterator[None]:
+    """Turn whatever the readers raise on a damaged file, of which no list is ever complete, into one LogError."""
     try:
         yield
-    except LogError:
+    except (TorchidError, Warning):
         raise
-    except failures as error:
+    except Exception as error:
         text = shown(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
         raise LogError(source, field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
 
@@ -89,11 +76,11 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
                 container = Npz(stack.enter_context(open_archive(path)))
             else:
                 h5py = import_h5py(path)
-                container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py)
+                container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
             total = sum(container.sizes().values())
-        if whole and total > MAX_BYTES:
-            raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_BYTES} bytes in all")
-        check_growth(path, total)
+        if whole and total > guards.MAX_ARRAYS:
+            raise LogError(path, "file", f"arrays of {total} bytes", f"at most {guards.MAX_ARRAYS} bytes in all")
+        guards.check_growth(path, total)
         yield container
 
 
@@ -105,7 +92,7 @@ def appearing_whole(path: Path) -> Iterator[Path]:
         LogError: the file cannot be written.
     """
     try:
-        with whole_file(path) as temporary:
+        with whole_file(path) as temporary, during("writing", path):
             yield temporary
     except OSError as error:
         raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error

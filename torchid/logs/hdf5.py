@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.logs.limits import MAX_SMALL, check_fields, check_names
+from torchid.guards import MAX_SMALL, check_fields, check_names
+from torchid.logs.chunks import Measured, chunk_bytes
 from torchid.logs.spill import Sliced
 
 _OVERHEAD = 4096  # bytes that an array takes up beside its numbers
@@ -21,8 +22,8 @@ _OVERHEAD = 4096  # bytes that an array takes up beside its numbers
 class Hdf5:
     """The datasets of an open file. Links are not followed: the numbers of a log stand in its file."""
 
-    def __init__(self, file: Any, h5py: Any) -> None:
-        self._file, self._h5py = file, h5py
+    def __init__(self, file: Any, h5py: Any, file_size: int) -> None:
+        self._file, self._h5py, self._file_size = file, h5py, file_size
 
     def sizes(self) -> dict[str, int]:
         """Declared bytes of each array, by name."""
@@ -32,9 +33,12 @@ class Hdf5:
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`; text is an array of UTF-8 bytes."""
         item = self._plain(name)
+        if item.chunks:
+            Measured(item).measure(slice(None))
         text = self._h5py.check_string_dtype(item.dtype)
         if text is not None:
             check_names(item.shape, text.length or 0)
+            check_names(item.chunks or ())
             # bytes rather than h5py's own decoding, which takes fixed-width text for ASCII
             return np.asarray(item[()]) if text.length else self._texts(item)
         if item.dtype.hasobject:  # references or ragged rows, of any size: what is wrong with them is said by others
@@ -44,10 +48,12 @@ class Hdf5:
     def sliced(self, name: str, folder: Path) -> Sliced:
         """The array `name`, read where it is sliced."""
         item = self._plain(name)
-        chunk = math.prod(item.chunks or (0,)) * item.dtype.itemsize
+        chunk = chunk_bytes(item, self._file_size)
         if chunk > MAX_SMALL:
             raise ValueError(f"chunks of {chunk} bytes, more than the {MAX_SMALL} that are read at a time")
-        return np.asarray(self.load(name)) if item.dtype.hasobject or not item.shape else item
+        if item.dtype.hasobject or not item.shape:
+            return np.asarray(self.load(name))
+        return Measured(item) if item.chunks else item
 
     def _plain(self, name: str) -> Any:
         """The dataset `name`; TypeError where it has no values in this file."""
@@ -69,7 +75,7 @@ class Hdf5:
         item = self._dataset(name)
         if item is None or item.shape is None:
             return 0
-        return int(item.dtype.itemsize) * max(math.prod(item.shape), math.prod(item.chunks or (0,)))
+        return max(int(item.dtype.itemsize) * math.prod(item.shape), chunk_bytes(item, self._file_size))
 
     def _dataset(self, name: str) -> Any:
         """The dataset `name` of the file itself, None where there is none."""

@@ -36,7 +36,8 @@ def kind_to_read(path: Path) -> Kind:
         raise LogError(path, "file", "a folder", f"a log ({', '.join(READABLE)}), or a folder that ROS 2 recorded")
     kind = _kind(path, READABLE)
     if not os.path.isfile(path):
-        raise LogError(path, "file", "no such file", f"an existing log ({', '.join(READABLE)})")
+        found = "a pipe, a device or a socket" if os.path.exists(path) else "no such file"
+        raise LogError(path, "file", found, f"an existing log ({', '.join(READABLE)})")
     return kind
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.logs.limits import check_fields, check_names
+from torchid.guards import check_fields, check_names
 from torchid.logs.spill import Sliced, Spill
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid.errors import LogError, during
 from torchid.logs.checks import (
     as_flags,
     as_frame,
@@ -68,13 +68,15 @@ def read_log(
     Warns:
         TorchidWarning: of a bag, that messages carry no time or come twice, or that a channel is NaN in some of them.
     """
-    source, kind = os.fspath(path), kind_to_read(Path(path))
-    if kind is Kind.ARRAYS:
-        raw = _arrays(source)
-    else:
-        raw = read_table(Path(path)) if kind is Kind.TABLE else read_bag(Path(path), topics, progress)
-        check_fields_given(source, raw)
-    return checked_log(source, raw, allow_gaps)
+    source = os.fspath(path)
+    with during("reading", source):
+        kind = kind_to_read(Path(path))
+        if kind is Kind.ARRAYS:
+            raw = _arrays(source)
+        else:
+            raw = read_table(Path(path)) if kind is Kind.TABLE else read_bag(Path(path), topics, progress)
+            check_fields_given(source, raw)
+        return checked_log(source, raw, allow_gaps)
 
 
 def checked_log(source: str, raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid import guards
 from torchid.errors import LogError, install
-from torchid.logs import container
+from torchid.guards import check_growth, check_names
 from torchid.logs.columns import TEXT, Layout, columns_of, layout_of
 from torchid.logs.container import appearing_whole, translated
 from torchid.logs.fields import NAMES
-from torchid.logs.limits import check_growth, check_names
 from torchid.text import shown
 
 #: Bytes of a CSV file that are parsed at a time; no row may be longer.
@@ -28,7 +28,7 @@ _ROWS = 2**16
 #: shows where the file has checksums.
 _PARQUET = {
     "thrift_string_size_limit": 2**26,
-    "thrift_container_size_limit": 2**22,
+    "thrift_container_size_limit": guards.MAX_SCHEMA,
     "page_checksum_verification": True,
 }
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
@@ -68,16 +68,13 @@ def _fields(pa: Any, path: Path, layout: Layout, batches: list[Any]) -> dict[str
     """The fields of some rows; forgets the batches."""
     table = pa.Table.from_batches(batches) if batches else None
     samples = 0 if table is None else table.num_rows
+    columns = {} if table is None else dict(zip(table.column_names, table.columns, strict=True))
+    del table
     batches.clear()
 
     def take(column: str) -> NDArray[Any]:
-        nonlocal table
-        if table is None:
-            return np.zeros(0)
-        index = table.column_names.index(column)
-        values = table.column(index)
-        table = table.remove_column(index)  # frees the memory of what has been taken
-        return _values(pa, path, column, values)
+        # popped, which frees the memory of what has been taken
+        return _values(pa, path, column, columns.pop(column)) if columns else np.zeros(0)
 
     return layout.fields(samples, take)
 
@@ -154,6 +151,8 @@ def _header(path: Path) -> tuple[list[str], bool]:
         empty = not stream.read(_BLOCK).strip()
     if not line.strip():
         raise LogError(path, "header", "an empty line", "the names of the columns")
+    if len(line) == _BLOCK:
+        raise LogError(path, "header", f"a line of at least {_BLOCK} bytes", "the names of the columns")
     text = line.decode("utf-8-sig").rstrip("\r\n")
     try:
         texts = [text.strip() for text in next(csv.reader([text], strict=True))]
@@ -213,8 +212,8 @@ def table_size(path: Path) -> int:
 
 
 def _check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
-    if whole and 8 * rows * columns > container.MAX_BYTES:
-        accepted = f"at most {container.MAX_BYTES} bytes in all"
+    if whole and 8 * rows * columns > guards.MAX_ARRAYS:
+        accepted = f"at most {guards.MAX_ARRAYS} bytes in all"
         raise LogError(path, "file", f"{rows} rows of {columns} columns", accepted)
     check_growth(path, 8 * rows * columns)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from torchid.parameters import Array
 from torchid.report.figures import STYLE
@@ -67,6 +68,8 @@ def bar_figure(title: str, groups: Sequence[Bars]) -> Figure:
         for x, y, top in zip(place, median, greatest, strict=True):
             axis.annotate(f"{y:.2g}", (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=7)
         axis.set_yscale("log")
+        axis.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
+        axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         axis.margins(y=0.15)
         axis.set_xticks(place, list(group.heights), rotation=40, ha="right")
         axis.set_title(group.name, loc="left", fontsize=9)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from textwrap import fill
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from torchid import parameters
+from torchid.errors import during
 from torchid.parameters import Array
 from torchid.report.metrics import BASE_ROWS, GROUPS, Metrics, group_name
+from torchid.text import escaped
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -25,6 +29,18 @@ STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.frameon": False,
 }
+
+
+def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
+    """Write a figure as a file, its texts without control characters.
+
+    In the same style as it was made, for labels of ticks are made now, and may hold dollar signs as well.
+    """
+    with during("drawing", path), matplotlib.rc_context(STYLE):
+        for text in figure.findobj(Text):
+            text.set_text(escaped(text.get_text(), "\n"))
+        figure.savefig(path, dpi=130, format=kind)
+
 
 _MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
 

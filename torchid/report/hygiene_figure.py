@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 
 import matplotlib
 import numpy as np
@@ -17,9 +18,11 @@ from torchid.hygiene.channels import channel_names, unit
 from torchid.logs import Log
 from torchid.logs.fields import FloatArray
 from torchid.report.figures import STYLE
+from torchid.text import shown
 
 COLORS = {CONDEMNED: "tab:red", SUSPICIOUS: "tab:orange", NOTE: "tab:blue"}
 _ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0  # inches
+_LETTERS, _LONGEST = 130, 600  # of size 9 in a line, and in a title
 _POINTS = 2000
 _NARROW = 1.0 / 600.0  # of the width: a single sample of a long log is to be seen
 _RANGE = (0.5, 99.5)  # percentiles that fill a row
@@ -29,7 +32,7 @@ _RANGE = (0.5, 99.5)  # percentiles that fill a row
 def hygiene_figure(logs: Sequence[Checked]) -> Figure:
     """One panel per log, one row per channel, each with its range beside it; findings are marked in their color."""
     rows = [len(_rows(one.log)) for one in logs]
-    heights = [_ROW * count + _HEAD for count in rows]
+    heights = [_ROW * (count + _title(one).count("\n")) + _HEAD for count, one in zip(rows, logs, strict=True)]
     figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
     panels = figure.subplots(len(logs), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     for axes, one in zip(panels, logs, strict=True):
@@ -39,6 +42,11 @@ def hygiene_figure(logs: Sequence[Checked]) -> Figure:
     if marks:
         panels[0].legend(handles=marks, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(marks))
     return figure
+
+
+def _title(checked: Checked) -> str:
+    """Name and verdict, wrapped here: matplotlib takes a text that it wraps for a formula, whatever it is told."""
+    return fill(shown(f"{Path(checked.log.source).name}: {checked.verdict}", _LONGEST), _LETTERS)
 
 
 def _marked(checked: Checked) -> list[Finding]:
@@ -84,7 +92,7 @@ def _panel(axes: Axes, checked: Checked) -> None:
     beside.set_yticks(list(places.values()), [_range_text(*channel, rows[channel]) for channel in places], fontsize=6)
     beside.tick_params(axis="y", length=0)
     beside.set_ylabel(f"range that fills a row: {_RANGE[0]:g} % to {_RANGE[1]:g} % of the values")
-    axes.set_title(f"{Path(log.source).name}: {checked.verdict}", loc="left", fontsize=9, wrap=True)
+    axes.set_title(_title(checked), loc="left", fontsize=9)
 
 
 def _mark(axes: Axes, start: float, end: float, places: Sequence[int], lasts: float, severity: str) -> None:

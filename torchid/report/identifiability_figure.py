@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from torchid.estimators import Estimate
 from torchid.estimators.result import FIXED
@@ -34,6 +35,7 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
     values = estimate.singular_values
     right.semilogy(np.arange(1, len(values) + 1), values, ".", color="tab:blue", markersize=4)
+    right.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
     right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
     right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
     right.set_xlabel("number")

@@ -10,8 +10,9 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from torchid.analysis.calibration import ExtraEstimate
-from torchid.errors import InputError
+from torchid.errors import InputError, during
 from torchid.estimators import Estimate
+from torchid.guards import MAX_JSON, read_bytes
 from torchid.parameters import PARAMETERS, PER_BODY, UNITS, Array
 from torchid.robot import Robot
 
@@ -130,7 +131,8 @@ def read_parameters(path: Path, robot: Robot) -> Array:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text())
+        with during("reading", path):
+            document = json.loads(read_bytes(path, MAX_JSON).decode())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(path, "file", f"not readable as JSON ({error})", "a run's parameters.json") from error
     return document if isinstance(document, dict) else {}

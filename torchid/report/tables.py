@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich import box
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -19,13 +21,28 @@ from torchid.estimators import Estimate
 from torchid.estimators.result import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.report.metrics import GROUPS, Metrics
+from torchid.text import escaped, unescaped
 
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
 
 
+class PlainConsole(Console):
+    """A console whose own control codes pass, and none that stand in the texts it shows."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """The segments of what is shown, of plain text."""
+        for text, style, control in super().render(renderable, options):
+            yield Segment(text, style, control) if control else Segment(escaped(text, "\n"), style)
+
+
+def people_console(stderr: bool = False) -> Console:
+    """A console on standard output or error; the boundary's own care of these would also undo its colors."""
+    return PlainConsole(file=unescaped(sys.stderr if stderr else sys.stdout))
+
+
 def print_tables(*tables: Table) -> None:
     """Print to standard output, at most 100 columns wide; a file or pipe gets the full 100."""
-    console = Console()
+    console = people_console()
     console.width = min(console.width, 100) if console.is_terminal else 100
     for table in tables:
         console.print(table)
@@ -33,7 +50,7 @@ def print_tables(*tables: Table) -> None:
 
 def table_text(table: Table) -> str:
     """A table as plain text, 100 columns wide."""
-    console = Console(width=100, file=io.StringIO(), force_terminal=False)
+    console = PlainConsole(width=100, file=io.StringIO(), force_terminal=False)
     with console.capture() as captured:
         console.print(table)
     return captured.get()

@@ -7,17 +7,12 @@ from pathlib import Path, PurePosixPath
 
 from lxml import etree
 
+from torchid.guards import MAX_LINE, MAX_MESH, MAX_PARTS, MAX_UNFOLDED, in_mebibytes, read_bytes
 from torchid.robot.collada import check_collada
 from torchid.text import is_plain, shown
 
 FORMATS = ("stl", "obj", "dae", "ply", "off")
-_LARGEST = 32 * 2**20  # bytes; the largest of the robots that were looked at has 29 MB, which trimesh reads in 4 s
-_UNFOLDED = 64 * 2**20  # bytes of shapes in a COLLADA file, each counted as often as it is used
-_MOST_PARTS, _LONGEST_LINE = (
-    1000,
-    2**16,
-)  # of text: trimesh takes a millisecond for a part, and splits long lines slowly
-_PART = {"obj": b"usemtl", "stl": b"endsolid"}
+_PART = {"obj": b"usemtl"}
 
 
 class MeshError(Exception):
@@ -34,18 +29,16 @@ def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise MeshError(f"{shown(filename)}: none of {', '.join(FORMATS)}")
-    if path.stat().st_size > _LARGEST:
-        raise MeshError(f"{shown(filename)}: more than {_LARGEST // 2**20} MiB")
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, MAX_MESH)
         if kind == "dae":
-            check_collada(content, _UNFOLDED)
+            check_collada(content, MAX_UNFOLDED)
     except (OSError, ValueError, etree.XMLSyntaxError, RecursionError) as error:
         raise MeshError(f"{shown(filename)}: {type(error).__name__}: {shown(str(error))}") from error
-    if kind in _PART and content.count(_PART[kind]) > _MOST_PARTS:
-        raise MeshError(f"{shown(filename)}: more than {_MOST_PARTS} parts")
-    if kind == "obj" and max(map(len, content.splitlines()), default=0) > _LONGEST_LINE:
-        raise MeshError(f"{shown(filename)}: a line of more than {_LONGEST_LINE} bytes")
+    if kind in _PART and content.lower().count(_PART[kind]) > MAX_PARTS:
+        raise MeshError(f"{shown(filename)}: more than {MAX_PARTS} parts")
+    if kind == "obj" and max(map(len, content.splitlines()), default=0) > MAX_LINE:
+        raise MeshError(f"{shown(filename)}: a line of more than {in_mebibytes(MAX_LINE)}")
     return kind, content
 
 

@@ -13,7 +13,7 @@ import pytorch_kinematics as pk
 import torch
 
 from torchid import parameters
-from torchid.errors import MasslessBodyWarning, UnknownNameError, UrdfError
+from torchid.errors import MasslessBodyWarning, UnknownNameError, UrdfError, during
 from torchid.parameters import Array
 from torchid.robot.chain import JointGeometry, build_chain, joint_geometry, link_poses
 from torchid.robot.nominal import nominal_parameters
@@ -174,24 +174,25 @@ def load_robot(
         UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
     """
     path = Path(path)
-    links, joints = read_urdf(path)
-    tree = build_tree(path, links, joints, base_link, ft_joints)
-    nominal = nominal_parameters(path, tree, {link.name: link for link in links})
-    massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
-    if massless.all():
-        raise UrdfError(path, "<inertial>", "no link has mass", "at least one link with mass > 0")
-    bodies = tuple(
-        Body(
-            name,
-            parent=-1 if joint is None else joint.parent,
-            joint=joint,
-            links=tuple(link for link, (body, _) in tree.links.items() if body == index),
-            massless=bool(massless[index]),
+    with during("reading", path):
+        links, joints = read_urdf(path)
+        tree = build_tree(path, links, joints, base_link, ft_joints)
+        nominal = nominal_parameters(path, tree, {link.name: link for link in links})
+        massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
+        if massless.all():
+            raise UrdfError(path, "<inertial>", "no link has mass", "at least one link with mass > 0")
+        bodies = tuple(
+            Body(
+                name,
+                parent=-1 if joint is None else joint.parent,
+                joint=joint,
+                links=tuple(link for link, (body, _) in tree.links.items() if body == index),
+                massless=bool(massless[index]),
+            )
+            for index, (name, joint) in enumerate(zip(tree.names, tree.joints, strict=True))
         )
-        for index, (name, joint) in enumerate(zip(tree.names, tree.joints, strict=True))
-    )
-    _warn_of_massless_ends(path, bodies)
-    return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, build_chain(tree))
+        _warn_of_massless_ends(path, bodies)
+        return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, build_chain(tree))
 
 
 def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:

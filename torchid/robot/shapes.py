@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,21 +14,25 @@ import numpy as np
 import trimesh
 from lxml import etree
 from scipy.optimize import minimize_scalar
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Inertial
 
 from torchid.errors import TorchidWarning, UrdfError
+from torchid.guards import MAX_AXES, MAX_NUMBER, MAX_POINTS, MAX_SHAPES
 from torchid.parameters import Array
 from torchid.robot.mesh_files import MeshError, mesh_content
 from torchid.robot.robot import Robot
-from torchid.robot.urdf import MAX_NUMBER, parse_xml, read_urdf
+from torchid.robot.urdf import parse_xml, read_urdf
 from torchid.text import shown
 
 ShapeKind = Literal["collision", "visual"]
 SHAPE_TAGS = ("box", "sphere", "cylinder", "capsule", "mesh")
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _STL_HEAD, _FACE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_MOST_SHAPES = 300  # of a link: each gives axes to try on all others
+_CORNER = re.compile(rb"\bvertex\s+(\S{1,40})\s+(\S{1,40})\s+(\S{1,40})", re.IGNORECASE)
+_SAMPLE, _FEW = 20_000, 0.1  # points whose hull is tried first, and the share of corners that makes a hull worth it
+_PART = 2**16  # points that are turned at a time
 _THINNEST = 1e-3  # of the longest edge: a plate or a flat mesh keeps an interior
 
 
@@ -64,9 +69,9 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
 
     A link without shapes of the preferred kind counts with those of the other kind. A link that has mass and neither
     counts as the uniform box of its inertia, provided that another link of the body has shapes. The box has the axes,
-    of the body's link and of every shape, in which its volume is least. The ellipsoid's semi-axes are the box's half
-    edges times the least factor that encloses all: sqrt(3) around a box (the smallest ellipsoid there is), sqrt(2)
-    around a cylinder, 1 around a sphere.
+    of the body's link and of every shape, in which its volume is least; of shapes of very many points, the first few
+    are tried. The ellipsoid's semi-axes are the box's half edges times the least factor that encloses all: sqrt(3)
+    around a box (the smallest ellipsoid there is), sqrt(2) around a cylinder, 1 around a sphere.
 
     Args:
         robot: any; meshes are looked for in its URDF's package and, by `package://`, in those beside it.
@@ -85,12 +90,13 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
     chosen = [i for i, body in enumerate(robot.bodies) if not body.massless] if bodies is None else bodies
     found: dict[int, Extent] = {}
     shapeless, unreadable, reasons = [], [], []
+    meshes = _Meshes(robot.path)
     for index in chosen:
         body, shapes, unseen = robot.bodies[index], [], []
         try:
             for name in body.links:
                 T_body_link = robot.links[name][1]
-                of_link = _link_shapes(robot.path, elements[name], prefer)
+                of_link = _link_shapes(meshes, elements[name], prefer)
                 shapes += [shape.moved(T_body_link) for shape in of_link]
                 if not of_link and inertials[name] is not None and inertials[name].mass > 0.0:
                     unseen.append(_inertia_box(inertials[name]).moved(T_body_link))
@@ -115,26 +121,27 @@ def _warn(path: Path, what: str, bodies: list[str], reasons: list[str]) -> None:
         warnings.warn(message, TorchidWarning, stacklevel=3)
 
 
-def _link_shapes(path: Path, link: etree._Element, prefer: ShapeKind) -> list[_Shape]:
+def _link_shapes(meshes: _Meshes, link: etree._Element, prefer: ShapeKind) -> list[_Shape]:
     other = "visual" if prefer == "collision" else "collision"
     for tag in (prefer, other):
         elements = link.findall(tag)
         if elements:
             field = f"link '{link.get('name')}', <{tag}>"
-            if len(elements) > _MOST_SHAPES:
-                raise UrdfError(path, field, f"{len(elements)} of them", f"at most {_MOST_SHAPES}")
-            return [_shape(path, field, element) for element in elements]
+            if len(elements) > MAX_SHAPES:
+                raise UrdfError(meshes.urdf, field, f"{len(elements)} of them", f"at most {MAX_SHAPES}")
+            return [_shape(meshes, field, element) for element in elements]
     return []
 
 
-def _shape(path: Path, field: str, element: etree._Element) -> _Shape:
+def _shape(meshes: _Meshes, field: str, element: etree._Element) -> _Shape:
     """A shape in its link's frame."""
+    path = meshes.urdf
     geometry = element.find("geometry")
     tags = [] if geometry is None else [child for child in geometry if isinstance(child.tag, str)]  # and no comments
     if len(tags) != 1 or tags[0].tag not in SHAPE_TAGS:
         found = ", ".join(f"<{child.tag!s}>" for child in tags) or "no shape"
         raise UrdfError(path, f"{field} <geometry>", found, f"one of {', '.join(SHAPE_TAGS)}")
-    points, spread = _of_kind(path, f"{field} <{tags[0].tag!s}", tags[0])
+    points, spread = _of_kind(meshes, f"{field} <{tags[0].tag!s}", tags[0])
     origin, T = element.find("origin"), np.eye(4)
     if origin is not None:
         rpy, xyz = (_numbers(path, f"{field} <origin", origin, name, 3, "0 0 0") for name in ("rpy", "xyz"))
@@ -142,13 +149,14 @@ def _shape(path: Path, field: str, element: etree._Element) -> _Shape:
     return _Shape(points, spread, np.eye(3)).moved(T)
 
 
-def _of_kind(path: Path, field: str, shape: etree._Element) -> tuple[Array, Array]:
+def _of_kind(meshes: _Meshes, field: str, shape: etree._Element) -> tuple[Array, Array]:
     """Points (N, 3) and spread (3, 3) of a shape in its own frame."""
+    path = meshes.urdf
     if shape.tag == "box":
         return _CORNERS * _numbers(path, field, shape, "size", 3) / 2.0, np.zeros((3, 3))
     if shape.tag == "mesh":
         scale = _numbers(path, field, shape, "scale", 3, "1 1 1")
-        return _vertices(path, shape.get("filename", "")) * scale, np.zeros((3, 3))
+        return meshes.vertices(str(shape.get("filename", ""))) * scale, np.zeros((3, 3))
     (radius,) = _numbers(path, field, shape, "radius", 1)
     if shape.tag == "sphere":
         return np.zeros((1, 3)), radius * np.eye(3)
@@ -174,20 +182,65 @@ def _numbers(path: Path, field: str, element: etree._Element, name: str, count: 
     return values
 
 
+class _Meshes:
+    """The meshes that a URDF names, each read once, however often it is named."""
+
+    def __init__(self, urdf: Path) -> None:
+        """None is read yet."""
+        self.urdf, self._read, self._left = urdf, dict[str, Array | MeshError](), MAX_POINTS
+
+    def vertices(self, filename: str) -> Array:
+        """The corners (N, 3) [m] of a mesh; MeshError where it cannot be read, or all shapes have too many."""
+        if filename not in self._read:
+            try:
+                self._read[filename] = _corners(_vertices(self.urdf, filename))
+            except MeshError as error:
+                self._read[filename] = error
+        found = self._read[filename]
+        if isinstance(found, MeshError):
+            raise found
+        self._left -= len(found)
+        if self._left < 0:
+            raise MeshError(f"{shown(filename)}: shapes of more than {MAX_POINTS} points in all")
+        return found
+
+
+def _corners(points: Array) -> Array:
+    """The points of a mesh that reach furthest in some direction, (K, 3), where they are much fewer than all."""
+    try:
+        for sample in (points[:: max(1, len(points) // _SAMPLE)], points):
+            hull = ConvexHull(sample).vertices
+            if len(hull) > _FEW * len(sample):
+                return points
+    except QhullError:  # flat, or fewer than four
+        return points
+    return np.asarray(points[hull])
+
+
 def _vertices(urdf: Path, filename: str) -> Array:
     """Vertices (N, 3) [m] of a mesh, in the unit that the file states, if any; other files it names are not read."""
     kind, content = mesh_content(urdf, filename)
-    if kind == "stl" and len(content) == _STL_HEAD + _FACE.itemsize * int.from_bytes(content[80:_STL_HEAD], "little"):
-        return _checked(filename, np.frombuffer(content, _FACE, offset=_STL_HEAD)["corners"].reshape(-1, 3))
+    if kind == "stl":
+        return _checked(filename, _of_stl(filename, content))
     try:
         with np.errstate(all="ignore"):
             mesh = trimesh.load(io.BytesIO(content), kind, force="mesh", process=False, skip_materials=True)
     except Exception as error:  # noqa: B902 - readers of several formats raise what they like
         raise MeshError(f"{shown(filename)}: {type(error).__name__}: {shown(str(error))}") from error
     units = getattr(mesh, "units", None)
-    return _checked(filename, getattr(mesh, "vertices", ())) * (
-        trimesh.units.unit_conversion(units, "meters") if units else 1.0
-    )
+    with np.errstate(all="ignore"):  # of units that no mesh has, which the check that follows refuses
+        unit = trimesh.units.unit_conversion(units, "meters") if units else 1.0
+        return _checked(filename, np.asarray(getattr(mesh, "vertices", ())) * unit)
+
+
+def _of_stl(filename: str, content: bytes) -> np.ndarray:
+    """Corners (3 faces, 3) of an STL file, binary if its size says so, or else of text."""
+    if len(content) == _STL_HEAD + _FACE.itemsize * int.from_bytes(content[80:_STL_HEAD], "little"):
+        return np.frombuffer(content, _FACE, offset=_STL_HEAD)["corners"].reshape(-1, 3)
+    try:
+        return np.array(_CORNER.findall(content)).astype(np.float64).reshape(-1, 3)
+    except ValueError as error:
+        raise MeshError(f"{shown(filename)}: ValueError: {shown(str(error))}") from error
 
 
 def _checked(filename: str, vertices: object) -> Array:
@@ -213,7 +266,8 @@ def _extent(shapes: list[_Shape]) -> Extent | None:
     """Of one body's shapes, None if they are a point."""
     points, spreads = np.concatenate([shape.points for shape in shapes]), np.stack([shape.spread for shape in shapes])
     of_point = np.repeat(np.arange(len(shapes)), [len(shape.points) for shape in shapes])
-    boxes = [_box(points, spreads, of_point, axes) for axes in (np.eye(3), *(shape.axes for shape in shapes))]
+    tried = 1 + min(len(shapes), max(1, MAX_AXES // len(points)))
+    boxes = [_box(points, spreads, of_point, axes) for axes in (np.eye(3), *(shape.axes for shape in shapes))[:tried]]
     volumes = [float(np.prod(half)) for _, _, half in boxes]
     best = next(i for i, volume in enumerate(volumes) if volume <= min(volumes) * (1.0 + 1e-9))  # the link's if as good
     centre, axes, half = boxes[best]
@@ -234,8 +288,12 @@ def _box(points: Array, spreads: Array, of_point: np.ndarray, axes: Array) -> tu
         of_point: (N,), the shape of each point.
         axes: (3, 3), columns.
     """
-    along, wide = points @ axes, np.linalg.norm(np.swapaxes(spreads, 1, 2) @ axes, axis=1)[of_point]
-    top, bottom = (along + wide).max(axis=0), (along - wide).min(axis=0)
+    wide = np.linalg.norm(np.swapaxes(spreads, 1, 2) @ axes, axis=1)
+    top, bottom = np.full(3, -np.inf), np.full(3, np.inf)
+    for part in (slice(k, k + _PART) for k in range(0, len(points), _PART)):
+        along, beside = points[part] @ axes, wide[of_point[part]]
+        top = np.maximum(top, (along + beside).max(axis=0))
+        bottom = np.minimum(bottom, (along - beside).min(axis=0))
     return axes @ (top + bottom) / 2.0, axes, (top - bottom) / 2.0
 
 

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Joint, Link
 
 from torchid.errors import TorchidWarning, UnknownNameError, UrdfError
+from torchid.guards import MAX_NUMBER
 from torchid.parameters import Array
-from torchid.robot.urdf import MAX_NUMBER, MOVING_TYPES
+from torchid.robot.urdf import MOVING_TYPES
 
 FT_FIELD = "force/torque sensor at a fixed joint"
 

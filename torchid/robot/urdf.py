@@ -14,6 +14,7 @@ from lxml import etree
 from yourdfpy.urdf import Joint, Link
 
 from torchid.errors import UnknownNameError, UrdfError
+from torchid.guards import MAX_LETTERS, MAX_LINKS, MAX_NUMBER, MAX_URDF, in_mebibytes, read_bytes
 from torchid.text import is_plain, shown
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
@@ -24,11 +25,6 @@ _SCALARS = ("value", "multiplier", "offset", "damping", "friction", *_INERTIA_AT
 _NUMBERS = {"xyz": 3, "rpy": 3} | dict.fromkeys(_SCALARS, 1)  # how many an attribute holds
 _DECIMAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
 
-#: Bytes of a file, links, and characters of a name: the largest of the robots that were looked at has 0.2 MB and 130
-#: links. A chain of 300 joints takes pytorch-kinematics 2 s, of 800 it overflows its stack.
-MAX_BYTES, MAX_LINKS, MAX_LETTERS = 8 * 2**20, 300, 200
-MAX_NUMBER = 1e9  # kg, m or any other unit: their products stay far from what float64 can hold
-
 
 def parse_xml(path: Path) -> etree._ElementTree:
     """The URDF's XML tree; entities stay unresolved and nothing is fetched.
@@ -36,16 +32,15 @@ def parse_xml(path: Path) -> etree._ElementTree:
     Raises:
         UrdfError: the file is missing or is not well-formed XML with a `<robot>` root.
     """
-    try:
-        if path.exists() and not path.is_file():
-            raise OSError("a folder" if path.is_dir() else "no file")
-        with path.open("rb") as stream:  # not by its name: libxml2 would unpack what is compressed, without bounds
-            content = stream.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        found = "a folder" if path.is_dir() else "cannot be read" if path.exists() else "no such file"
-        raise UrdfError(path, "file", found, "a readable URDF file") from error
-    if len(content) > MAX_BYTES:
-        raise UrdfError(path, "file", f"more than {MAX_BYTES // 2**20} MiB", "a URDF, which is far smaller")
+    try:  # not by its name: libxml2 would unpack what is compressed, without bounds
+        content = read_bytes(path, MAX_URDF)
+    except FileNotFoundError as error:
+        raise UrdfError(path, "file", "no such file", "a readable URDF file") from error
+    except OSError as error:
+        raise UrdfError(path, "file", f"cannot be read ({error.strerror})", "a readable URDF file") from error
+    except ValueError as error:
+        accepted = f"a URDF of at most {in_mebibytes(MAX_URDF)}"
+        raise UrdfError(path, "file", f"cannot be read ({error})", accepted) from error
     try:
         tree = etree.parse(io.BytesIO(content), etree.XMLParser(resolve_entities=False, no_network=True))
     except (etree.XMLSyntaxError, ValueError, LookupError) as error:

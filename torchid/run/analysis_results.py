@@ -14,9 +14,11 @@ from torchid.analysis.base_parameters import BaseParameters
 from torchid.analysis.candidates import sensor_set
 from torchid.analysis.planner import SensorPlan
 from torchid.config import dump_config
+from torchid.errors import during
 from torchid.problem.plan import State
 from torchid.report.accuracy import SetAccuracy, accuracy_figure
 from torchid.report.analysis_document import base_document, base_text, checks_document, plan_document
+from torchid.report.figures import save_figure
 from torchid.report.tree_figure import tree_figure
 from torchid.run.experiment import Scene
 from torchid.run.folder import ANALYSIS, new_folder, write_json
@@ -65,12 +67,12 @@ def write_analysis(analysis: Analysis) -> None:
     if analysis.accuracies:
         document["accuracy"] = {name: found.as_dict() for name, found in analysis.accuracies.items()}
         figures["accuracy"] = accuracy_figure(analysis.accuracies)
-    with new_folder(analysis.output, scene.config.overwrite, ANALYSIS) as folder:
+    with during("writing", analysis.output), new_folder(analysis.output, scene.config.overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(scene.config))
         write_json(folder / "analysis.json", document)
         (folder / "base_parameters.txt").write_text("\n\n".join(texts))
         for name, figure in figures.items():
-            figure.savefig(folder / f"{name}.png", dpi=130)
+            save_figure(figure, folder / f"{name}.png")
 
 
 def _picture(scene: Scene, scenario: Scenario) -> Figure:

@@ -16,6 +16,7 @@ from torchid.hygiene import Checked, check
 from torchid.logs import Log, read_log
 from torchid.logs.container import appearing_whole
 from torchid.logs.ros.topics import Topics
+from torchid.report.figures import save_figure
 from torchid.report.hygiene_figure import hygiene_figure
 from torchid.report.hygiene_tables import hygiene_document
 from torchid.robot import load_robot
@@ -150,4 +151,4 @@ def write_outputs(checked: Sequence[Checked], document: str | None, figure: str 
             new.write_text(json.dumps(hygiene_document(checked), indent=1, allow_nan=False) + "\n")
     if figure is not None:
         with appearing_whole(Path(figure)) as new:
-            hygiene_figure(checked).savefig(new, dpi=130, format=Path(figure).suffix[1:].lower())
+            save_figure(hygiene_figure(checked), new, Path(figure).suffix[1:].lower())

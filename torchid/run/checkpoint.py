@@ -16,13 +16,13 @@ import torch
 
 from torchid.config.scan import check_yaml
 from torchid.errors import InputError
+from torchid.guards import MAX_STATE, check_regular
 from torchid.text import shown
 
 CHECKPOINT = "checkpoint.pt"
 
 _ACCEPTED = "a checkpoint that torchid wrote"
 _DIGEST = "digest"
-_MOST_ENTRIES = 10_000  # files in the archive, and values in the state: a few for each parameter group
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
@@ -103,11 +103,10 @@ def damage_refused(folder: Path) -> Iterator[None]:
 
 def _check_archive(path: Path) -> None:
     """Compare what was written with its checksums, which `torch.load` does not look at; nothing may have to unfold."""
-    if not path.is_file():
-        raise OSError("no such file")
+    check_regular(path)
     with zipfile.ZipFile(path) as file:
         entries = file.infolist()
-        if len(entries) > _MOST_ENTRIES or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        if len(entries) > MAX_STATE or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise zipfile.BadZipFile("compressed, or of too many parts")
         if any(entry.filename.endswith("constants.pkl") for entry in entries):
             raise zipfile.BadZipFile("a programme of torch.jit")
@@ -121,8 +120,8 @@ def _check_values(state: object) -> None:
     left, seen = [state], 0
     while left:
         value, seen = left.pop(), seen + 1
-        if seen > _MOST_ENTRIES:
-            raise ValueError(f"more than {_MOST_ENTRIES} values")
+        if seen > MAX_STATE:
+            raise ValueError(f"more than {MAX_STATE} values")
         if isinstance(value, dict):
             left += [*value.keys(), *value.values()]
         elif isinstance(value, (list, tuple)):

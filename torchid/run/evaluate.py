@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchid.config import load_config
-from torchid.errors import ConfigError, TorchidWarning
-from torchid.report.figures import error_figure
+from torchid.errors import ConfigError, TorchidWarning, during
+from torchid.guards import MAX_YAML, read_bytes
+from torchid.report.figures import error_figure, save_figure
 from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.parameters_json import read_parameters, read_shared_extras
 from torchid.run.calibration import Calibration, errors
@@ -70,11 +71,11 @@ def evaluate(
         }
         for path, count in reader.excluded.items():
             document[Path(path).stem]["excluded_samples"] = count
-        with new_folder(output, True, EVALUATION) as new:
-            (new / "config.yaml").write_text((folder / "config.yaml").read_text())
+        with during("writing", output), new_folder(output, True, EVALUATION) as new:
+            (new / "config.yaml").write_bytes(read_bytes(folder / "config.yaml", MAX_YAML))
             write_json(new / "metrics.json", document)
-            forces_of(evaluation, samples[0], both).savefig(new / "forces.png", dpi=130)
-            error_figure(metrics).savefig(new / "errors.png", dpi=130)
+            save_figure(forces_of(evaluation, samples[0], both), new / "forces.png")
+            save_figure(error_figure(metrics), new / "errors.png")
     return metrics, output
 
 

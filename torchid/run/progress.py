@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+from torchid.report.tables import people_console
 
 
 def progress_bars() -> Progress:
     """Bars that vanish when their work is done and stay silent where standard error is not a terminal."""
-    console = Console(stderr=True)
+    console = people_console(stderr=True)
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:<28}"),

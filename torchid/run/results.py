@@ -13,13 +13,21 @@ from torchid.analysis.calibration import ExtraEstimate
 from torchid.analysis.contributions import Contributions
 from torchid.analysis.known import TotalMass
 from torchid.config import ExperimentConfig, dump_config
+from torchid.errors import during
 from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Samples
 from torchid.problem.predict import force_series
 from torchid.problem.states import StateReport
 from torchid.report.extra_figure import extra_figure
-from torchid.report.figures import ForceSeries, contribution_figure, error_figure, force_figure, parameter_figure
+from torchid.report.figures import (
+    ForceSeries,
+    contribution_figure,
+    error_figure,
+    force_figure,
+    parameter_figure,
+    save_figure,
+)
 from torchid.report.identifiability_figure import identifiability_figure
 from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.report.parameters_json import parameters_document
@@ -104,13 +112,13 @@ def write_run(
     }
     if run.extras:
         figures["extras"] = extra_figure(run.extras)
-    with new_folder(config.output, config.overwrite) as folder:
+    with during("writing", config.output), new_folder(config.output, config.overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
         write_json(folder / "metrics.json", metrics_document(run))
         (folder / "identified.urdf").write_bytes(identified_urdf(robot, run.phi))
         for name, figure in figures.items():
-            figure.savefig(folder / f"{name}.png", dpi=130)
+            save_figure(figure, folder / f"{name}.png")
         if training is not None:
             training.copy_curves(folder)
         _write_curves(run, folder, {name: folder / f"{name}.png" for name in figures})

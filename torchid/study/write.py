@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from torchid.report.comparison import Bars, Panel, bar_figure, panel_figure
+from torchid.report.figures import save_figure
 from torchid.report.metrics import GROUPS, group_name
 from torchid.report.tables import table_text
 from torchid.report.tensorboard import write_comparison
@@ -45,7 +46,7 @@ def write_study(folder: Path, results: Results, series: Series) -> None:
     (folder / "tables.txt").write_text("\n".join(table_text(table) for table in tables.values()))
     write_json(folder / "results.json", _document(results))
     for name, figure in drawn.items():
-        figure.savefig(folder / f"{name}.png", dpi=130)
+        save_figure(figure, folder / f"{name}.png")
     scalars = {
         (sensors, f"{training}/{group}"): [
             results.spread(condition, training, sensors, f"{group}/relative").median for condition in results.conditions

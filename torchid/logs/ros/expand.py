@@ -8,24 +8,20 @@ import io
 import lz4.frame
 import zstandard
 
-from torchid.logs.ros.storage import MAX_RECORD
+from torchid.guards import Budget
 from torchid.text import shown
 
-#: Most bytes that one compressed byte may stand for, in chunks of more than `_FREE`. Messages that never change but for
-#: their stamps shrink a hundredfold.
-_MOST, _FREE = 1000, 2**20
 
-
-def expanded(data: bytes, compression: str) -> bytes:
+def expanded(data: bytes, compression: str, budget: Budget) -> bytes:
     """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
 
     Raises:
-        ValueError: another compression, or a chunk that grows out of all proportion.
+        ValueError: another compression, or more bytes than the budget of the file has left.
     """
-    limit = min(MAX_RECORD, max(_FREE, _MOST * len(data)))
+    limit = budget.most()
     if compression in ("", "none"):
-        return data
-    if compression == "bz2":
+        out = data
+    elif compression == "bz2":
         out = bz2.BZ2Decompressor().decompress(data, limit + 1)
     elif compression == "lz4":
         out = lz4.frame.LZ4FrameDecompressor().decompress(data, limit + 1)
@@ -36,4 +32,5 @@ def expanded(data: bytes, compression: str) -> bytes:
         raise ValueError(f"chunks compressed by '{shown(compression)}'")
     if len(out) > limit:
         raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
+    budget.expand(len(out))
     return out

@@ -9,9 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from torchid.errors import LogError
+from torchid.guards import check_names, plain
 from torchid.logs.fields import FloatArray
-from torchid.logs.limits import check_names
-from torchid.logs.ros.storage import Channel, plain
+from torchid.logs.ros.storage import Channel
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _JOINT_FIELDS = {"position": "joint_position", "velocity": "joint_velocity", "effort": "joint_torque"}

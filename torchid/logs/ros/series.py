@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, TorchidWarning, UnknownNameError
-from torchid.logs import container
+from torchid.guards import MAX_ARRAYS
 from torchid.logs.fields import FloatArray
 from torchid.logs.ros.messages import Decoder, JointStates
 
@@ -48,8 +48,8 @@ class Rows:
         self._stamps.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
         self._received.append(received)
         self._values.frombytes(np.asarray(row, dtype=np.float64).tobytes())
-        if 8 * len(self._values) > container.MAX_BYTES:
-            raise LogError(self._source, self.topic, "more messages than fit", f"{container.MAX_BYTES} bytes")
+        if 8 * len(self._values) > MAX_ARRAYS:
+            raise LogError(self._source, self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
 
     def series(self) -> Series:
         """All messages in the order of their stamps, each once.

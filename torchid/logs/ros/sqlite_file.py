@@ -6,7 +6,8 @@ import sqlite3
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from torchid.logs.ros.storage import MAX_RECORD, Channel, Record
+from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget
+from torchid.logs.ros.storage import Channel, Record
 
 
 class SqliteFile:
@@ -16,6 +17,8 @@ class SqliteFile:
         """Open the file, which may be on a read-only disk."""
         self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
         self._connection.execute("PRAGMA trusted_schema = OFF")
+        self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD)
+        self._size = path.stat().st_size
         for table in ("topics", "messages"):
             self._check_plain(table)
 
@@ -35,17 +38,22 @@ class SqliteFile:
 
     def channels(self) -> list[Channel]:
         """All topics."""
-        rows = self._connection.execute("SELECT name, type, serialization_format FROM topics").fetchall()
+        rows = self._connection.execute("SELECT name, type, serialization_format FROM topics").fetchmany(MAX_TOPICS + 1)
+        if len(rows) > MAX_TOPICS:
+            raise ValueError(f"more than {MAX_TOPICS} topics")
         return [Channel(str(name), str(kind), str(encoding)) for name, kind, encoding in rows]
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
         """The messages of some topics."""
-        names = dict(self._connection.execute("SELECT id, name FROM topics").fetchall())
+        names = dict(self._connection.execute("SELECT id, name FROM topics").fetchmany(MAX_TOPICS))
+        budget = Budget(self._size)
         (total,) = self._connection.execute("SELECT count(*) FROM messages").fetchone()
         rows = self._connection.execute("SELECT topic_id, timestamp, data FROM messages")
         for i, (topic, received, data) in enumerate(rows):
+            budget.record()
             if names.get(topic) not in topics:
                 continue
+            budget.message()
             if not (isinstance(received, int) and isinstance(data, bytes) and len(data) <= MAX_RECORD):
                 raise ValueError(f"message {i} has no time or no data")
             yield Record(names[topic], received, data, i / total)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sqlite3
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -11,21 +10,11 @@ from pathlib import Path
 from typing import Protocol
 
 from torchid.errors import LogError, install
+from torchid.guards import plain
 from torchid.logs.container import translated
-from torchid.logs.limits import MAX_LETTERS
-from torchid.text import is_plain, shown
 
-#: Most bytes of one record. A camera's image has a few million, the chunk of messages around it hardly more.
-MAX_RECORD = 2**28
 #: What bags of any kind are read with.
 _PACKAGES = ("rosbags", "mcap", "zstandard")
-
-
-def plain(text: str) -> str:
-    """A name out of a bag, ValueError where no name is like that and no message can show it."""
-    if len(text) > MAX_LETTERS or not is_plain(text):
-        raise ValueError(f"a name of {len(text)} characters: {shown(text)}")
-    return text
 
 
 @dataclass(frozen=True)
@@ -74,10 +63,9 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
     """
     suffix = path.suffix.lower()
     try:
-        import mcap.exceptions
-        import rosbags.rosbag1
-        import rosbags.serde
-        import zstandard
+        import mcap  # noqa: F401
+        import rosbags.rosbag1  # noqa: F401
+        import zstandard  # noqa: F401
     except ImportError as error:
         absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
         found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
@@ -87,10 +75,6 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
     from torchid.logs.ros.sqlite_file import SqliteFile
 
     readers: dict[str, Callable[[Path], BagFile]] = {".bag": Ros1File, ".mcap": McapFile, ".db3": SqliteFile}
-    failures = (
-        mcap.exceptions.McapError, rosbags.rosbag1.ReaderError, rosbags.serde.SerdeError, zstandard.ZstdError,
-        sqlite3.Error, AssertionError, ArithmeticError, LookupError, AttributeError,
-    )  # fmt: skip
     accepted = f"a complete {suffix} file of ROS messages"
-    with translated(str(path), "file", accepted, failures), contextlib.closing(readers[suffix](path)) as file:
+    with translated(str(path), "file", accepted), contextlib.closing(readers[suffix](path)) as file:
         yield file

@@ -1,0 +1,213 @@
+"""Whatever stops a command is told in one line of plain text that says what was being done to which file."""
+
+from __future__ import annotations
+
+import errno
+import io
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from demo import shortened_demo
+from rich.table import Table
+from rich.text import Text
+
+from torchid.boundary import guarded
+from torchid.cli import main
+from torchid.config.scan import check_yaml
+from torchid.errors import ConfigError, TorchidWarning, during
+from torchid.guards import read_bytes
+from torchid.report.tables import people_console, print_tables, table_text
+from torchid.text import is_plain
+
+EVIL = "a\x1b[31m\u202eb\nc\r\x07\u200b$x_{$"
+
+
+def stopped(error: BaseException, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    """Exit status and the line on standard error of a command that an error stops while it reads a file."""
+
+    def command() -> None:
+        with during("reading", "outer.yaml"), during("reading", f"{EVIL}.npz"):
+            raise error
+
+    status = guarded("torchid", command)
+    out, said = capsys.readouterr()
+    assert out == ""
+    assert said.count("\n") == 1
+    assert is_plain(said.rstrip("\n"))
+    return status, said.rstrip("\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "parts"),
+    [
+        (KeyError("x"), 1, ("KeyError: 'x'", "a fault in torchid", "--debug shows where")),
+        (RuntimeError(EVIL), 1, ("RuntimeError", "a fault in torchid")),
+        (RecursionError(), 1, ("RecursionError: no text", "a fault in torchid")),
+        (AssertionError(), 1, ("AssertionError", "a fault in torchid")),
+        (MemoryError(), 1, ("not enough memory", "accepted: smaller logs")),
+        (OSError(errno.ENOSPC, "No space left on device"), 1, ("OSError: [Errno 28] No space left on device",)),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_any_error_becomes_a_line_that_says_what_was_being_done(
+    capsys: pytest.CaptureFixture[str], error: Exception, status: int, parts: tuple[str, ...]
+) -> None:
+    found, line = stopped(error, capsys)
+    assert found == status
+    assert line.startswith("torchid: reading a\\x1b[31m\\u202eb c ")
+    assert "outer.yaml" not in line
+    for part in parts:
+        assert part in line
+    assert ("fault in torchid" in line) == any("fault" in part for part in parts)
+
+
+def test_bad_input_speaks_for_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    status, line = stopped(ConfigError(EVIL, "field", f"'{EVIL}'", "names"), capsys)
+    assert (status, line.startswith("torchid: a\\x1b[31m\\u202eb c "), "reading" in line) == (2, True, False)
+
+
+def test_arguments_that_are_not_understood_are_repeated_in_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["check", "x.npz", f"--{EVIL}"])
+    assert all(map(is_plain, capsys.readouterr().err.split("\n")))
+
+
+def test_a_traceback_is_shown_to_who_asks(capsys: pytest.CaptureFixture[str]) -> None:
+    assert guarded("torchid", lambda: {}["x"], debug=True) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_whatever_is_printed_has_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+    def command() -> int:
+        sys.stdout.write(f"{EVIL}\n")
+        table = Table(title=EVIL.replace("[", "("))
+        table.add_column(Text(EVIL))
+        table.add_row(Text(EVIL))
+        print_tables(table)
+        people_console(stderr=True).print(Text(EVIL))
+        warnings.warn(f"{EVIL}: a gap", TorchidWarning, stacklevel=1)
+        return 0
+
+    assert guarded("torchid", command) == 0
+    for said in capsys.readouterr():
+        assert said
+        assert all(map(is_plain, said.split("\n")))
+    table = Table()
+    table.add_row(Text(EVIL))
+    assert all(map(is_plain, table_text(table).split("\n")))
+
+
+def test_a_terminal_keeps_its_colors(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stdout", screen)
+    assert guarded("torchid", lambda: people_console().print(Text(EVIL, style="red"))) == 0
+    assert "\x1b[31ma\\x1b[31m" in screen.getvalue()
+
+
+def test_libraries_do_not_speak_to_users(capsys: pytest.CaptureFixture[str]) -> None:
+    """But for numbers that went wrong in them, once."""
+
+    def command() -> None:
+        logging.getLogger("trimesh").warning("%s", EVIL)
+        warnings.simplefilter("always")
+        warnings.warn("findfont: no glyph", UserWarning, stacklevel=1)
+        for _ in range(2):
+            np.array([1e308]) * np.array([1e308])
+
+    assert guarded("torchid", command) == 0
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith("torchid: NumericalWarning: a library met a number that it cannot handle (overflow")
+
+
+def test_a_reader_who_has_enough_is_not_told(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in `torchid check log.npz | head -1`."""
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w", buffering=1) as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        assert guarded("torchid", lambda: sys.stdout.write("x" * 10_000) and 0) == 1
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("value", ["!!timestamp x", "!!int ''", "!!bool x", "!!float a", "!!set {a}", "!!int 1.5"])
+def test_a_tag_that_its_value_does_not_fit_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], value: str
+) -> None:
+    (tmp_path / "x.yaml").write_text(f"device: {value}\n")
+    for arguments in (["x.yaml"], [str(tmp_path / "x.yaml")], ["x.yaml", f"device={value}"]):
+        assert main(["identify", *arguments]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    check_yaml("a: !!int 3\nb: !!float 1\nc: !!bool yes\nd: !!str 5\ne: ! x\nf: !!map {a: 1}\n")
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_names_that_look_like_formulas_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "$x_{$\x1b[2J\n\u202e.npz"
+    q = np.random.default_rng(0).standard_normal((30, 40))
+    np.savez(path, time=np.arange(30.0), joint_names=np.array([f"$a_{{{k}$" for k in range(40)]), joint_position=q)
+    assert main(["check", str(path), "--figure", str(tmp_path / "$y_{$.png")]) in (0, 1)
+    assert capsys.readouterr().err == ""
+    assert (tmp_path / "$y_{$.png").is_file()
+
+
+def _pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def _endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def _sparse(path: Path) -> None:
+    with path.open("wb") as stream:
+        stream.truncate(10 * 2**30)
+
+
+@pytest.mark.parametrize("make", [_pipe, _endless, _sparse], ids=lambda make: make.__name__)
+@pytest.mark.parametrize("name", ["config.yaml", "parameters.json", "x.npz", "x.h5", "x.csv", "x.parquet", "x.mcap",
+                                  "x.bag", "x.db3", "x.urdf"])  # fmt: skip
+def test_what_has_no_end_is_not_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], make: Callable[[Path], None], name: str
+) -> None:
+    demo = shortened_demo(tmp_path / "demo", 40)
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.yaml").write_text(
+        (demo / "quadruped.yaml").read_text().replace("quadruped.urdf", f"{demo}/quadruped.urdf")
+    )
+    path = (run if name in ("config.yaml", "parameters.json") else tmp_path) / name
+    path.unlink(missing_ok=True)
+    make(path)
+    arguments = ["evaluate", str(run), "--log", str(demo / "sway_test.npz")]
+    if path.parent == tmp_path:
+        arguments = ["check", str(path)]
+        if name == "x.urdf":
+            arguments = ["check", str(demo / "sway_test.npz"), "--urdf", str(path)]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert name in said or "no config.yaml" in said
+
+
+def test_a_file_is_read_as_far_as_it_may_be(tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(bytes(100))
+    assert len(read_bytes(tmp_path / "x", 100)) == 100
+    with pytest.raises(ValueError, match="more than 99 bytes"):
+        read_bytes(tmp_path / "x", 99)
+    with pytest.raises(OSError, match="a folder"):
+        read_bytes(tmp_path, 99)

@@ -1,0 +1,125 @@
+"""The boundary between a command and its user: whatever stops a command is told in one line of plain text."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+from torchid.errors import BaseLostError, InputError, TorchidWarning, doing_of
+from torchid.interrupts import begin, ending_interrupts, written
+from torchid.text import EscapedStream, one_line
+
+#: What the machine refuses, and not the user's files nor the program: no room, no memory, no permission.
+_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE)
+#: Of numbers that went wrong in a library: they may touch results. Others speak to programmers.
+_NUMERICAL = (RuntimeWarning,)
+_HOW = "--debug shows where"
+
+
+def guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
+    """Run a command so that whatever stops it is told in one line.
+
+    What is written meanwhile, by whomever, has control characters as escapes. Libraries' warnings of numbers become a
+    line of ours, for they may touch results; their other warnings, and what they log, tell users nothing that they
+    could mend, often in texts out of files, and are shown with `debug` only.
+
+    Args:
+        program: its name.
+        command: what to run; returns an exit status, None for 0.
+        debug: whether to show tracebacks and all warnings.
+
+    Returns:
+        The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else, silently where nobody
+        reads what is written any more.
+    """
+    with plain_streams(), warnings.catch_warnings(), _libraries_silent(debug):
+        warnings.simplefilter("always", TorchidWarning)
+        warnings.showwarning = _Warnings(program, debug)
+        try:
+            begin()
+            with ending_interrupts():
+                status = command() or 0
+            sys.stdout.flush()
+            return status
+        except BrokenPipeError:  # `torchid ... | head`: who has read enough wants no line about it
+            _forget(sys.stdout)
+            return 1
+        except KeyboardInterrupt as interrupt:
+            _say(program, str(interrupt) or f"interrupted; {written()} was written")
+            return 1
+        except Exception as error:  # a full disk, or a bug: still no wall of text unless asked for
+            if debug:
+                traceback.print_exc()
+            status, line = told(error)
+            _say(program, line)
+            return status
+
+
+def told(error: Exception) -> tuple[int, str]:
+    """Exit status and the one line that says what stopped a command."""
+    if isinstance(error, (InputError, BaseLostError)):
+        return 2, str(error)
+    doing = doing_of(error)
+    where = f"{doing}: " if doing else ""
+    if isinstance(error, MemoryError):
+        return 1, f"{where}not enough memory ({str(error) or 'the system gives no more'}); accepted: smaller logs"
+    if isinstance(error, OSError) and error.errno in _MACHINE:
+        return 1, f"{where}{type(error).__name__}: {error}"
+    text = str(error) or "no text"
+    return 1, f"{where}{type(error).__name__}: {text}; this is a fault in torchid, please report it ({_HOW})"
+
+
+class _Warnings:
+    """Warnings as lines, each of another text once."""
+
+    def __init__(self, program: str, debug: bool) -> None:
+        self._program, self._debug, self._seen = program, debug, set[str]()
+
+    def __call__(self, message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+        text = f"{category.__name__}: {message}"
+        if not issubclass(category, TorchidWarning):
+            if not (self._debug or issubclass(category, _NUMERICAL)) or text in self._seen:
+                return
+            self._seen.add(text)
+            text = f"NumericalWarning: a library met a number that it cannot handle ({message})"
+        _say(self._program, text)
+
+
+def _say(program: str, text: str) -> None:
+    with suppress(BrokenPipeError):
+        print(f"{program}: {one_line(text)}", file=sys.stderr)
+
+
+def _forget(stream: object) -> None:
+    """Let the interpreter's last flush of a closed pipe go nowhere."""
+    with suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # type: ignore[attr-defined]
+
+
+@contextmanager
+def plain_streams() -> Iterator[None]:
+    """Standard output and error without control characters in what is written."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (EscapedStream(stream) for stream in before)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+@contextmanager
+def _libraries_silent(debug: bool) -> Iterator[None]:
+    """Keep what libraries log, often with texts out of files, from standard error."""
+    handler, root = logging.NullHandler(), logging.getLogger()
+    if not debug:
+        root.addHandler(handler)  # without any, Python writes warnings to standard error
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
