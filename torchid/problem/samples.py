@@ -42,6 +42,7 @@ class Samples:
             rate over the noise bandwidth of the filter.
         share: (N, C), what is left of a constant contact reading, as `Log.contact_share`; None where it is `active`.
         folder: on whose disk the tensors of a log larger than memory lie, None for one in memory.
+        fold: number of the block of all logs that these samples are in, see `in_folds`.
     """
 
     source: str
@@ -57,6 +58,7 @@ class Samples:
     oversampling: float = 1.0
     share: Tensor | None = None
     folder: Path | None = None
+    fold: int = 0
 
     def __len__(self) -> int:
         return len(self.time)

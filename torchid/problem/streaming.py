@@ -27,12 +27,13 @@ Weighing = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
 
 @dataclass
 class Part:
-    """What is kept of the samples of one log, by its source, in one contact state."""
+    """What is kept of the samples of one log, by its source, in one contact state and one fold (see `in_folds`)."""
 
     source: str
     state: State
     factor: TriangularFactor
     samples: int
+    fold: int = 0
 
 
 def compress(
@@ -69,7 +70,7 @@ def compress_parts(
     progress: Progress | None = None,
     weigh: Weighing | None = None,
 ) -> list[Part]:
-    """As `compress`, but with a factor for every contact state in every log, in the order of the logs.
+    """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
 
     Logs of one source count as one. `weigh` may change rows before they are added: called with the samples they come
     from, their columns and themselves.
@@ -84,12 +85,13 @@ def _fold(
     builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weigh: Weighing | None = None
 ) -> list[Part]:
     """Parts of some chunks, all logs together unless `by_log`."""
-    parts: dict[tuple[str, State], Part] = {}
+    parts: dict[tuple[str, State, int], Part] = {}
     workspace = Workspace()
     for samples, state in chunks:
-        key = samples.source if by_log else "", state
+        key = (samples.source, state, samples.fold) if by_log else ("", state, 0)
         if key not in parts:
-            parts[key] = Part(*key, TriangularFactor(builder.width), 0)
+            source, _, fold = key
+            parts[key] = Part(source, state, TriangularFactor(builder.width), 0, fold)
         parts[key].samples += len(samples)
         for support, rows in builder.rows(samples, state, workspace):
             weighed = rows if weigh is None else weigh(samples, support, rows)
@@ -100,9 +102,9 @@ def _fold(
 @one_thread()
 def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
     """The parts that workers have made of their chunks."""
-    total: dict[tuple[str, State], Part] = {}
+    total: dict[tuple[str, State, int], Part] = {}
     for part in chain.from_iterable(of_workers):
-        same = total.setdefault((part.source, part.state), part)
+        same = total.setdefault((part.source, part.state, part.fold), part)
         if same is not part:
             same.samples += part.samples
             same.factor.merge(part.factor)

@@ -70,10 +70,10 @@ def _cell(metrics: Metrics, group: str) -> str:
     return f"{rms:.4g}" + ("" if relative is None else f" ({100 * relative:.3g} %)")
 
 
-def state_table(states: Sequence[Mapping[str, object]]) -> Table:
+def state_table(states: Sequence[Mapping[str, Any]]) -> Table:
     """Contact states with sample counts, rows per sample, and what is left of the base."""
     table = Table(title="Contact states", title_justify="left")
-    for heading in ("in contact", "samples", "rows each", "rank(S_b V_x)", "smallest s.v."):
+    for heading in ("in contact", "samples", "rows each", "rank(S_b V_x)", "at full rank", "smallest s.v."):
         table.add_column(heading, justify="left" if heading == "in contact" else "right")
     for state in states:
         rank, smallest = state["base_rank"], state["base_singular_value"]
@@ -82,9 +82,19 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
             str(state["samples"]),
             str(state["rows"]),
             "fixed base" if rank is None else f"{rank} of 6",
+            _shares(state),
             "" if smallest is None else f"{smallest:.2g}",
         )
     return table
+
+
+def _shares(state: Mapping[str, Any]) -> str:
+    """Share of the samples that see the whole base, and the least rank of the others."""
+    full, ranks = state["base_full_share"], state["base_rank_shares"]
+    if full is None:
+        return ""
+    lowest = min(ranks, default=6)
+    return f"{100 * full:.3g} %" + (f" (least: {lowest})" if lowest < 6 else "")
 
 
 def legend_of_marks() -> str:
