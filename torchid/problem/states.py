@@ -20,7 +20,9 @@ from torchid.problem.threads import one_thread
 from torchid.sensing.projection import base_rank, base_singular_values
 
 _CHECKED = 512  # samples a state, from all over the logs: shares are then known to about 2 %
-_MOST = 0.5  # share of the samples that must see the whole base: then the median of the smallest singular value is not 0
+_MOST = (
+    0.5  # share of the samples that must see the whole base: then the median of the smallest singular value is not 0
+)
 
 
 @dataclass(frozen=True)
@@ -51,9 +53,13 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
         every = torch.arange(len(samples))
         for state, index in by_state(samples):
             counts[state] += len(every[index])
-    rows, values, weights = Counter[State](), defaultdict[State, list[Tensor]](list), defaultdict[State, list[Tensor]](list)
+    rows, values, weights = (
+        Counter[State](),
+        defaultdict[State, list[Tensor]](list),
+        defaultdict[State, list[Tensor]](list),
+    )
     for samples, state, weight in spread_by_state(logs, _CHECKED):
-        for index, V in builder.bases(samples.to(builder.device), state):
+        for _, V in builder.bases(samples.to(builder.device), state):
             rows[state] = max(rows[state], V.shape[2] + len(builder.plan(state).lone_joints))
             if builder.tree.base_rows:
                 values[state].append(base_singular_values(V).cpu())

@@ -18,7 +18,7 @@ from torchid.analysis.left_out import Contribution, PartContribution
 from torchid.estimators import Estimate
 from torchid.estimators.result import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
 from torchid.parameters import PARAMETERS, PER_BODY
-from torchid.report.metrics import GROUPS, Metrics
+from torchid.report.metrics import SHOWN, Metrics
 
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
 
@@ -54,7 +54,7 @@ def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
     for name in columns:
         for which in ("URDF", "identified"):
             table.add_column(Text(f"{name}\n{which}"), justify="right", overflow="fold")
-    for group, label in GROUPS.items():
+    for group, label in SHOWN.items():
         cells = [_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *cells)
         if group == "base_force":
@@ -64,7 +64,7 @@ def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
 
 
 def _cell(metrics: Metrics, group: str) -> str:
-    rms, relative = metrics.rms[group], metrics.relative[group]
+    rms, relative = metrics.rms.get(group), metrics.relative.get(group)
     if rms is None:
         return "-"
     return f"{rms:.4g}" + ("" if relative is None else f" ({100 * relative:.3g} %)")

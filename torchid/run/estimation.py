@@ -67,6 +67,18 @@ def stated_conditions(settings: EstimatorConfig, robot: Robot, source: object = 
     return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0, names=robot.body_names)
 
 
+def stand_in(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
+    """What solves the same problem in one go: for a descent, what it approaches with the same ridge.
+
+    Penalties that bodies pay for not existing are left out.
+    """
+    if settings.name != "sgd":
+        return batch_estimator(settings, conditions)
+    if settings.consistency == "penalties" or not settings.ridge:
+        return LeastSquares(settings.ridge, settings.rank_tolerance)
+    return Consistent(settings.ridge, conditions=conditions, rank_tolerance=settings.rank_tolerance)
+
+
 def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
     """What solves a compressed problem in one go, `least_squares` or `consistent`.
 

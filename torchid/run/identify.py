@@ -10,33 +10,33 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
 from rich.progress import Progress
 
 from torchid.analysis.contributions import Contributions, contributions
 from torchid.analysis.known import total_mass
 from torchid.config import ExperimentConfig
-from torchid.errors import NumericalWarning, SensorError
+from torchid.errors import NumericalWarning
 from torchid.estimators import Estimate, LeastSquares, violations
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
+from torchid.problem.folds import folds_together, in_folds, states_together
 from torchid.problem.plan import State, state_name
 from torchid.problem.states import check_base, state_reports
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
-from torchid.run.calibration import Calibration, errors, warn_of_confounded
+from torchid.run.calibration import Calibration, warn_of_confounded
 from torchid.run.claim import claimed
-from torchid.run.estimation import assembled, batch_estimator, stated_conditions
+from torchid.run.estimation import assembled, batch_estimator, stand_in, stated_conditions
 from torchid.run.experiment import Experiment, set_up
-from torchid.run.fit import Fit, fitted
+from torchid.run.fit import Fit, fits_without_folds, fitted
 from torchid.run.folder import check_free
+from torchid.run.plausibility import check_plausible
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import Identification, write_run
 from torchid.run.robust import RobustSummary, loss_of, robust_fit
 from torchid.run.training import Training, check_training, training_folder
-
-_IMPLAUSIBLE = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
+from torchid.run.validation import CrossValidation, Judge, Pair, warn_of_worse
 
 
 @dataclass
@@ -85,7 +85,8 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             builder = RowBuilder(*scene).to(config.device)
             states = state_reports(logs["train"], builder)
             check_base(states, config.sensors.on_base_lost)
-            parts = _compressed(builder, logs["train"], bars)
+            blocks = in_folds(logs["train"], builder)
+            parts = _compressed(builder, blocks, bars)
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device, experiment.terms)
         with clock("solve"):
             solve: Callable[[LinearProblem], Estimate]
@@ -95,17 +96,24 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             else:
                 solve = estimator.solve
             fit = fitted(parts, experiment, builder, solve, source)
-            fit, robust = _robust(fit, experiment, builder, solve, logs["train"], bars, source)
+            fit, robust = _robust(fit, experiment, builder, solve, blocks, bars, source)
             del parts
             estimate, problem = fit.estimate, fit.assembly.problem
-            _check_sense(estimate, source)
+            mass = total_mass(fit.assembly, estimate, config.estimator.rank_tolerance)
+            check_plausible(fit, mass, experiment, source)
             warn_of_confounded(fit.extras, source)
         with clock("identifiability"):
-            alone = _by_state(experiment, builder, fit.parts, source)
-            adds = _contributions(experiment, builder, fit.parts, logs["train"], problem, bars)
+            whole = folds_together(fit.parts, builder)
+            alone = _by_state(experiment, builder, whole, source)
+            adds = _contributions(experiment, builder, whole, logs["train"], problem, bars)
+        with clock("cross-validate"):
+            instead = stand_in(config.estimator, conditions).solve
+            left_out = fits_without_folds(fit.parts, experiment, builder, instead, source)
         with clock("evaluate"):
-            both = Calibration.both(experiment, experiment.sensors, estimate.phi, fit.extras)
-            metrics = _metrics(evaluation, logs, both, bars)
+            both, *without = (_calibrations(experiment, one) for one in (fit, *left_out))
+            judge = Judge(evaluation, builder)
+            of_blocks = states_together(fit.parts, builder)
+            metrics, validation = _metrics(judge, logs["test"], blocks, of_blocks, (both, without), bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
         samples = sum(map(len, logs["train"]))
         run = Identification(
@@ -121,8 +129,10 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             clock.seconds,
             samples,
             reader.excluded,
-            total_mass(fit.assembly, estimate, config.estimator.rank_tolerance),
+            mass,
+            validation,
         )
+        warn_of_worse(run.worse, source)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], both, training)
     return run
@@ -210,30 +220,33 @@ def _contributions(
     return found
 
 
+def _calibrations(experiment: Experiment, fit: Fit) -> tuple[Calibration, Calibration]:
+    return Calibration.both(experiment, experiment.sensors, fit.estimate.phi, fit.extras)
+
+
 def _metrics(
-    evaluation: Evaluation,
-    logs: Mapping[str, Sequence[Samples]],
-    both: tuple[Calibration, Calibration],
+    judge: Judge,
+    test: Sequence[Samples],
+    blocks: Sequence[Samples],
+    parts: Sequence[Part],
+    calibrations: tuple[tuple[Calibration, Calibration], Sequence[tuple[Calibration, Calibration]]],
     bars: Progress,
-) -> dict[str, tuple[Metrics, Metrics]]:
-    """Nominal and identified metrics by set of logs."""
-    sets = {name: logs[name] for name in SETS if logs[name]}
-    bar = bars.add_task("evaluating", total=sum(len(log) for same in sets.values() for log in same))
-    return {name: errors(evaluation, same, both, lambda n: bars.advance(bar, n)) for name, same in sets.items()}
+) -> tuple[dict[str, Pair], CrossValidation | None]:
+    """Nominal and identified metrics by set of logs, and of fits without a fold each on that fold.
+
+    `parts`: of the blocks of the training logs; `calibrations`: of the fit, and of the fits without a fold.
+    """
+    both, left_out = calibrations
+    bar = bars.add_task("evaluating", total=sum(map(len, [*blocks, *test])))
+
+    def done(samples: int) -> None:
+        bars.advance(bar, samples)
+
+    train, validation = judge.training_errors(blocks, parts, both, left_out, done)
+    return {"train": train} | ({"test": judge.errors(test, both, done)} if test else {}), validation
 
 
 def _identified_metrics(
     evaluation: Evaluation, logs: Mapping[str, Sequence[Samples]], phi: Array
 ) -> dict[str, Metrics]:
     return {name: evaluation.metrics(logs[name], phi[None])[0] for name in SETS if logs[name]}
-
-
-def _check_sense(estimate: Estimate, source: object) -> None:
-    """Refuse a fit of nothing, and warn of one that the dynamics cannot explain."""
-    if not estimate.rank:
-        raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
-    left = np.sqrt(estimate.cost / max(estimate.rows, 1))  # not corrected for the fit, which may be far from the best
-    if left > _IMPLAUSIBLE:
-        found = f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
-        advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
-        warnings.warn(f"{source}: {found}; {advice}", NumericalWarning, stacklevel=3)
