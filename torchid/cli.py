@@ -191,6 +191,8 @@ def _print_fit(run: Identification) -> None:
     print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
     if run.validation is not None:
         _print_validation(run.validation)
+    if run.ridge is not None:
+        print(f"ridge         {run.ridge.ridge:g}, chosen by what predicts left-out blocks of the training logs")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
     if isinstance(estimate, BoundEstimate) and estimate.relative_price is not None:

@@ -74,9 +74,9 @@ def stand_in(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares 
     """
     if settings.name != "sgd":
         return batch_estimator(settings, conditions)
-    if settings.consistency == "penalties" or not settings.ridge:
-        return LeastSquares(settings.ridge, settings.rank_tolerance)
-    return Consistent(settings.ridge, conditions=conditions, rank_tolerance=settings.rank_tolerance)
+    if settings.consistency == "penalties" or not settings.pull:
+        return LeastSquares(settings.pull, settings.rank_tolerance)
+    return Consistent(settings.pull, conditions=conditions, rank_tolerance=settings.rank_tolerance)
 
 
 def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
@@ -86,7 +86,7 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
         InputError: the certified method without CVXPY and Clarabel.
     """
     if settings.name == "least_squares":
-        return LeastSquares(settings.ridge, settings.rank_tolerance)
+        return LeastSquares(settings.pull, settings.rank_tolerance)
     return Consistent(
-        settings.ridge, settings.prior, conditions, settings.method, settings.certify, settings.rank_tolerance
+        settings.pull, settings.prior, conditions, settings.method, settings.certify, settings.rank_tolerance
     )

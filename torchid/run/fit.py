@@ -71,8 +71,12 @@ def fitted(
         solve: an estimator.
         source: named in errors.
     """
-    settings, robot = scene.config.estimator, scene.robot
-    assembly = assembled(parts, builder, robot, settings, source)
+    assembly = assembled(parts, builder, scene.robot, scene.config.estimator, source)
+    return solved(parts, assembly, scene, solve)
+
+
+def solved(parts: list[Part], assembly: Assembly, scene: Scene, solve: Callable[[LinearProblem], Estimate]) -> Fit:
+    """Solve what the logs pose. Arguments as of `fitted`."""
     estimate = solve(assembly.problem)
-    extras = estimate_extras(assembly, estimate, robot.body_names, settings.rank_tolerance)
+    extras = estimate_extras(assembly, estimate, scene.robot.body_names, scene.config.estimator.rank_tolerance)
     return Fit(parts, assembly, estimate, extras)

@@ -7,13 +7,12 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from rich.progress import Progress
 
 from torchid.analysis.contributions import Contributions, contributions
-from torchid.analysis.known import total_mass
 from torchid.config import ExperimentConfig
 from torchid.errors import NumericalWarning
 from torchid.estimators import Estimate, LeastSquares, violations
@@ -26,7 +25,7 @@ from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.run.calibration import Calibration, warn_of_confounded
 from torchid.run.claim import claimed
-from torchid.run.estimation import assembled, batch_estimator, stand_in, stated_conditions
+from torchid.run.estimation import assembled, stand_in, stated_conditions
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.fit import Fit, fits_without_folds, fitted
 from torchid.run.folder import check_free
@@ -34,8 +33,9 @@ from torchid.run.plausibility import check_plausible
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import Identification, write_run
+from torchid.run.ridge import RidgeChoice, chosen_ridge
 from torchid.run.robust import RobustSummary, loss_of, robust_fit
-from torchid.run.training import Training, check_training, training_folder
+from torchid.run.training import Training, check_training, descent_settings, training_folder
 from torchid.run.validation import CrossValidation, Judge, Pair, warn_of_worse
 
 
@@ -76,8 +76,8 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
         with clock("read"):
             experiment = set_up(config, source)
             conditions = stated_conditions(config.estimator, experiment.robot, source)
-            training = Training(config, experiment.robot, source) if config.estimator.name == "sgd" else None
-            estimator = training or batch_estimator(config.estimator, conditions)
+            if config.estimator.name == "sgd":
+                descent_settings(config, source)  # before any work
             reader = LogReader(experiment)
             logs = _read(reader, experiment, bars)
         with clock("compress"):
@@ -87,35 +87,34 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             check_base(states, config.sensors.on_base_lost)
             blocks = in_folds(logs["train"], builder)
             parts = _compressed(builder, blocks, bars)
+        with clock("ridge"):
+            experiment, ridge = _with_ridge(experiment, parts, blocks, builder, bars, source)
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device, experiment.terms)
+        training = None
         with clock("solve"):
-            solve: Callable[[LinearProblem], Estimate]
-            if isinstance(estimator, Training):
+            settings = experiment.config.estimator
+            instead = stand_in(settings, conditions).solve
+            solve: Callable[[LinearProblem], Estimate] = instead
+            if settings.name == "sgd":
+                check_plausible(fitted(parts, experiment, builder, instead, source), experiment, source)
+                training = Training(experiment.config, experiment.robot, source)
                 evaluate = partial(_identified_metrics, evaluation, logs)
-                solve = partial(estimator.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
-            else:
-                solve = estimator.solve
+                solve = partial(training.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
             fit = fitted(parts, experiment, builder, solve, source)
             fit, robust = _robust(fit, experiment, builder, solve, blocks, bars, source)
             del parts
             estimate, problem = fit.estimate, fit.assembly.problem
-            mass = total_mass(fit.assembly, estimate, config.estimator.rank_tolerance)
-            check_plausible(fit, mass, experiment, source)
+            mass = check_plausible(fit, experiment, source)
             warn_of_confounded(fit.extras, source)
         with clock("identifiability"):
             whole = folds_together(fit.parts, builder)
             alone = _by_state(experiment, builder, whole, source)
             adds = _contributions(experiment, builder, whole, logs["train"], problem, bars)
-        with clock("cross-validate"):
-            instead = stand_in(config.estimator, conditions).solve
-            left_out = fits_without_folds(fit.parts, experiment, builder, instead, source)
         with clock("evaluate"):
+            left_out = fits_without_folds(fit.parts, experiment, builder, instead, source)
             both, *without = (_calibrations(experiment, one) for one in (fit, *left_out))
-            judge = Judge(evaluation, builder)
-            of_blocks = states_together(fit.parts, builder)
+            judge, of_blocks = Judge(evaluation, builder), states_together(fit.parts, builder)
             metrics, validation = _metrics(judge, logs["test"], blocks, of_blocks, (both, without), bars)
-        broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
-        samples = sum(map(len, logs["train"]))
         run = Identification(
             experiment,
             estimate,
@@ -125,17 +124,37 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             alone,
             adds,
             metrics,
-            broken,
+            violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions),
             clock.seconds,
-            samples,
+            sum(map(len, logs["train"])),
             reader.excluded,
             mass,
             validation,
+            ridge,
         )
         warn_of_worse(run.worse, source)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], both, training)
     return run
+
+
+def _with_ridge(
+    experiment: Experiment,
+    parts: Sequence[Part],
+    blocks: Sequence[Samples],
+    builder: RowBuilder,
+    bars: Progress,
+    source: object,
+) -> tuple[Experiment, RidgeChoice | None]:
+    """The experiment with a ridge that is a number, and how it was chosen, if it was."""
+    config = experiment.config
+    if not config.estimator.chooses_ridge:
+        return experiment, None
+    bar = bars.add_task("choosing the ridge", total=None)
+    choice = chosen_ridge(parts, blocks, experiment, experiment.sensors, builder, source)
+    bars.update(bar, total=1, completed=1)
+    chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
+    return replace(experiment, config=chosen), choice
 
 
 def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
@@ -196,7 +215,7 @@ def _by_state(
     settings, samples = experiment.config.estimator, Counter[State]()
     for part in parts:
         samples[part.state] += part.samples
-    estimator, out = LeastSquares(settings.ridge, settings.rank_tolerance), {}
+    estimator, out = LeastSquares(settings.pull, settings.rank_tolerance), {}
     for state, _ in samples.most_common():
         of_state = [part for part in parts if part.state == state]
         problem = assembled(of_state, builder, experiment.robot, settings, source).problem

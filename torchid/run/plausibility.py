@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from torchid.analysis.known import TotalMass
+from torchid.analysis.known import TotalMass, total_mass
 from torchid.analysis.plausible import implausible
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError
 from torchid.hygiene import Finding, check
@@ -24,8 +24,11 @@ _USUAL = (
 )
 
 
-def check_plausible(fit: Fit, mass: TotalMass, scene: Scene, source: object) -> None:
+def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
     """Stop at a fit that no robot can have left, and warn of one that leaves much more than the stated noise.
+
+    Returns:
+        How well the total mass is known.
 
     Raises:
         SensorError: no parameter is in reach of the sensors.
@@ -38,10 +41,11 @@ def check_plausible(fit: Fit, mass: TotalMass, scene: Scene, source: object) -> 
     estimate = fit.estimate
     if not estimate.rank:
         raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
+    mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance)
     absurd = implausible(fit.assembly.problem, estimate.phi, mass, scene.robot)
     left = np.sqrt(estimate.cost / max(estimate.rows, 1))  # not corrected for the fit, which may be far from the best
     if absurd is None and left <= _UNEXPLAINED:
-        return
+        return mass
     log, finding = next(_findings(scene), (None, None))
     if finding is not None and (absurd is not None or finding.severity == CONDEMNED):
         told = f"{log}: {finding.field}: {finding.found}"
@@ -53,6 +57,7 @@ def check_plausible(fit: Fit, mass: TotalMass, scene: Scene, source: object) -> 
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
     warnings.warn(f"{source}: {found}{named}; {advice}", NumericalWarning, stacklevel=3)
+    return mass
 
 
 def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:

@@ -31,6 +31,7 @@ from torchid.report.verdict import Worse, verdict, worse_than_nominal
 from torchid.run.calibration import Calibration
 from torchid.run.experiment import Experiment
 from torchid.run.folder import new_folder, write_json
+from torchid.run.ridge import RidgeChoice
 from torchid.run.robust import RobustSummary
 from torchid.run.training import Training, body_eigenvalues
 from torchid.run.validation import CrossValidation
@@ -47,6 +48,7 @@ class Identification:
     `extras`: unknowns beside the bodies' parameters. `robust`: how outliers were weighed down, if so. `mass`: how well
     the total mass is known. `excluded`: condemned samples left out, by log. `adds`: what each training log, contact
     state and sensor adds. `validation`: None where the samples are too few to leave some out.
+    `ridge`: how it was chosen, if it was.
     """
 
     experiment: Experiment
@@ -63,6 +65,7 @@ class Identification:
     excluded: Mapping[str, int]
     mass: TotalMass
     validation: CrossValidation | None
+    ridge: RidgeChoice | None
 
     def violations_by_name(self) -> list[dict[str, object]]:
         """Conditions that the identified parameters break, the body by its name."""
@@ -172,6 +175,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "violations": run.violations_by_name(),
         "solution": _solution_document(estimate),
         "cross_validation": _validation_document(run),
+        "ridge_selection": None if run.ridge is None else asdict(run.ridge),
         "worse_than_nominal": [asdict(one) for one in run.worse],
         "verdict": verdict(run.worse),
         "contact_states": run.state_entries(),
@@ -254,7 +258,7 @@ def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
     return {
         "sensors": config.sensors.set or "by name",
         "estimator": estimator.name,
-        "ridge": estimator.ridge,
+        "ridge": estimator.pull,
         "friction": estimator.friction,
         "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
         "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,

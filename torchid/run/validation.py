@@ -106,26 +106,10 @@ class Judge:
                     readings = one.logs(logs)
                 measured, error = self.evaluation.sums(readings, phi[number : number + 1], progress if number else None)
                 pairs.append((measured, error))
-        for (measured, error), squares in zip(pairs, self.residuals(logs, parts, calibrations), strict=True):
+        for (measured, error), squares in zip(pairs, residuals(self.builder, logs, parts, calibrations), strict=True):
             for sums, found in ((measured, squares.measured), (error, squares.error)):
                 sums.whitened.add_squares(found, squares.rows)
         return pairs
-
-    @one_thread()
-    def residuals(
-        self, logs: Sequence[Samples], parts: Sequence[Part], calibrations: Sequence[Calibration]
-    ) -> list[Residual]:
-        """What compressed rows of some logs leave at the parameters of each calibration."""
-        by_source = {log.source: log for log in reversed(logs)}
-        out = [Residual() for _ in calibrations]
-        for part in parts:
-            R = part.factor.triangle()
-            for one, found in zip(calibrations, out, strict=True):
-                left = R[:, :-1] @ one.columns(self.builder, by_source[part.source]).cpu() - R[:, -1]
-                found.error += float(left @ left)
-                found.measured += float(R[:, -1] @ R[:, -1])
-                found.rows += part.factor.rows
-        return out
 
     def _metrics(self, sums: Sequence[Sequence[tuple[ForceSums, ForceSums]]]) -> list[Metrics]:
         """Of each calibration, over all folds."""
@@ -133,6 +117,23 @@ class Judge:
             self.evaluation.summary(*(ForceSums.total(each) for each in zip(*same, strict=True)))
             for same in zip(*sums, strict=True)
         ]
+
+
+@one_thread()
+def residuals(
+    builder: RowBuilder, logs: Sequence[Samples], parts: Sequence[Part], calibrations: Sequence[Calibration]
+) -> list[Residual]:
+    """What compressed rows of some logs leave at the parameters of each calibration."""
+    by_source = {log.source: log for log in reversed(logs)}
+    out = [Residual() for _ in calibrations]
+    for part in parts:
+        R = part.factor.triangle()
+        for one, found in zip(calibrations, out, strict=True):
+            left = R[:, :-1] @ one.columns(builder, by_source[part.source]).cpu() - R[:, -1]
+            found.error += float(left @ left)
+            found.measured += float(R[:, -1] @ R[:, -1])
+            found.rows += part.factor.rows
+    return out
 
 
 def _pair(metrics: Sequence[Metrics]) -> Pair:
