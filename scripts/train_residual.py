@@ -71,7 +71,7 @@ def compare(options: argparse.Namespace) -> None:
     reader = LogReader(experiment)
     train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))
     problem = torchid.linear_problem(torchid.compress(train, builder), builder, robot, config.estimator.friction)
-    settings = Sgd(ridge=config.estimator.ridge, epochs=options.epochs, residual=options.mode, residual_lr=0.01)
+    settings = Sgd(ridge=config.estimator.pull, epochs=options.epochs, residual=options.mode, residual_lr=0.01)
     torch.manual_seed(0)
 
     table = Table(title="rms of the projected residual, in standard deviations of the stated sensor noise")

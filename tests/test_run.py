@@ -250,7 +250,7 @@ def test_a_urdf_that_nothing_can_load_is_warned_of(tmp_path: Path) -> None:
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded human squats (../shared/data) are not here")
 @pytest.mark.filterwarnings(UNPHYSICAL)
 def test_force_plates_alone_identify_a_person_who_then_squats_differently(tmp_path: Path) -> None:
-    """Ridge 0.01 was chosen by five-fold cross-validation within the training log (see configs/human_squats.yaml)."""
+    """The ridge was chosen by leaving blocks of the training log out (see configs/human_squats.yaml)."""
     config = Path(__file__).resolve().parents[1] / "configs" / "human_squats.yaml"
     assert main(["identify", str(config), f"output={tmp_path / 'run'}"]) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())

@@ -93,7 +93,7 @@ def _left_out(
     rest = [part for part in parts if part.fold != fold]
     assembly = assembled(rest, builder, robot, settings, source)
     conditions = stated_conditions(settings, robot, source)
-    logs, own = ([x for x in some if x.fold == fold] for some in (blocks, parts))
+    logs, own = [x for x in blocks if x.fold == fold], [x for x in parts if x.fold == fold]
     out = []
     for ridge in GRID:
         fit = solved(rest, assembly, scene, stand_in(replace(settings, ridge=ridge), conditions).solve)
