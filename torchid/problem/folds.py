@@ -41,7 +41,8 @@ def in_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
             fold = min(int(count * middle / max(total, 1)), count - 1)
             out.append(replace(log if blocks == 1 else log[start:end], fold=fold))
         before += len(log)
-    return out
+    found = sorted({block.fold for block in out})  # rounding may have left one empty
+    return [replace(block, fold=found.index(block.fold)) for block in out]
 
 
 def _count(logs: Sequence[Samples], builder: RowBuilder) -> int:

@@ -77,13 +77,16 @@ class Judge:
             left_out: those of a fit without each fold, by its number; none without cross-validation.
             progress: called with the number of samples done.
         """
+        alike = 0 if self.builder.extras else 1  # nominal parameters of all fits, as far as no unknowns come with them
         sums = []
         for fold in sorted({log.fold for log in logs}):
             of_fold = [log for log in logs if log.fold == fold]
             own = [part for part in parts if part.fold == fold]
-            sums.append(self._sums(of_fold, own, [*both, *(left_out[fold] if left_out else ())], progress))
+            sums.append(self._sums(of_fold, own, [*both, *(left_out[fold][alike:] if left_out else ())], progress))
         metrics = self._metrics(sums)
-        return _pair(metrics), CrossValidation(len(left_out), *metrics[2:]) if left_out else None
+        if not left_out:
+            return _pair(metrics), None
+        return _pair(metrics), CrossValidation(len(left_out), metrics[0 if alike else 2], metrics[-1])
 
     def _sums(
         self,
