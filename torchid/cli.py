@@ -15,8 +15,12 @@ from torchid.errors import during
 from torchid.interrupts import interrupt_held_back as _interrupt_held_back
 
 if TYPE_CHECKING:
+    from torchid.analysis.known import TotalMass
+    from torchid.report.verdict import Worse
     from torchid.run.analysis_results import Scenario
     from torchid.run.noise import NoiseSummary
+    from torchid.run.results import Identification
+    from torchid.run.validation import CrossValidation
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
@@ -105,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
 def _identify(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
         from torchid.config import load_config
-        from torchid.estimators import BoundEstimate, ConsistentEstimate, Estimate, SgdEstimate
+        from torchid.estimators import Estimate
         from torchid.report.extra_table import extra_table
         from torchid.report.tables import (
             contribution_table,
@@ -117,10 +121,11 @@ def _identify(options: argparse.Namespace) -> None:
             violation_table,
         )
         from torchid.run import identify
-        from torchid.run.training import body_eigenvalues
 
     run = identify(load_config(options.file, options.overrides), options.file, options.resume)
     estimate, robot = run.estimate, run.experiment.robot
+    if run.worse:
+        _print_headline(run.worse)
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
     print_tables(
         contribution_table(run.adds),
@@ -134,10 +139,25 @@ def _identify(options: argparse.Namespace) -> None:
         print_tables(violation_table(run.violations_by_name()))
         if type(estimate) is Estimate:
             print("estimator.name=consistent finds the best parameters that break none of them")
-    mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
+    _print_fit(run)
+    timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
+    print(fill(f"time          {run.samples} samples: {timed}", 100, subsequent_indent=" " * 14))
+    print(f"written to    {run.experiment.config.output}")
+
+
+def _print_fit(run: Identification) -> None:
+    """Key figures, a line each."""
+    from torchid.estimators import BoundEstimate, ConsistentEstimate, SgdEstimate
+    from torchid.run.training import body_eigenvalues
+
+    estimate, robot = run.estimate, run.experiment.robot
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
     print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise")
+    if run.validation is not None:
+        _print_validation(run.validation)
+    if run.ridge is not None:
+        print(f"ridge         {run.ridge.ridge:g}, chosen by what predicts left-out blocks of the training logs")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
     if isinstance(estimate, BoundEstimate) and estimate.relative_price is not None:
@@ -146,18 +166,37 @@ def _identify(options: argparse.Namespace) -> None:
         print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
     if isinstance(estimate, SgdEstimate):
         print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
-    known = f"± {run.mass.standard_error:.2g} kg"
-    if not (isfinite(run.mass.standard_error) and run.mass.told_apart):
-        known = "kg, which the data do not " + ("tell from offsets" if not run.mass.told_apart else "determine")
-    print(f"total mass    {mass:.3f} {known} (URDF: {robot.nominal[:, 0].sum():.3f} kg)")
+    print(f"total mass    {_mass_text(run.mass)} (URDF: {run.mass.nominal:.3f} kg)")
     if run.robust is not None:
         found = run.robust
         print(f"robust        {found.loss}, {100 * found.mean_weight:.3g} % of the weight kept, {found.passes} passes")
     if robot.massless:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
-    timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
-    print(fill(f"time          {run.samples} samples: {timed}", 100, subsequent_indent=" " * 14))
-    print(f"written to    {run.experiment.config.output}")
+
+
+def _print_headline(worse: list[Worse]) -> None:
+    from torchid.report.verdict import ADVICE, verdict
+
+    for line in (f"WORSE THAN URDF: {verdict(worse)}", f"{ADVICE}; the results are written all the same, status 0"):
+        print(fill(line, 100, subsequent_indent="  "))
+
+
+def _print_validation(found: CrossValidation) -> None:
+    from torchid.report.verdict import JUDGED, described
+
+    texts = (described(group, found.identified.rms[group], found.nominal.rms[group]) for group in JUDGED)
+    text = f"held out      each of {found.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
+    print(fill(text, 100, subsequent_indent=" " * 14))
+
+
+def _mass_text(mass: TotalMass) -> str:
+    """The total mass with its standard error, or why there is none to be printed."""
+    if mass.determined:
+        return f"{mass.value:.3f} ± {mass.standard_error:.2g} kg"
+    if not mass.told_apart:
+        return "not determined: the data do not tell it from offsets"
+    known = f", standard error {mass.standard_error:.2g} kg" if isfinite(mass.standard_error) else ""
+    return f"not determined by the data{known}"
 
 
 def _print_noise(found: NoiseSummary) -> None:

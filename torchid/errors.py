@@ -46,6 +46,10 @@ class SensorError(InputError):
     """A sensor set or contact that does not fit the robot."""
 
 
+class ImplausibleFitError(InputError):
+    """A fit that no robot can have left: something about the data, not about the robot, is wrong."""
+
+
 class UnknownNameError(InputError, KeyError):
     """A name that nothing answers to; the message lists the nearest valid names."""
 

@@ -97,9 +97,9 @@ POSSIBLE_MARGIN = -1e-9
 
 
 def consistency_margin(phi: Array) -> Array:
-    """Smallest eigenvalue of the pseudo-inertia over its largest, (...,); negative means physically impossible."""
+    """Smallest eigenvalue of the pseudo-inertia over the largest in size, (...,); negative: physically impossible."""
     eigenvalues = np.linalg.eigvalsh(pseudo_inertia(phi))
-    return eigenvalues[..., 0] / np.maximum(eigenvalues[..., -1], np.finfo(float).tiny)
+    return eigenvalues[..., 0] / np.maximum(np.abs(eigenvalues).max(axis=-1), np.finfo(float).tiny)
 
 
 def least_eigenvalues(phi: Array, scale: Array) -> Array:

@@ -62,6 +62,8 @@ def estimate_extras(
         body_names: the robot's.
         rank_tolerance: as in `LeastSquares`.
     """
+    if not assembly.eliminations:
+        return []
     known, names = Known.of(assembly.problem, rank_tolerance), _names(assembly.problem.free, body_names)
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     shared = next((found for found in assembly.eliminations if not found.log), None)

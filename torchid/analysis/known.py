@@ -68,13 +68,20 @@ class Known:
 
 @dataclass(frozen=True)
 class TotalMass:
-    """How well the total mass is known [kg]: `standard_error`, infinite where the data do not determine it.
+    """The total mass and how well it is known [kg]: `standard_error`, infinite where the data do not determine it.
 
-    `told_apart`: whether they tell it from offsets and scales of sensors, as of `ExtraEstimate`.
+    `told_apart`: whether they tell it from offsets and scales of sensors, as of `ExtraEstimate`. `nominal`: the URDF's.
     """
 
     standard_error: float
     told_apart: bool
+    value: float
+    nominal: float
+
+    @property
+    def determined(self) -> bool:
+        """Whether the data say anything of it: a 95 % interval no wider than the URDF's mass on either side."""
+        return self.told_apart and 2.0 * self.standard_error <= self.nominal
 
 
 def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1e-10) -> TotalMass:
@@ -85,7 +92,8 @@ def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1
         standard_error_of(problem, estimate, weights.flatten(), rank_tolerance)
         for problem in (assembly.problem, assembly.if_known)
     )
-    return TotalMass(error, not np.isfinite(if_known) or error <= APART * if_known)
+    value, nominal = (float(weights.flatten() @ phi) for phi in (estimate.phi, assembly.problem.nominal))
+    return TotalMass(error, not np.isfinite(if_known) or error <= APART * if_known, value, nominal)
 
 
 @one_thread()

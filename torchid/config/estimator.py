@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 from pydantic.dataclasses import dataclass
 
 from torchid.config.types import STRICT, NotNegative, Number, Positive, Seed, no_flag
@@ -95,12 +102,30 @@ ROBUST_ACCEPTED = f"{', '.join(get_args(Loss))}, or a mapping with loss, tuning 
 Robust = Annotated[RobustConfig, BeforeValidator(_by_loss)]
 
 
+AUTO = "auto"
+"""What stands for a ridge that the data choose."""
+
+
+def _number_or_auto(value: object, check: ValidatorFunctionWrapHandler) -> object:
+    try:
+        return value if value == AUTO else check(value)
+    except ValidationError as error:
+        raise ValueError(f"a finite number of at least 0, or {AUTO}") from error
+
+
+if TYPE_CHECKING:
+    Ridge = float | str
+else:
+    Ridge = Annotated[NotNegative, WrapValidator(_number_or_auto)]
+
+
 @dataclass(config=STRICT, frozen=True)
 class EstimatorConfig:
     """How parameters are found.
 
-    `ridge` pulls to the URDF, `friction: false` leaves friction at the URDF's values, `frozen` bodies keep all of
-    theirs; `robust` takes outliers out of a batch fit; `margin` of the scaled pseudo-inertias.
+    `ridge` pulls to the URDF, auto: as far as predicts left-out blocks of the training logs best, `friction: false`
+    leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` takes outliers out of a batch
+    fit; `margin` of the scaled pseudo-inertias.
 
     For `consistent`: `prior` that the ridge is in, `total_mass` [kg] if known, `method` and whether to `certify` with
     the other; `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry` makes left
@@ -110,7 +135,7 @@ class EstimatorConfig:
     """
 
     name: Literal["least_squares", "consistent", "sgd"] = "least_squares"
-    ridge: NotNegative = 0.0
+    ridge: Ridge = 0.0
     rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
     friction: bool = True
     frozen: list[str] = dataclasses.field(default_factory=list)
@@ -127,6 +152,16 @@ class EstimatorConfig:
     consistency: Literal["log_cholesky", "penalties"] = "log_cholesky"
     penalties: PenaltiesConfig = dataclasses.field(default_factory=PenaltiesConfig)
     training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
+
+    @property
+    def chooses_ridge(self) -> bool:
+        """Whether the ridge is to be chosen by the data."""
+        return self.ridge == AUTO
+
+    @property
+    def pull(self) -> float:
+        """The ridge as a number, 0 while it has not been chosen."""
+        return 0.0 if isinstance(self.ridge, str) else self.ridge
 
 
 _ALL = ("name", "ridge", "rank_tolerance", "friction", "frozen")

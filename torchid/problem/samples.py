@@ -45,6 +45,7 @@ class Samples:
         unloaded: (N, C, 6), what the contacts' sensors read in the air, NaN elsewhere, as `Log.contact_unloaded`; None
             where there is no such reading.
         folder: on whose disk the tensors of a log larger than memory lie, None for one in memory.
+        fold: number of the block of all logs that these samples are in, see `in_folds`.
     """
 
     source: str
@@ -61,6 +62,7 @@ class Samples:
     share: Tensor | None = None
     unloaded: Tensor | None = None
     folder: Path | None = None
+    fold: int = 0
 
     def __len__(self) -> int:
         return len(self.time)

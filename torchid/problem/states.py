@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import accumulate
 
 import torch
+from torch import Tensor
 
 from torchid.errors import BaseLostError, BaseLostWarning
-from torchid.problem.chunks import by_state
+from torchid.problem.chunks import by_state, spread_by_state
 from torchid.problem.plan import State, state_name
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.problem.threads import one_thread
 from torchid.sensing.projection import base_rank, base_singular_values
 
-_CHECKED, _CHUNKS_CHECKED = 64, 8  # samples a chunk, chunks a state: rank is generic, a few postures settle it
+_CHECKED = 512  # samples a state, from all over the logs: shares are then known to about 2 %
+_MOST = (
+    0.5  # share of the samples that must see the whole base: then the median of the smallest singular value is not 0
+)
 
 
 @dataclass(frozen=True)
 class StateReport:
     """A contact state in the logs.
 
-    `name`: frames in contact, joined by "+". `rows`: equations per sample. `base_rank`: rank(S_b V_x), the best over
-    the samples checked, None for a fixed base. `base_singular_value`: median of its smallest singular value; near 0,
-    base accelerations are all but lost.
+    `name`: frames in contact, joined by "+". `rows`: equations per sample, at most. `base_rank`: rank(S_b V_x) that at
+    least half of the samples checked reach, None for a fixed base, as all that follows. `base_singular_value`: median
+    of its smallest singular value; near 0, base accelerations are all but lost. `base_full_share`: share of the samples
+    at rank 6; `base_rank_shares`: share at each rank that occurs, descending.
     """
 
     name: str
@@ -33,37 +40,48 @@ class StateReport:
     rows: int
     base_rank: int | None
     base_singular_value: float | None
+    base_full_share: float | None = None
+    base_rank_shares: dict[int, float] = field(default_factory=dict)
 
 
 @one_thread()
 @torch.no_grad()
 def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateReport]:
     """One report per contact state, most frequent first."""
-    counts: dict[State, int] = {}
-    values: dict[State, list[torch.Tensor]] = {}
-    rows: dict[State, int] = {}
-    checked: dict[State, int] = {}
+    counts = Counter[State]()
     for samples in logs:
         every = torch.arange(len(samples))
         for state, index in by_state(samples):
-            counts[state] = counts.get(state, 0) + len(every[index])
-            checked[state] = checked.get(state, 0) + 1
-            if checked[state] <= _CHUNKS_CHECKED:
-                piece = samples[index]
-                spread = piece[torch.linspace(0, len(piece) - 1, min(len(piece), _CHECKED)).long()].to(builder.device)
-                for _, V in builder.bases(spread, state):
-                    rows[state] = max(rows.get(state, 0), V.shape[2] + len(builder.plan(state).lone_joints))
-                    if builder.tree.base_rows:
-                        values.setdefault(state, []).append(base_singular_values(V).cpu())
-    reports = []
-    for state in sorted(counts, key=lambda s: -counts[s]):
-        rank = smallest = None
-        if builder.tree.base_rows:
-            found = torch.cat(values[state])
-            rank = int(base_rank(found).max())
-            smallest = float(found[:, -1].median())
-        reports.append(StateReport(state_name(builder.contacts, state), counts[state], rows[state], rank, smallest))
-    return reports
+            counts[state] += len(every[index])
+    rows, values, weights = (
+        Counter[State](),
+        defaultdict[State, list[Tensor]](list),
+        defaultdict[State, list[Tensor]](list),
+    )
+    for samples, state, weight in spread_by_state(logs, _CHECKED):
+        for _, V in builder.bases(samples.to(builder.device), state):
+            rows[state] = max(rows[state], V.shape[2] + len(builder.plan(state).lone_joints))
+            if builder.tree.base_rows:
+                values[state].append(base_singular_values(V).cpu())
+                weights[state].append(torch.full((len(V),), weight))
+    return [
+        StateReport(
+            state_name(builder.contacts, state),
+            count,
+            rows[state],
+            *(_of_base(torch.cat(values[state]), torch.cat(weights[state])) if values[state] else (None, None)),
+        )
+        for state, count in counts.most_common()
+    ]
+
+
+def _of_base(values: Tensor, weight: Tensor) -> tuple[int, float, float, dict[int, float]]:
+    """What a report says of the base, from singular values (B, 6) of samples that stand for so many each."""
+    ranks = base_rank(values)
+    share = {int(rank): float(weight[ranks == rank].sum() / weight.sum()) for rank in ranks.unique().flip(0)}
+    reached = accumulate(share.values())
+    most = next(rank for rank, so_far in zip(share, reached, strict=True) if so_far >= _MOST)
+    return most, float(values[:, -1].median()), share.get(6, 0.0), share
 
 
 def check_base(reports: Sequence[StateReport], on_base_lost: str = "error") -> None:
@@ -82,8 +100,14 @@ def check_base(reports: Sequence[StateReport], on_base_lost: str = "error") -> N
     lost = [report for report in reports if report.base_rank is not None and report.base_rank < 6]
     if not lost:
         return
-    where = "; ".join(f"{r.name} ({r.samples} samples): rank {r.base_rank} of 6" for r in lost[:4])
+    where = "; ".join(f"{r.name} ({r.samples} samples): {_described(r)}" for r in lost[:4])
     message = f"sensors: the base is lost, rank(S_b V_x) < 6, in contact with {where}"
     if on_base_lost == "error":
         raise BaseLostError(f"{message}; accepted: more sensors, other contacts, or sensors.on_base_lost: warn")
     warnings.warn(f"{message}; parameters of some bodies are out of reach there", BaseLostWarning, stacklevel=2)
+
+
+def _described(report: StateReport) -> str:
+    """The rank of most samples, and the share of those that are better."""
+    share = f", 6 in {100 * report.base_full_share:.2g} % of them" if report.base_full_share else ""
+    return f"rank {report.base_rank} of 6{share}"

@@ -24,12 +24,12 @@ from torchid.problem.workspace import Workspace
 from torchid.robot import Robot
 
 Weighing = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
-_Key = tuple[str, State, bool]
+_Key = tuple[str, State, int, bool]
 
 
 @dataclass
 class Part:
-    """What is kept of the samples of one log, by its source, in one contact state.
+    """What is kept of the samples of one log, by its source, in one contact state and one fold (see `in_folds`).
 
     Equations of sensors whose contact is in the air are in a part of their own, `unloaded`, which counts no samples;
     `gated`: numbers, among the extras, of the offsets that have none because the readings there are exactly 0.
@@ -39,6 +39,7 @@ class Part:
     state: State
     factor: TriangularFactor
     samples: int
+    fold: int = 0
     unloaded: bool = False
     gated: set[int] = field(default_factory=set)
 
@@ -77,7 +78,7 @@ def compress_parts(
     progress: Progress | None = None,
     weigh: Weighing | None = None,
 ) -> list[Part]:
-    """As `compress`, but with a factor for every contact state in every log, in the order of the logs.
+    """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
 
     Logs of one source count as one. Unknown offsets of contact sensors have further parts: readings in the air.
     `weigh` may change other rows before they are added: called with the samples they come from, their columns and
@@ -96,21 +97,18 @@ def _fold(
     parts: dict[_Key, Part] = {}
     workspace = Workspace()
 
-    def part(source: str, state: State, unloaded: bool) -> Part:
-        key = source, state, unloaded
-        if key not in parts:
-            parts[key] = Part(source, state, TriangularFactor(builder.width), 0, unloaded)
-        return parts[key]
+    def part(samples: Samples, state: State, unloaded: bool) -> Part:
+        key = (samples.source, state, samples.fold, unloaded) if by_log else ("", state, 0, False)
+        return parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
 
     for samples, state in chunks:
-        source = samples.source if by_log else ""
-        own = part(source, state, False)
+        own = part(samples, state, False)
         own.samples += len(samples)
         for support, rows in builder.rows(samples, state, workspace):
             weighed = rows if weigh is None else weigh(samples, support, rows)
             own.factor.add(support, weighed, samples.oversampling)
         for channel in unloaded_channels(builder, samples):
-            of_air = part(source, state, by_log)
+            of_air = part(samples, state, True)
             if channel.gated:
                 of_air.gated.add(channel.offset)
             else:
@@ -123,7 +121,7 @@ def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
     """The parts that workers have made of their chunks."""
     total: dict[_Key, Part] = {}
     for part in chain.from_iterable(of_workers):
-        same = total.setdefault((part.source, part.state, part.unloaded), part)
+        same = total.setdefault((part.source, part.state, part.fold, part.unloaded), part)
         if same is not part:
             same.samples += part.samples
             same.gated |= part.gated

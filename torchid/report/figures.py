@@ -16,7 +16,7 @@ from matplotlib.text import Text
 from torchid import parameters
 from torchid.errors import during
 from torchid.parameters import Array
-from torchid.report.metrics import BASE_ROWS, GROUPS, Metrics, group_name
+from torchid.report.metrics import BASE_ROWS, SHOWN, Metrics, group_name
 from torchid.text import escaped
 
 STYLE: dict[Any, Any] = {
@@ -94,13 +94,13 @@ def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
-        groups = [group for group in GROUPS if nominal.relative[group] is not None]
+        groups = [group for group in SHOWN if nominal.relative.get(group) is not None]
         place = np.arange(len(groups))
         for shift, metrics, color, label in (
             (-0.2, nominal, _NOMINAL, "URDF"),
             (0.2, identified, _IDENTIFIED, "identified"),
         ):
-            heights = [100.0 * (metrics.relative[group] or 0.0) for group in groups]
+            heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(place + shift, heights, 0.38, color=color, label=label)
             axis.bar_label(bars, fmt="%.3g", fontsize=8)
         axis.set_xticks(place, [group_name(group).replace(" ", "\n") for group in groups])

@@ -15,7 +15,7 @@ from torchid.problem.plan import State
 from torchid.problem.predict import forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.report.sums import ForceSums, figure, projected
+from torchid.report.sums import WHITENED, ForceSums, figure, projected
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
 from torchid.sensing.sensors import named_sensors
@@ -27,6 +27,9 @@ GROUPS = {
     "nullspace": "projected [N, N m]",
 }
 """Groups of rows that errors are given for, with a name and unit to show."""
+
+SHOWN = GROUPS | {WHITENED: "whitened [x noise]"}
+"""Those, and the whitened projected residual of a fit's own rows, which there is with any sensors."""
 
 LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
 """Readings of force/torque sensors in limbs, of robots that have some."""
@@ -40,14 +43,15 @@ BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis
 
 def group_name(group: str) -> str:
     """Name of a group of rows, without its unit."""
-    return GROUPS[group].split(" [")[0]
+    return SHOWN[group].split(" [")[0]
 
 
 @dataclass(frozen=True)
 class Metrics:
     """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
 
-    `rms` and `relative` by group; `by_joint_rms` and `by_joint_relative` by joint. Relative means rms of the error over
+    `rms` and `relative` by group of `SHOWN`, the last in units of the stated noise; `by_joint_rms` and
+    `by_joint_relative` by joint. Relative means rms of the error over
     rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
     the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
     mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
@@ -73,7 +77,7 @@ class Metrics:
                 out[f"{group}_{suffix}"] = groups[group]
                 if group == "joint_torque":
                     out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
-        return out
+        return out | {WHITENED: self.rms.get(WHITENED), f"{WHITENED}_relative": self.relative.get(WHITENED)}
 
 
 class Evaluation:
@@ -91,7 +95,17 @@ class Evaluation:
     def metrics(
         self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
     ) -> list[Metrics]:
-        """One `Metrics` per row of `phi`, as `RowBuilder.columns_of`, over all samples of the logs together."""
+        """One `Metrics` per row of `phi`, as `RowBuilder.columns_of`, over all samples of the logs together.
+
+        Without the whitened projected residual, which depends on sensors.
+        """
+        measured, *errors = self.sums(logs, phi, progress)
+        return [self.summary(measured, error) for error in errors]
+
+    def sums(
+        self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
+    ) -> list[ForceSums]:
+        """Of the measured forces, then of the errors of each row of `phi`."""
         builder = self.builder
         columns = builder.columns_of(phi)
 
@@ -108,18 +122,18 @@ class Evaluation:
             return sums
 
         parts = over_chunks(logs, builder, fold, progress=progress)
-        measured, *errors = [ForceSums.total(same) for same in zip(*parts, strict=True)]
-        return [self._summary(error, measured) for error in errors]
+        return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
-    def _summary(self, errors: ForceSums, measured: ForceSums) -> Metrics:
+    def summary(self, measured: ForceSums, errors: ForceSums) -> Metrics:
+        """What sums say."""
         base = self.robot.base_rows
         rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
         joints = slice(base, base + self.robot.n)
         by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
         names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
         return Metrics(
-            {group: figure(rms[group]) for group in GROUPS},
-            {group: _ratio(rms[group], size[group]) for group in GROUPS},
+            {group: figure(rms[group]) for group in SHOWN},
+            {group: _ratio(rms[group], size[group]) for group in SHOWN},
             {name: figure(x) for name, x in zip(names, by_joint, strict=True)},
             {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
             _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),

@@ -12,6 +12,9 @@ from torchid.problem.plan import State
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
+WHITENED = "projected_residual"
+"""The group of the rows that a fit sees: whitened, and projected so that nothing unmeasured is in them."""
+
 
 class Squares:
     """Sums and sums of squares by row, over the samples where the row is known."""
@@ -28,6 +31,11 @@ class Squares:
         self.plain += weight * values.sum(0)
         self.sum += weight * np.square(values).sum(0)
         self.count += weight * known.sum(0)
+
+    def add_squares(self, squares: float, count: int) -> None:
+        """Add one row's sum of squares over so many samples, of whose mean nothing is known."""
+        self.sum += squares
+        self.count += count
 
     def rms(self, rows: slice = slice(None)) -> Array:
         """Row by row."""
@@ -55,11 +63,14 @@ class Squares:
 
 
 class ForceSums:
-    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space."""
+    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space.
+
+    `whitened`: of the rows that a fit sees, V_x^T f of its sensors in units of their noise.
+    """
 
     def __init__(self, nv: int) -> None:
         """Start empty."""
-        self.rows, self.projected = Squares(nv), Squares(1)
+        self.rows, self.projected, self.whitened = Squares(nv), Squares(1), Squares(1)
 
     @classmethod
     def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
@@ -68,6 +79,7 @@ class ForceSums:
         for part in parts:
             out.rows.merge(part.rows)
             out.projected.merge(part.projected)
+            out.whitened.merge(part.whitened)
         return out
 
     def rms(self, base_rows: int, n: int) -> dict[str, float]:
@@ -81,6 +93,7 @@ class ForceSums:
             "ft_force": force,
             "ft_moment": moment,
             "nullspace": self.projected.pooled(slice(None)),
+            WHITENED: self.whitened.pooled(slice(None)),
         }
 
     def _in_limbs(self, first: int) -> tuple[float, float]:

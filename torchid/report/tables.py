@@ -20,7 +20,7 @@ from torchid.analysis.left_out import Contribution, PartContribution
 from torchid.estimators import Estimate
 from torchid.estimators.result import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
 from torchid.parameters import PARAMETERS, PER_BODY
-from torchid.report.metrics import GROUPS, Metrics
+from torchid.report.metrics import SHOWN, Metrics
 from torchid.text import escaped, unescaped
 
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
@@ -71,7 +71,7 @@ def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
     for name in columns:
         for which in ("URDF", "identified"):
             table.add_column(Text(f"{name}\n{which}"), justify="right", overflow="fold")
-    for group, label in GROUPS.items():
+    for group, label in SHOWN.items():
         cells = [_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *cells)
         if group == "base_force":
@@ -81,16 +81,16 @@ def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
 
 
 def _cell(metrics: Metrics, group: str) -> str:
-    rms, relative = metrics.rms[group], metrics.relative[group]
+    rms, relative = metrics.rms.get(group), metrics.relative.get(group)
     if rms is None:
         return "-"
     return f"{rms:.4g}" + ("" if relative is None else f" ({100 * relative:.3g} %)")
 
 
-def state_table(states: Sequence[Mapping[str, object]]) -> Table:
+def state_table(states: Sequence[Mapping[str, Any]]) -> Table:
     """Contact states with sample counts, rows per sample, and what is left of the base."""
     table = Table(title="Contact states", title_justify="left")
-    for heading in ("in contact", "samples", "rows each", "rank(S_b V_x)", "smallest s.v."):
+    for heading in ("in contact", "samples", "rows each", "rank(S_b V_x)", "at full rank", "smallest s.v."):
         table.add_column(heading, justify="left" if heading == "in contact" else "right")
     for state in states:
         rank, smallest = state["base_rank"], state["base_singular_value"]
@@ -99,6 +99,7 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
             str(state["samples"]),
             str(state["rows"]),
             "fixed base" if rank is None else f"{rank} of 6",
+            _shares(state),
             "" if smallest is None else f"{smallest:.2g}",
         )
     return table
@@ -123,6 +124,15 @@ def noise_advice(suggested: Mapping[str, Any]) -> str:
 
     keys = ", ".join(f"{key}: {text(x)}" for key, x in suggested.items())
     return f"noise         stated values contradict the residuals: state sensors.noise {{{keys}}}, or none of these"
+
+
+def _shares(state: Mapping[str, Any]) -> str:
+    """Share of the samples that see the whole base, and the least rank of the others."""
+    full, ranks = state["base_full_share"], state["base_rank_shares"]
+    if full is None:
+        return ""
+    lowest = min(ranks, default=6)
+    return f"{100 * full:.3g} %" + (f" (least: {lowest})" if lowest < 6 else "")
 
 
 def legend_of_marks() -> str:

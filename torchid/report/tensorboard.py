@@ -13,8 +13,9 @@ from torch.utils.tensorboard import SummaryWriter
 
 from torchid.analysis.information import Knowledge
 from torchid.estimators import BoundEstimate, Epoch, Estimate
-from torchid.report.metrics import GROUPS, SETS, Metrics
+from torchid.report.metrics import SETS, SHOWN, Metrics
 
+_CHARTED = (*SETS, "left_out")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
 
 
@@ -34,7 +35,7 @@ class RunEvents:
             since: step from which on what earlier event files in the folder say is void.
         """
         self._writer = SummaryWriter(str(folder), purge_step=since)
-        groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in SETS]] for group in GROUPS}
+        groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in _CHARTED]] for group in SHOWN}
         loss = {
             "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
             "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
@@ -56,11 +57,15 @@ class RunEvents:
     def errors(self, step: int, sets: Mapping[str, Metrics]) -> None:
         """Errors by group of rows of one parameter vector on sets of logs."""
         for name, metrics in sets.items():
-            for group in GROUPS:
-                if metrics.relative[group] is not None:
+            for group in SHOWN:
+                if metrics.relative.get(group) is not None:
                     self._writer.add_scalar(f"relative_error_{name}/{group}", metrics.relative[group], step)
-                if metrics.rms[group] is not None:
+                if metrics.rms.get(group) is not None:
                     self._writer.add_scalar(f"rms_error_{name}/{group}", metrics.rms[group], step)
+
+    def verdict(self, step: int, text: str) -> None:
+        """How the identified parameters predict what the fit has not seen, beside the URDF's."""
+        self._writer.add_text("verdict", text, step)
 
     def eigenvalues(self, step: int, least: Mapping[str, float]) -> None:
         """Smallest eigenvalue of the scaled pseudo-inertia by body; negative: no such body exists."""

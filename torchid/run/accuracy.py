@@ -14,6 +14,7 @@ from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.elimination import Assembly, assemble
 from torchid.problem.extras import ExtraTerms
+from torchid.problem.folds import in_folds
 from torchid.problem.measured import measured_components
 from torchid.problem.samples import check_forces
 from torchid.problem.streaming import compress_parts
@@ -24,6 +25,8 @@ from torchid.run.calibration import Calibration
 from torchid.run.estimation import batch_estimator, stated_conditions
 from torchid.run.experiment import Scene
 from torchid.run.fit import fitted
+from torchid.run.plausibility import check_plausible
+from torchid.run.ridge import chosen_ridge
 from torchid.sensing import SensorSet, named_sensors, with_ft_sensors
 
 
@@ -54,7 +57,7 @@ def accuracies(
             message = f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'"
             warnings.warn(message, TorchidWarning, stacklevel=2)
         else:
-            out[name] = _accuracy(scene, sensors, train, test, evaluation, reference, source)
+            out[name] = _accuracy(name, scene, sensors, train, test, evaluation, reference, source)
         bars.advance(bar)
     return out
 
@@ -95,6 +98,7 @@ def _reference(scene: Scene, train: Sequence[Samples]) -> _Reference | None:
 
 
 def _accuracy(
+    name: str,
     scene: Scene,
     sensors: SensorSet,
     train: Sequence[Samples],
@@ -107,13 +111,18 @@ def _accuracy(
     builder = RowBuilder(robot, scene.contacts, sensors, scene.terms).to(scene.config.device)
     if settings.name == "sgd":
         settings = replace(settings, name="least_squares")
+    blocks = in_folds(train, builder)
+    parts = compress_parts(blocks, builder)
+    if settings.chooses_ridge:
+        settings = replace(settings, ridge=chosen_ridge(parts, blocks, scene, sensors, builder, source).ridge)
     estimator = batch_estimator(settings, stated_conditions(settings, robot, source))
-    fit = fitted(compress_parts(train, builder), scene, builder, estimator.solve, source)
+    fit = fitted(parts, scene, builder, estimator.solve, source)
+    check_plausible(fit, scene, f"{source} (sensors {name})")
     estimate, problem = fit.estimate, fit.assembly.problem
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling
     prior_error = scene.config.analysis.prior_error
-    directions = error_directions(problem, settings.ridge, variance, prior_error, settings.rank_tolerance)
+    directions = error_directions(problem, settings.pull, variance, prior_error, settings.rank_tolerance)
     found = scene.noise.times(noise)
     bodies = Evaluation(robot, scene.contacts, scene.config.device, ExtraTerms(sign_width=scene.terms.sign_width))
     expected = expected_errors(bodies.builder, test or train, directions, found)

@@ -1,9 +1,9 @@
-"""Logs as calibrated sensors would have recorded them, what actuators add to predictions, and the errors of both."""
+"""Logs as calibrated sensors would have recorded them, and what actuators add to predictions."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -20,7 +20,7 @@ from torchid.problem.elimination import assemble
 from torchid.problem.extras import Extra
 from torchid.problem.samples import check_forces
 from torchid.problem.streaming import Part, compress_parts
-from torchid.report.metrics import Evaluation, Metrics
+from torchid.report.metrics import Evaluation
 from torchid.run.estimation import assembled
 from torchid.run.experiment import Scene
 from torchid.run.fit import Fit
@@ -83,6 +83,10 @@ class Calibration:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""
         return np.append(self.phi, self._known(evaluation.builder.extras, ""))
 
+    def columns(self, builder: RowBuilder, log: Samples) -> Tensor:
+        """Parameters in the columns of the rows of a log's sensors, (width,)."""
+        return builder.columns_of(np.append(self.phi, self._values_for(log))[None])[0]
+
     @cached_property
     def _builder(self) -> RowBuilder:
         scene = self.scene
@@ -127,25 +131,6 @@ class Calibration:
         return robust_unknowns(log, builder, solve, columns, loss_of(robust.loss, robust.tuning), robust.passes)
 
 
-def errors(
-    evaluation: Evaluation,
-    logs: Sequence[Samples],
-    both: tuple[Calibration, Calibration],
-    progress: Callable[[int], None] | None = None,
-) -> tuple[Metrics, Metrics]:
-    """Of nominal and identified parameters on logs as recorded, each with the unknowns that suit them."""
-    nominal, identified = both
-    if not nominal.changes_readings:
-        before, after = evaluation.metrics(logs, np.stack([one.parameters(evaluation) for one in both]), progress)
-    else:
-        with warnings.catch_warnings():  # the identified ones say the same
-            warnings.simplefilter("ignore", TorchidWarning)
-            readings = nominal.logs(logs)
-        (before,) = evaluation.metrics(readings, nominal.parameters(evaluation)[None])
-        (after,) = evaluation.metrics(identified.logs(logs), identified.parameters(evaluation)[None], progress)
-    return before, after
-
-
 def warn_of_confounded(found: Sequence[ExtraEstimate], source: object) -> None:
     """Name the sensors whose offset or scale the data cannot tell from other parameters, and these.
 
@@ -180,7 +165,7 @@ def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: ob
             warnings.warn(f"{message}, which says nothing of their offsets", TorchidWarning, stacklevel=3)
     settings = scene.config.estimator
     assembly = assembled(on_ground, builder, scene.robot, settings, source)
-    estimate = LeastSquares(settings.ridge, settings.rank_tolerance).solve(assembly.problem)
+    estimate = LeastSquares(settings.pull, settings.rank_tolerance).solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, scene.robot.body_names, settings.rank_tolerance)
     noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
     found = disagreements(fit.parts, builder, extras, noise)

@@ -72,7 +72,7 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     found = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
-            log = _read(file, config.logs.topics, config.preprocessing)
+            log = log_to_check(file, config.logs.topics, config.preprocessing)
             found.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
     return found
 
@@ -96,7 +96,7 @@ def check_log(
     Raises:
         InputError: the log or the URDF cannot be read, or the log is larger than an experiment's may be by default.
     """
-    log = _read(Path(path), None if topics is None else load_topics(topics), PreprocessingConfig())
+    log = log_to_check(Path(path), None if topics is None else load_topics(topics), PreprocessingConfig())
     if urdf is None:
         return check(log)
     robot = load_robot(urdf, base_link, fixed_base, log.ft_names)
@@ -105,8 +105,12 @@ def check_log(
     return check(log, robot, [_contact(log, index) for index in range(len(log.contact_names))])
 
 
-def _read(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Log:
-    """A log, unless it is larger than what may be in memory at once."""
+def log_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Log:
+    """A log as it was read.
+
+    Raises:
+        LogError: it cannot be read, or is larger than what may be in memory at once.
+    """
     size = gigabytes(path, settings.memory_gb)
     if size > settings.memory_gb:
         accepted = f"parts of the log, or an experiment file with a preprocessing.memory_gb above {size:.2g}"

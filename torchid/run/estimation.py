@@ -67,6 +67,18 @@ def stated_conditions(settings: EstimatorConfig, robot: Robot, source: object = 
     return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0, names=robot.body_names)
 
 
+def stand_in(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
+    """What solves the same problem in one go: for a descent, what it approaches with the same ridge.
+
+    Penalties that bodies pay for not existing are left out.
+    """
+    if settings.name != "sgd":
+        return batch_estimator(settings, conditions)
+    if settings.consistency == "penalties" or not settings.pull:
+        return LeastSquares(settings.pull, settings.rank_tolerance)
+    return Consistent(settings.pull, conditions=conditions, rank_tolerance=settings.rank_tolerance)
+
+
 def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
     """What solves a compressed problem in one go, `least_squares` or `consistent`.
 
@@ -74,7 +86,7 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
         InputError: the certified method without CVXPY and Clarabel.
     """
     if settings.name == "least_squares":
-        return LeastSquares(settings.ridge, settings.rank_tolerance)
+        return LeastSquares(settings.pull, settings.rank_tolerance)
     return Consistent(
-        settings.ridge, settings.prior, conditions, settings.method, settings.certify, settings.rank_tolerance
+        settings.pull, settings.prior, conditions, settings.method, settings.certify, settings.rank_tolerance
     )

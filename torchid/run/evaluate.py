@@ -9,15 +9,17 @@ from pathlib import Path
 from torchid.config import load_config
 from torchid.errors import ConfigError, TorchidWarning, during
 from torchid.guards import MAX_YAML, read_bytes
+from torchid.problem import RowBuilder
 from torchid.report.figures import error_figure, save_figure
 from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.parameters_json import read_parameters, read_shared_extras
-from torchid.run.calibration import Calibration, errors
+from torchid.run.calibration import Calibration
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import forces_of
+from torchid.run.validation import Judge
 
 
 def evaluate(
@@ -57,10 +59,12 @@ def evaluate(
         reader = LogReader(experiment, folder)
         samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
         evaluation = Evaluation(robot, experiment.contacts, config.device, experiment.terms)
+        builder = RowBuilder(robot, experiment.contacts, experiment.sensors, experiment.terms).to(config.device)
+        judge = Judge(evaluation, builder)
         evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
         metrics = {}
         for log in samples:
-            pair = errors(evaluation, [log], both, lambda n: bars.advance(evaluating, n))
+            pair = judge.errors([log], both, lambda n: bars.advance(evaluating, n))
             metrics[Path(log.source).stem] = pair
             if not any(x is not None for x in pair[1].rms.values()):
                 message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"

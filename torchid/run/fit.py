@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from torch import Tensor
 
 from torchid.analysis.calibration import ExtraEstimate, estimate_extras
+from torchid.errors import TorchidWarning
 from torchid.estimators import Estimate, LeastSquares
 from torchid.problem import LinearProblem, RowBuilder
 from torchid.problem.elimination import Assembly
+from torchid.problem.folds import states_together
 from torchid.problem.streaming import Part
 from torchid.run.estimation import assembled
 from torchid.run.experiment import Scene
@@ -33,6 +36,36 @@ class Fit:
         return builder.columns_of(np.append(self.estimate.phi, extras)[None])[0]
 
 
+def fits_without_folds(
+    parts: Sequence[Part],
+    scene: Scene,
+    builder: RowBuilder,
+    solve: Callable[[LinearProblem], Estimate],
+    source: object = "experiment",
+) -> list[Fit]:
+    """For every fold, in order, the fit of all others; none where there is only one.
+
+    Args:
+        parts: of a fit, with the weights that they have in it.
+        scene: as of `fitted`, with the others.
+        builder: of the rows.
+        solve: an estimator.
+        source: named in errors.
+    """
+    folds = sorted({part.fold for part in parts})
+    if len(folds) < 2:
+        return []
+    blocks = states_together(parts, builder)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
+        fits = []
+        for fold in folds:
+            rest = [block for block in blocks if block.fold != fold]
+            assembly = assembled(rest, builder, scene.robot, scene.config.estimator, source)
+            fits.append(solved(rest, assembly, scene, solve))
+        return fits
+
+
 def fitted(
     parts: list[Part],
     scene: Scene,
@@ -49,14 +82,26 @@ def fitted(
         solve: an estimator.
         source: named in errors.
     """
-    settings, robot = scene.config.estimator, scene.robot
-    assembly = assembled(parts, builder, robot, settings, source)
-    if any(part.unloaded for part in parts):
-        first = LeastSquares(settings.ridge, settings.rank_tolerance).solve(assembly.problem)
-        parts = [_with_own_noise(part, first.residual_std) for part in parts]
-        assembly = assembled(parts, builder, robot, settings, source)
+    return solved(*posed(parts, scene, builder, source), scene, solve)
+
+
+def posed(
+    parts: Sequence[Part], scene: Scene, builder: RowBuilder, source: object = "experiment"
+) -> tuple[list[Part], Assembly]:
+    """The problem that logs pose, and their parts with the weights that they have in it. Arguments as of `fitted`."""
+    settings = scene.config.estimator
+    assembly = assembled(parts, builder, scene.robot, settings, source)
+    if not any(part.unloaded for part in parts):
+        return list(parts), assembly
+    first = LeastSquares(settings.pull, settings.rank_tolerance).solve(assembly.problem)
+    weighed = [_with_own_noise(part, first.residual_std) for part in parts]
+    return weighed, assembled(weighed, builder, scene.robot, settings, source)
+
+
+def solved(parts: list[Part], assembly: Assembly, scene: Scene, solve: Callable[[LinearProblem], Estimate]) -> Fit:
+    """Solve what the logs pose. Arguments as of `fitted`."""
     estimate = solve(assembly.problem)
-    extras = estimate_extras(assembly, estimate, robot.body_names, settings.rank_tolerance)
+    extras = estimate_extras(assembly, estimate, scene.robot.body_names, scene.config.estimator.rank_tolerance)
     return Fit(parts, assembly, estimate, extras)
 
 

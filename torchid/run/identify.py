@@ -7,38 +7,37 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
-import numpy as np
 from rich.progress import Progress
 
 from torchid.analysis.contributions import Contributions, contributions
-from torchid.analysis.known import total_mass
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning, SensorError
+from torchid.errors import NumericalWarning
 from torchid.estimators import Estimate, LeastSquares, violations
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
+from torchid.problem.folds import folds_together, in_folds, states_together
 from torchid.problem.plan import State, state_name
 from torchid.problem.states import check_base, state_reports
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
-from torchid.run.calibration import Calibration, errors, warn_of_confounded, warn_of_disagreement
+from torchid.run.calibration import Calibration, warn_of_confounded, warn_of_disagreement
 from torchid.run.claim import claimed
-from torchid.run.estimation import assembled, batch_estimator, stated_conditions
+from torchid.run.estimation import assembled, stand_in, stated_conditions
 from torchid.run.experiment import Experiment, set_up
-from torchid.run.fit import Fit, fitted
+from torchid.run.fit import Fit, fits_without_folds, fitted
 from torchid.run.folder import RUN, check_free
 from torchid.run.noise import weighed
+from torchid.run.plausibility import check_plausible
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import Identification, write_run
+from torchid.run.ridge import RidgeChoice, chosen_ridge
 from torchid.run.robust import RobustSummary, loss_of, robust_fit
-from torchid.run.training import Training, check_training, training_folder
-
-_IMPLAUSIBLE = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
-_UNEXPLAINED = 0.5  # of the weighted forces' rms: recorded logs stay below 0.35
+from torchid.run.training import Training, check_training, descent_settings, training_folder
+from torchid.run.validation import CrossValidation, Judge, Pair, warn_of_worse
 
 
 @dataclass
@@ -78,8 +77,8 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
         with clock("read"):
             experiment = set_up(config, source)
             conditions = stated_conditions(config.estimator, experiment.robot, source)
-            training = Training(config, experiment.robot, source) if config.estimator.name == "sgd" else None
-            estimator = training or batch_estimator(config.estimator, conditions)
+            if config.estimator.name == "sgd":
+                descent_settings(config, source)  # before any work
             reader = LogReader(experiment)
             logs = _read(reader, experiment, bars)
         with clock("noise"):
@@ -88,30 +87,37 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             experiment, noise = weighed(experiment, logs["train"], source)
         with clock("compress"):
             builder = _builder(experiment)
-            parts = _compressed(builder, logs["train"], bars)
+            blocks = in_folds(logs["train"], builder)
+            parts = _compressed(builder, blocks, bars)
+        with clock("ridge"):
+            experiment, ridge = _with_ridge(experiment, parts, blocks, builder, bars, source)
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device, experiment.terms)
+        training = None
         with clock("solve"):
-            solve: Callable[[LinearProblem], Estimate]
-            if isinstance(estimator, Training):
+            settings = experiment.config.estimator
+            instead = stand_in(settings, conditions).solve
+            solve: Callable[[LinearProblem], Estimate] = instead
+            if settings.name == "sgd":
+                check_plausible(fitted(parts, experiment, builder, instead, source), experiment, source)
+                training = Training(experiment.config, experiment.robot, source)
                 evaluate = partial(_identified_metrics, evaluation, logs)
-                solve = partial(estimator.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
-            else:
-                solve = estimator.solve
+                solve = partial(training.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
             fit = fitted(parts, experiment, builder, solve, source)
-            fit, robust = _robust(fit, experiment, builder, solve, logs["train"], bars, source)
+            fit, robust = _robust(fit, experiment, builder, solve, blocks, bars, source)
             del parts
             estimate, problem = fit.estimate, fit.assembly.problem
-            _check_sense(estimate, problem, source)
+            mass = check_plausible(fit, experiment, source)
             warn_of_confounded(fit.extras, source)
             warn_of_disagreement(fit, experiment, builder, source)
         with clock("identifiability"):
-            alone = _by_state(experiment, builder, fit.parts, source)
-            adds = _contributions(experiment, builder, fit.parts, logs["train"], problem, bars)
+            whole = folds_together(fit.parts, builder)
+            alone = _by_state(experiment, builder, whole, source)
+            adds = _contributions(experiment, builder, whole, logs["train"], problem, bars)
         with clock("evaluate"):
-            both = Calibration.both(experiment, experiment.sensors, estimate.phi, fit.extras)
-            metrics = _metrics(evaluation, logs, both, bars)
-        broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions)
-        samples = sum(map(len, logs["train"]))
+            left_out = fits_without_folds(fit.parts, experiment, builder, instead, source)
+            both, *without = (_calibrations(experiment, one) for one in (fit, *left_out))
+            judge, of_blocks = Judge(evaluation, builder), states_together(fit.parts, builder)
+            metrics, validation = _metrics(judge, logs["test"], blocks, of_blocks, (both, without), bars)
         run = Identification(
             experiment,
             estimate,
@@ -122,15 +128,37 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             alone,
             adds,
             metrics,
-            broken,
+            violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions),
             clock.seconds,
-            samples,
+            sum(map(len, logs["train"])),
             reader.excluded,
-            total_mass(fit.assembly, estimate, config.estimator.rank_tolerance),
+            mass,
+            validation,
+            ridge,
         )
+        warn_of_worse(run.worse, source)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], both, training)
     return run
+
+
+def _with_ridge(
+    experiment: Experiment,
+    parts: Sequence[Part],
+    blocks: Sequence[Samples],
+    builder: RowBuilder,
+    bars: Progress,
+    source: object,
+) -> tuple[Experiment, RidgeChoice | None]:
+    """The experiment with a ridge that is a number, and how it was chosen, if it was."""
+    config = experiment.config
+    if not config.estimator.chooses_ridge:
+        return experiment, None
+    bar = bars.add_task("choosing the ridge", total=None)
+    choice = chosen_ridge(parts, blocks, experiment, experiment.sensors, builder, source)
+    bars.update(bar, total=1, completed=1)
+    chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
+    return replace(experiment, config=chosen), choice
 
 
 def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
@@ -196,7 +224,7 @@ def _by_state(
     settings, samples = experiment.config.estimator, Counter[State]()
     for part in parts:
         samples[part.state] += part.samples
-    estimator, out = LeastSquares(settings.ridge, settings.rank_tolerance), {}
+    estimator, out = LeastSquares(settings.pull, settings.rank_tolerance), {}
     for state, _ in samples.most_common():
         of_state = [part for part in parts if part.state == state]
         problem = assembled(of_state, builder, experiment.robot, settings, source).problem
@@ -220,35 +248,33 @@ def _contributions(
     return found
 
 
+def _calibrations(experiment: Experiment, fit: Fit) -> tuple[Calibration, Calibration]:
+    return Calibration.both(experiment, experiment.sensors, fit.estimate.phi, fit.extras)
+
+
 def _metrics(
-    evaluation: Evaluation,
-    logs: Mapping[str, Sequence[Samples]],
-    both: tuple[Calibration, Calibration],
+    judge: Judge,
+    test: Sequence[Samples],
+    blocks: Sequence[Samples],
+    parts: Sequence[Part],
+    calibrations: tuple[tuple[Calibration, Calibration], Sequence[tuple[Calibration, Calibration]]],
     bars: Progress,
-) -> dict[str, tuple[Metrics, Metrics]]:
-    """Nominal and identified metrics by set of logs."""
-    sets = {name: logs[name] for name in SETS if logs[name]}
-    bar = bars.add_task("evaluating", total=sum(len(log) for same in sets.values() for log in same))
-    return {name: errors(evaluation, same, both, lambda n: bars.advance(bar, n)) for name, same in sets.items()}
+) -> tuple[dict[str, Pair], CrossValidation | None]:
+    """Nominal and identified metrics by set of logs, and of fits without a fold each on that fold.
+
+    `parts`: of the blocks of the training logs; `calibrations`: of the fit, and of the fits without a fold.
+    """
+    both, left_out = calibrations
+    bar = bars.add_task("evaluating", total=sum(map(len, [*blocks, *test])))
+
+    def done(samples: int) -> None:
+        bars.advance(bar, samples)
+
+    train, validation = judge.training_errors(blocks, parts, both, left_out, done)
+    return {"train": train} | ({"test": judge.errors(test, both, done)} if test else {}), validation
 
 
 def _identified_metrics(
     evaluation: Evaluation, logs: Mapping[str, Sequence[Samples]], phi: Array
 ) -> dict[str, Metrics]:
     return {name: evaluation.metrics(logs[name], phi[None])[0] for name in SETS if logs[name]}
-
-
-def _check_sense(estimate: Estimate, problem: LinearProblem, source: object) -> None:
-    """Refuse a fit of nothing, and warn of one that the dynamics cannot explain."""
-    if not estimate.rank:
-        raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
-    left = np.sqrt(estimate.cost / max(estimate.rows, 1))  # not corrected for the fit, which may be far from the best
-    share = np.sqrt(estimate.cost / max(problem.cost(np.zeros_like(estimate.phi)), np.finfo(float).tiny))
-    if left > _IMPLAUSIBLE:
-        found = f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
-        advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
-        warnings.warn(f"{source}: {found}; {advice}", NumericalWarning, stacklevel=3)
-    elif share > _UNEXPLAINED:
-        found = f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
-        warnings.warn(f"{source}: {found}; check units, frames, quaternion order and contact_active",
-                      NumericalWarning, stacklevel=3)  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +35,19 @@ from torchid.report.parameters_json import parameters_document
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.report.tensorboard import RunEvents
 from torchid.report.urdf_export import identified_urdf
+from torchid.report.verdict import Worse, verdict, worse_than_nominal
 from torchid.run.calibration import Calibration
 from torchid.run.experiment import Experiment
 from torchid.run.folder import new_folder, write_json
 from torchid.run.noise import NoiseSummary
+from torchid.run.ridge import RidgeChoice
 from torchid.run.robust import RobustSummary
 from torchid.run.training import Training, body_eigenvalues
+from torchid.run.validation import CrossValidation
 
 _PLOTTED_SAMPLES = 3000
+LEFT_OUT = "blocks left out of the fit"
+"""How tables call the training samples that cross-validation predicts."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,8 @@ class Identification:
 
     `extras`: unknowns beside the bodies' parameters. `noise`: what rows were weighed with. `robust`: how outliers were
     weighed down, if so. `mass`: how well the total mass is known. `excluded`: condemned samples left out, by log.
-    `adds`: what each training log, contact state and sensor adds.
+    `adds`: what each training log, contact state and sensor adds. `validation`: None where the samples are too few to
+    leave some out. `ridge`: how it was chosen, if it was.
     """
 
     experiment: Experiment
@@ -67,11 +74,19 @@ class Identification:
     samples: int
     excluded: Mapping[str, int]
     mass: TotalMass
+    validation: CrossValidation | None
+    ridge: RidgeChoice | None
 
     def violations_by_name(self) -> list[dict[str, object]]:
         """Conditions that the identified parameters break, the body by its name."""
         names = self.experiment.robot.body_names
         return [asdict(x) | {"body": None if x.body is None else names[x.body]} for x in self.violations]
+
+    @cached_property
+    def worse(self) -> list[Worse]:
+        """Groups of rows where the URDF predicts better, on blocks left out of the fit or on the test logs."""
+        sets = {} if self.validation is None else {LEFT_OUT: (self.validation.nominal, self.validation.identified)}
+        return worse_than_nominal(sets | ({"test logs": self.metrics["test"]} if "test" in self.metrics else {}))
 
     def state_entries(self) -> list[dict[str, object]]:
         """Contact states, with what each of them adds."""
@@ -161,7 +176,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "excluded_samples": run.excluded,
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
-        "total_mass": float(run.phi[:, 0].sum()),
+        "total_mass": run.mass.value if run.mass.determined else None,
         "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
         "total_mass_told_from_offsets": run.mass.told_apart,
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
@@ -170,10 +185,22 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "robust": None if run.robust is None else asdict(run.robust),
         "violations": run.violations_by_name(),
         "solution": _solution_document(estimate),
+        "cross_validation": _validation_document(run),
+        "ridge_selection": None if run.ridge is None else asdict(run.ridge),
+        "worse_than_nominal": [asdict(one) for one in run.worse],
+        "verdict": verdict(run.worse),
         "contact_states": run.state_entries(),
         "identifiability": _identifiability_document(run),
         "seconds": run.seconds,
     }
+
+
+def _validation_document(run: Identification) -> dict[str, object] | None:
+    """Errors on blocks of the training logs of what was fitted without them."""
+    found = run.validation
+    if found is None:
+        return None
+    return {"folds": found.folds, "nominal": found.nominal.as_dict(), "identified": found.identified.as_dict()}
 
 
 def _identifiability_document(run: Identification) -> dict[str, object]:
@@ -217,6 +244,10 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
                 events.errors(step, {name: pair[step] for name, pair in run.metrics.items()})
                 events.eigenvalues(step, body_eigenvalues(robot, phi))
             events.solution(estimate, run.samples / run.seconds["compress"])
+        if run.validation is not None:
+            events.errors(0, {"left_out": run.validation.nominal})
+            events.errors(last, {"left_out": run.validation.identified})
+        events.verdict(last, verdict(run.worse) or "nowhere worse than the URDF's parameters")
         events.fit(last, estimate)
         events.identifiability(last, estimate, run.adds.known, table_text(verdict_counts_table(run.by_state, estimate)))
         final = {
@@ -238,7 +269,7 @@ def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
     return {
         "sensors": config.sensors.set or "by name",
         "estimator": estimator.name,
-        "ridge": estimator.ridge,
+        "ridge": estimator.pull,
         "friction": estimator.friction,
         "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
         "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,

@@ -215,7 +215,7 @@ def descent_settings(config: ExperimentConfig, source: object = "experiment") ->
     optimizer, schedule = dict(training.optimizer), dict(training.schedule or {})
     try:
         return Sgd(
-            ridge=estimator.ridge,
+            ridge=estimator.pull,
             rank_tolerance=estimator.rank_tolerance,
             consistency=estimator.consistency,
             margin=estimator.margin,
