@@ -23,7 +23,7 @@ from torchid.estimators.optimizers import (
 )
 
 REFUSED = {"SparseAdam", "Muon"}  # the latter since torch 2.9
-SLOWER = {"ASGD": 2.0, "RAdam": 1.7, "Rprop": 1.4}
+EPOCHS_OF = {"LBFGS": 3, "ASGD": 25, "Rprop": 40}
 SCHEDULES: dict[str, dict[str, Any]] = {
     "ConstantLR": {"total_iters": 3},
     "CosineAnnealingLR": {},
@@ -93,10 +93,10 @@ def test_an_optimizer_of_torch_that_cannot_do_it_is_refused_by_those_that_can(na
 
 @pytest.mark.parametrize("name", optimizer_names())
 def test_every_supported_optimizer_comes_near_the_closed_form_by_its_name_alone(name: str) -> None:
-    """52 times the closed form at the nominal parameters; after so few epochs most are within 2 %."""
+    """52 times the closed form at the nominal parameters; after so few epochs most are within 2 %, ASGD at 1.7."""
     w = demo()
-    estimate = Trainer(Sgd(0.001, optimizer=name, epochs=4 if name == "LBFGS" else 25), w.problem, w.batches).run()
-    assert 1.0 < estimate.objective / estimate.unconstrained < SLOWER.get(name, 1.1)
+    estimate = Trainer(Sgd(0.001, optimizer=name, epochs=EPOCHS_OF.get(name, 15)), w.problem, w.batches).run()
+    assert 1.0 < estimate.objective / estimate.unconstrained < (2.0 if name == "ASGD" else 1.3)
 
 
 @pytest.mark.parametrize(
