@@ -12,6 +12,7 @@ import pytest
 import yaml
 from demo import shortened_demo
 from refusals import files_in, refusal
+from synthetic import Oracle
 
 import torchid
 from torchid.analysis.base_check import PostureSummary, StateCheck
@@ -317,14 +318,16 @@ def test_what_is_planned_for_flight_is_not_compared_on_logs_of_a_robot_that_stan
 
 
 def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(experiment: Path) -> None:
-    time, rng = np.arange(200) * 0.01, np.random.default_rng(0)
-    position = np.stack([np.sin((1.0 + 0.3 * j) * time + j) for j in range(len(TORQUES))], axis=1)
+    time, hz = np.arange(200)[:, None] * 0.01, 1.0 + 0.3 * np.arange(len(TORQUES))
+    position, velocity = np.sin(hz * time + np.arange(len(TORQUES))), hz * np.cos(hz * time + np.arange(len(TORQUES)))
+    oracle = Oracle(experiment / "quadruped.urdf", TORQUES, fixed_base=True)
+    torque = oracle.frictionless_forces(position, velocity, -(hz**2) * position)
     np.savez(
         experiment / "bolted.npz",
-        time=time,
+        time=time[:, 0],
         joint_names=np.array(TORQUES),
         joint_position=position,
-        joint_torque=rng.normal(size=position.shape),
+        joint_torque=torque,
     )
     file = asked(
         experiment,
@@ -334,7 +337,7 @@ def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
         sensors="joints",
         output=str(experiment / "bolted"),
     )
-    with pytest.warns(TorchidWarning):  # fitted on what it is tested on, and torques that no robot needs
+    with pytest.warns(TorchidWarning):  # fitted on what it is tested on
         analysis = analyze(load_analysis(file), file)
     (scenario,) = analysis.scenarios
     assert scenario.plan.question.criterion == "stack"

@@ -184,7 +184,7 @@ def _print_headline(worse: list[Worse]) -> None:
 def _print_validation(found: CrossValidation) -> None:
     from torchid.report.verdict import JUDGED, described
 
-    texts = (described(group, found.identified.rms[group], found.nominal.rms[group]) for group in JUDGED)
+    texts = (described(group, found.identified.rms.get(group), found.nominal.rms.get(group)) for group in JUDGED)
     text = f"held out      each of {found.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
     print(fill(text, 100, subsequent_indent=" " * 14))
 

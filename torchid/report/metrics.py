@@ -130,10 +130,11 @@ class Evaluation:
         rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
         joints = slice(base, base + self.robot.n)
         by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
+        groups = SHOWN if errors.whitened.count.any() else GROUPS
         names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
         return Metrics(
-            {group: figure(rms[group]) for group in SHOWN},
-            {group: _ratio(rms[group], size[group]) for group in SHOWN},
+            {group: figure(rms[group]) for group in groups},
+            {group: _ratio(rms[group], size[group]) for group in groups},
             {name: figure(x) for name, x in zip(names, by_joint, strict=True)},
             {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
             _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),

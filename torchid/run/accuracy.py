@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from rich.progress import Progress
 
 from torchid.analysis.accuracy import error_directions
-from torchid.errors import LogError, TorchidWarning
+from torchid.errors import ImplausibleFitError, LogError, TorchidWarning
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.elimination import Assembly, assemble
@@ -44,7 +44,7 @@ def accuracies(
     logs have them, or else by the set's; what is expected counts offsets and the like as known in predictions.
 
     Warns:
-        TorchidWarning: the training logs lack a sensor of a set, which is left out.
+        TorchidWarning: the training logs lack a sensor of a set, or no robot can have left its fit; it is left out.
     """
     bar = bars.add_task("comparing sensor sets", total=len(sets))
     evaluation = Evaluation(scene.robot, scene.contacts, scene.config.device, scene.terms)
@@ -53,11 +53,12 @@ def accuracies(
         try:
             for samples in train:
                 check_forces(samples, scene.robot, scene.contacts, sensors)
+            out[name] = _accuracy(scene, sensors, train, test, evaluation, reference, source)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'"
             warnings.warn(message, TorchidWarning, stacklevel=2)
-        else:
-            out[name] = _accuracy(name, scene, sensors, train, test, evaluation, reference, source)
+        except ImplausibleFitError as error:
+            warnings.warn(f"{error}; no accuracy of the sensors '{name}'", TorchidWarning, stacklevel=2)
         bars.advance(bar)
     return out
 
@@ -98,7 +99,6 @@ def _reference(scene: Scene, train: Sequence[Samples]) -> _Reference | None:
 
 
 def _accuracy(
-    name: str,
     scene: Scene,
     sensors: SensorSet,
     train: Sequence[Samples],
@@ -117,7 +117,7 @@ def _accuracy(
         settings = replace(settings, ridge=chosen_ridge(parts, blocks, scene, sensors, builder, source).ridge)
     estimator = batch_estimator(settings, stated_conditions(settings, robot, source))
     fit = fitted(parts, scene, builder, estimator.solve, source)
-    check_plausible(fit, scene, f"{source} (sensors {name})")
+    check_plausible(fit, scene, source)
     estimate, problem = fit.estimate, fit.assembly.problem
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling
