@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +59,17 @@ def test_resolved_config_reads_back_as_itself(run: Path) -> None:
     assert config.robot.urdf == DEMO / "quadruped.urdf"
     assert config.sensors.set == "joints"
     assert yaml.safe_load((run / "config.yaml").read_text())["sensors"]["noise"]["joint_torque"] == 0.1
+
+
+def test_the_noise_that_rows_were_weighed_with_stands_in_the_run(run: Path) -> None:
+    groups = {one["group"]: one for one in json.loads((run / "metrics.json").read_text())["noise"]["groups"]}
+    noise = load_config(run / "config.yaml").sensors.noise
+    assert groups["joint_torque"]["origin"] == "stated"
+    assert groups["joint_torque"]["used"] == noise.joint_torque == 0.1
+    for key in ("base_force", "base_moment"):
+        assert [groups[f"{key}.{axis}"]["used"] for axis in "xyz"] == list(getattr(noise, key))
+        assert {groups[f"{key}.{axis}"]["origin"] for axis in "xyz"} <= {"estimated", "at most", "confounded"}
+    assert noise.contact_force == 0.5, "as the file says, though no contact is measured"
 
 
 def test_parameters_json_names_every_body_and_parameter(run: Path) -> None:
@@ -198,6 +211,42 @@ def test_parameters_that_are_no_numbers_are_not_evaluated(
     printed = capsys.readouterr().err
     assert f"identified.{damage[1]}" in printed
     assert document["bodies"][3]["name"] in printed
+
+
+@pytest.mark.parametrize("noise", [(), ("sensors.noise={}",)], ids=["stated", "estimated"])
+def test_positions_in_degrees_stop_a_run_that_names_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: tuple[str, ...]
+) -> None:
+    demo_with(tmp_path / "demo", joint_position=np.rad2deg)
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), *noise]) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "joint_position: front_left_thigh" in told
+    assert "degrees?; accepted: convert joint_position" in told
+
+
+@pytest.mark.parametrize(
+    ("noise", "said"),
+    [((), "times the stated sensor noise"), (("sensors.noise={}",), "no rigid-body model explains 9")],
+    ids=["stated", "estimated"],
+)
+def test_torques_of_no_robot_are_noticed_and_the_fit_called_worse_than_the_urdf(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: tuple[str, ...], said: str
+) -> None:
+    rng = np.random.default_rng(0)
+    demo_with(tmp_path / "demo", joint_torque=lambda torque: 50.0 * rng.normal(size=torque.shape))
+    file, output = tmp_path / "demo" / "quadruped.yaml", tmp_path / "run"
+    assert main(["identify", str(file), f"output={output}", *noise]) == 0
+    printed = capsys.readouterr()
+    assert said in printed.err
+    assert printed.out.startswith("WORSE THAN URDF: the identified parameters predict worse")
+
+
+def demo_with(folder: Path, **changes: Callable[[Any], Any]) -> None:
+    """The demo with fields of its training log changed."""
+    shutil.copytree(DEMO, folder)
+    with np.load(DEMO / "sway_train.npz") as log:
+        fields = dict(log)
+    np.savez(folder / "sway_train.npz", **fields | {name: change(fields[name]) for name, change in changes.items()})
 
 
 def test_names_are_shown_as_they_are_and_never_as_markup(capsys: pytest.CaptureFixture[str]) -> None:
