@@ -168,10 +168,9 @@ class _Path:
             if abs(below.misfit - target) <= _CLOSE * (target - least):
                 break
             ridge = 100.0 * below.ridge if above is None else float(np.sqrt(below.ridge * above.ridge))
-            step = self.at(ridge)
-            if step is None:
+            if (between := self.at(ridge)) is None:
                 break
-            below, above = (step, above) if step.misfit <= target else (below, step)
+            below, above = (between, above) if between.misfit <= target else (below, between)
         message = (
             "estimator: with ridge 0 the misfit goes on falling while parameters that the data do not determine grow "
         )
