@@ -6,6 +6,7 @@ import copy
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -350,7 +351,7 @@ class Trainer:
             yield self.batches.chunks, self.batches.samples
         else:
             for batch in self.batches.epoch(self.epoch):
-                yield lambda batch=batch: [batch], len(batch)
+                yield partial(list, [batch]), len(batch)
 
     def _step(self, batches: Callable[[], Iterable[Batch]], samples: int) -> Terms:
         """One step of the optimizer; terms are those before it."""
