@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 #: Parts of names that tell the sides, and the ends, of a robot apart.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")
 _ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH")
+_PARTS = re.compile(r"([A-Za-z0-9]+)")
 #: Joints of a chain up to which single neighbours are tried.
 _SHORT = 12
 
@@ -36,8 +37,7 @@ def _exchanged(names: Sequence[str], pairs: Sequence[str]) -> tuple[str, ...] | 
     """Every name with its part exchanged for the other; None unless these are the same names again."""
     for some in (pairs, *([pair] for pair in pairs)):  # all together, or where two share a part, each alone
         other = {one: two for pair in some for one, two in (pair.split(), pair.split()[::-1])}
-        token = re.compile("|".join(f"(?<![A-Za-z0-9]){part}(?![A-Za-z0-9])" for part in other))
-        found = tuple(token.sub(lambda match, other=other: other[match[0]], name) for name in names)
+        found = tuple("".join(other.get(part, part) for part in _PARTS.split(name)) for name in names)
         if sorted(found) == sorted(names) and found != tuple(names):
             return found
     return _by_first_letter(names) if pairs is _SIDES else None

@@ -63,9 +63,9 @@ def mistakes(log: Log) -> Iterator[Mistake]:
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, 1, axis=1)))
         yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _quaternions(inverse))
     if log.imu_specific_force is not None:
-        given = "reversed: gravity minus acceleration"
+        reading = "reversed: gravity minus acceleration"
         yield Mistake(
-            "imu_specific_force", given, "reverse it: it points up at rest", _scaled("imu_specific_force", -1.0)
+            "imu_specific_force", reading, "reverse it: it points up at rest", _scaled("imu_specific_force", -1.0)
         )
     if log.joint_torque is not None:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"

@@ -198,7 +198,7 @@ def _solved(found: Terms, joints: np.ndarray) -> Gains:
         H = G[1:, 1:] + np.diag(10.0 * prior)
         x = np.linalg.solve(H, G[1:, 0] + 10.0 * prior * start)
         left = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
-        return x, np.diag(np.linalg.inv(H)), float(left)
+        return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(left)
 
     x, variance, left = solve(None)
     size = max(1.0, left / max(found.rows, 1))
