@@ -204,8 +204,8 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
     ]
     evaluated = [f"{kind}_error_{name}/{group}" for kind in ("relative", "rms") for name in ("train", "test")
                  for group in GROUPS]  # fmt: skip
-    judged = [f"{kind}_error_left_out/{group}" for kind in ("relative", "rms") for group in SHOWN]
-    judged += [f"{kind}_error_{name}/{WHITENED}" for kind in ("relative", "rms") for name in ("train", "test")]
+    # the log is too short to leave folds of it out
+    judged = [f"{kind}_error_{name}/{WHITENED}" for kind in ("relative", "rms") for name in ("train", "test")]
     evaluated += [f"eigenvalue/{name}" for name in robot.body_names]
     once = ["fit/residual_std", "fit/rank", "fit/condition_number", "identifiability/bits"]
     once += ["identifiability/combinations", *(f"verdicts/{verdict}" for verdict in VERDICTS)]
