@@ -54,10 +54,10 @@ class RunEvents:
         """Write what is still held in memory."""
         self._writer.flush()
 
-    def errors(self, step: int, sets: Mapping[str, Metrics]) -> None:
+    def errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(SHOWN)) -> None:
         """Errors by group of rows of one parameter vector on sets of logs."""
         for name, metrics in sets.items():
-            for group in SHOWN:
+            for group in groups:
                 if metrics.relative.get(group) is not None:
                     self._writer.add_scalar(f"relative_error_{name}/{group}", metrics.relative[group], step)
                 if metrics.rms.get(group) is not None:

@@ -32,6 +32,7 @@ from torchid.report.figures import (
 from torchid.report.identifiability_figure import identifiability_figure
 from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.report.parameters_json import parameters_document
+from torchid.report.sums import WHITENED
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.report.tensorboard import RunEvents
 from torchid.report.urdf_export import identified_urdf
@@ -244,6 +245,9 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
                 events.errors(step, {name: pair[step] for name, pair in run.metrics.items()})
                 events.eigenvalues(step, body_eigenvalues(robot, phi))
             events.solution(estimate, run.samples / run.seconds["compress"])
+        else:  # what was not worked out by epoch
+            for step, which in ((0, 0), (epochs, 1)):
+                events.errors(step, {name: pair[which] for name, pair in run.metrics.items()}, (WHITENED,))
         if run.validation is not None:
             events.errors(0, {"left_out": run.validation.nominal})
             events.errors(last, {"left_out": run.validation.identified})
