@@ -16,9 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchid import guards
 from torchid.errors import InputError, LogError, UnknownNameError
-from torchid.logs import Log, read_log, write_log
+from torchid.logs import Log, container, read_log, write_log
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 N = 6
@@ -344,7 +343,7 @@ def test_absurd_declared_sizes_are_refused_before_they_are_read(
     with h5py.File(save(tmp_path / "x.h5", changed(time=None)), "a") as file:
         file.create_dataset("time", (10**12,), dtype="f8", chunks=(10**8,))
     assert "bytes in all" in message_of(tmp_path / "x.h5")
-    monkeypatch.setattr(guards, "MAX_ARRAYS", 100)
+    monkeypatch.setattr(container, "MAX_ARRAYS", 100)
     assert "at most 100 bytes" in message_of(save(tmp_path / "y.npz", file_fields()))
 
 

@@ -12,10 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from torchid import guards
 from torchid.errors import LogError, UnknownNameError
 from torchid.guards import MAX_COLUMNS
-from torchid.logs import Log, read_log, write_log
+from torchid.logs import Log, read_log, table, write_log
 from torchid.logs.checks import LARGEST
 
 Columns = dict[str, Sequence[Any]]
@@ -258,7 +257,7 @@ def test_sizes_without_bounds_are_refused_before_they_fill_the_memory(
     assert "columns" in message_of(tmp_path / "line.csv")
     (tmp_path / "row.csv").write_bytes(b"time,joint_position.a\n0," + b"1" * 10_000_000)
     assert "cannot be read" in message_of(tmp_path / "row.csv")
-    monkeypatch.setattr(guards, "MAX_ARRAYS", 100)
+    monkeypatch.setattr(table, "MAX_ARRAYS", 100)
     for suffix in SUFFIXES:
         assert "at most 100 bytes" in message_of(save(tmp_path / f"z{suffix}", columns()))
 

@@ -220,7 +220,7 @@ def test_positions_in_degrees_stop_a_run_that_names_them(
     demo_with(tmp_path / "demo", joint_position=np.rad2deg)
     assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), *noise]) == 2
     told = capsys.readouterr().err.splitlines()[-1]
-    assert "joint_position: front_left_thigh" in told
+    assert "torchid check finds in sway_train.npz: joint_position: " in told
     assert "degrees?; accepted: convert joint_position" in told
 
 

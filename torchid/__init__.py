@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     )
     from torchid.hygiene import Checked, without_condemned
     from torchid.hygiene.check import check
-    from torchid.logs import Log, Topics, preprocess, read_log, write_log
+    from torchid.logs import Log, Topics, read_log, write_log
+    from torchid.logs.preprocess import preprocess
     from torchid.problem import (
         ExtraTerms,
         LinearProblem,
@@ -69,7 +70,8 @@ _HOMES = {
     ),
     "torchid.hygiene": ("Checked", "without_condemned"),
     "torchid.hygiene.check": ("check",),
-    "torchid.logs": ("Log", "Topics", "preprocess", "read_log", "write_log"),
+    "torchid.logs": ("Log", "Topics", "read_log", "write_log"),
+    "torchid.logs.preprocess": ("preprocess",),
     "torchid.problem": (
         "ExtraTerms",
         "LinearProblem",

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid import guards
 from torchid.errors import LogError
 from torchid.guards import MAX_COLUMNS
+from torchid.guards import MAX_LETTERS as MAX_NAME
 from torchid.logs.fields import NAMES, SHAPES, VARIANTS, UnknownFieldError, is_quaternion, shape_of
 from torchid.text import is_plain, shown
 from torchid.wrenches import COMPONENTS
@@ -21,7 +21,7 @@ from torchid.wrenches import COMPONENTS
 TEXT = "imu_frame"
 FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAMES)
 #: Characters in the name of a column, which holds that of a joint.
-MAX_LETTERS = 2 * guards.MAX_LETTERS
+MAX_LETTERS = 2 * MAX_NAME
 
 _UNIT = re.compile(r"\[.*\]$|\(.*\)$")
 _KIND = {"joint_names": "joint", "contact_names": "contact", "ft_names": "sensor"}

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid import guards
 from torchid.errors import LogError, TorchidError, during
+from torchid.guards import MAX_ARRAYS, check_growth
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.npz import Npz, open_archive
 from torchid.logs.spill import Sliced
@@ -78,9 +78,9 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
                 h5py = import_h5py(path)
                 container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
             total = sum(container.sizes().values())
-        if whole and total > guards.MAX_ARRAYS:
-            raise LogError(path, "file", f"arrays of {total} bytes", f"at most {guards.MAX_ARRAYS} bytes in all")
-        guards.check_growth(path, total)
+        if whole and total > MAX_ARRAYS:
+            raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
+        check_growth(path, total)
         yield container
 
 

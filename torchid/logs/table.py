@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid import guards
 from torchid.errors import LogError, install
-from torchid.guards import check_growth, check_names
+from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_growth, check_names
 from torchid.logs.columns import TEXT, Layout, columns_of, layout_of
 from torchid.logs.container import appearing_whole, translated
 from torchid.logs.fields import NAMES
@@ -28,7 +27,7 @@ _ROWS = 2**16
 #: shows where the file has checksums.
 _PARQUET = {
     "thrift_string_size_limit": 2**26,
-    "thrift_container_size_limit": guards.MAX_SCHEMA,
+    "thrift_container_size_limit": MAX_SCHEMA,
     "page_checksum_verification": True,
 }
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
@@ -212,8 +211,8 @@ def table_size(path: Path) -> int:
 
 
 def _check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
-    if whole and 8 * rows * columns > guards.MAX_ARRAYS:
-        accepted = f"at most {guards.MAX_ARRAYS} bytes in all"
+    if whole and 8 * rows * columns > MAX_ARRAYS:
+        accepted = f"at most {MAX_ARRAYS} bytes in all"
         raise LogError(path, "file", f"{rows} rows of {columns} columns", accepted)
     check_growth(path, 8 * rows * columns)
 
