@@ -234,15 +234,22 @@ class Oracle:
 
 
 def random_states(
-    rng: np.random.Generator, n: int, samples: int, fixed_base: bool = False
+    rng: np.random.Generator, n: int, samples: int, fixed_base: bool = False, tilt: float | None = None
 ) -> tuple[Array, Array, Array]:
-    """Unrelated random states (q, v, a): the base turned any way round, everything moving and accelerating."""
+    """Unrelated random states (q, v, a), everything moving and accelerating.
+
+    The base is turned any way round, or any way about the vertical and by so much about other axes, about [rad].
+    """
     joints = rng.uniform(-1.5, 1.5, (samples, n))
     nv = n + (0 if fixed_base else 6)
     v, a = rng.normal(size=(samples, nv)), 3.0 * rng.normal(size=(samples, nv))
     if fixed_base:
         return joints, v, a
-    quat = Rotation.random(samples, random_state=rng).as_quat()
+    if tilt is None:
+        quat = Rotation.random(samples, random_state=rng).as_quat()
+    else:
+        turned = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, (samples, 1)))
+        quat = (turned * Rotation.from_rotvec(tilt * rng.normal(size=(samples, 3)) * [1.0, 1.0, 0.0])).as_quat()
     return np.hstack([rng.normal(size=(samples, 3)), quat, joints]), v, a
 
 
@@ -285,6 +292,7 @@ def make_log(
     samples: int,
     rng: np.random.Generator,
     source: str = "synthetic.npz",
+    tilt: float | None = None,
 ) -> Log:
     """A log of unrelated random states whose forces close the dynamics exactly.
 
@@ -295,8 +303,9 @@ def make_log(
         samples: number of samples.
         rng: draws states and internal forces.
         source: name of the log.
+        tilt: of the base, as `random_states` has it.
     """
-    q, v, a = random_states(rng, len(oracle.joint_names), samples, fixed_base=not oracle.base)
+    q, v, a = random_states(rng, len(oracle.joint_names), samples, not oracle.base, tilt)
     active = np.array([states[i % len(states)] for i in range(samples)], dtype=bool).reshape(samples, len(contacts))
     a, torque, wrench = _close_the_dynamics(oracle, q, v, a, contacts, active, rng)
     extra, n = 7 if oracle.base else 0, len(oracle.joint_names)

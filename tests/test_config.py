@@ -104,11 +104,17 @@ def test_the_least_experiment_has_four_keys_and_the_documented_defaults(file: Pa
     assert config.preprocessing.cutoff_hz is config.preprocessing.sample_rate_hz is None
     assert config.sensors.set == "full"
     noise = config.sensors.noise
-    assert (noise.joint_torque, noise.contact_force, noise.contact_moment) == (0.5, 2.0, 0.2)
-    assert noise.base_force is noise.base_moment is None
+    assert all(x is None for x in dataclasses.asdict(noise).values()), "estimated"
     assert config.sensors.on_base_lost == "error"
     assert (config.estimator.name, config.estimator.ridge, config.estimator.friction) == ("least_squares", 0.0, True)
     assert (config.device, config.overwrite) == ("cpu", False)
+
+
+def test_noise_by_axis_is_read_back_as_it_was(file: Path) -> None:
+    config = load(file, LEAST, "sensors.noise.base_force=[60, 50, 3]", "sensors.noise.base_moment=2")
+    assert (config.sensors.noise.base_force, config.sensors.noise.base_moment) == ((60.0, 50.0, 3.0), 2.0)
+    file.write_text(dump_config(config))
+    assert load_config(file) == config
 
 
 def test_every_key_of_the_file_arrives(file: Path) -> None:
@@ -294,6 +300,14 @@ def test_an_unknown_key_is_refused_by_its_place_and_the_nearest_that_exists(
         (changed(sensors={"joint_torques": "hip"}), "sensors.joint_torques", "'hip'"),
         (changed(sensors={"contact_wrenches": {"sole": ["fw"]}}), "sensors.contact_wrenches.sole.0", "'fw'"),
         (changed(sensors={"set": "full", "noise": {"joint_torque": 0}}), "sensors.noise.joint_torque", "0"),
+        (changed(sensors={"set": "full", "noise": {"base_force": 0}}), "sensors.noise.base_force", "[x, y, z]"),
+        (changed(sensors={"set": "full", "noise": {"base_force": [1, 2]}}), "sensors.noise.base_force", "[x, y, z]"),
+        (
+            changed(sensors={"set": "full", "noise": {"base_moment": [1, 2, -3]}}),
+            "sensors.noise.base_moment",
+            "greater",
+        ),
+        (changed(sensors={"set": "full", "noise": {"base_moment": "much"}}), "sensors.noise.base_moment", "'much'"),
         (changed(sensors={"set": "full", "on_base_lost": "ignore"}), "sensors.on_base_lost", "'ignore'"),
         (changed(estimator="least_squares"), "estimator", "'least_squares'"),
         (changed(estimator={"ridge": float("nan")}), "estimator.ridge", "nan"),

@@ -59,6 +59,17 @@ def test_resolved_config_reads_back_as_itself(run: Path) -> None:
     assert yaml.safe_load((run / "config.yaml").read_text())["sensors"]["noise"]["joint_torque"] == 0.1
 
 
+def test_the_noise_that_rows_were_weighed_with_stands_in_the_run(run: Path) -> None:
+    groups = {one["group"]: one for one in json.loads((run / "metrics.json").read_text())["noise"]["groups"]}
+    noise = load_config(run / "config.yaml").sensors.noise
+    assert groups["joint_torque"]["origin"] == "stated"
+    assert groups["joint_torque"]["used"] == noise.joint_torque == 0.1
+    for key in ("base_force", "base_moment"):
+        assert [groups[f"{key}.{axis}"]["used"] for axis in "xyz"] == list(getattr(noise, key))
+        assert {groups[f"{key}.{axis}"]["origin"] for axis in "xyz"} <= {"estimated", "at most", "confounded"}
+    assert noise.contact_force == 0.5, "as the file says, though no contact is measured"
+
+
 def test_parameters_json_names_every_body_and_parameter(run: Path) -> None:
     document = json.loads((run / "parameters.json").read_text())
     bodies, robot = document["bodies"], torchid.load_robot(DEMO / "quadruped.urdf")
@@ -199,14 +210,21 @@ def test_parameters_that_are_no_numbers_are_not_evaluated(
     assert document["bodies"][3]["name"] in printed
 
 
-def test_forces_in_other_units_are_noticed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("noise", "said"),
+    [((), "times the stated sensor noise"), (("sensors.noise={}",), "explains 94 % of the weighted forces")],
+    ids=["stated", "estimated"],
+)
+def test_forces_in_other_units_are_noticed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: tuple[str, ...], said: str
+) -> None:
     shutil.copytree(DEMO, tmp_path / "demo")
     with np.load(DEMO / "sway_train.npz") as log:
         fields = dict(log)
     fields["joint_position"] = np.rad2deg(fields["joint_position"])
     np.savez(tmp_path / "demo" / "sway_train.npz", **fields)
-    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml")]) == 0
-    assert "times the stated sensor noise" in capsys.readouterr().err
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), *noise]) == 0
+    assert said in capsys.readouterr().err
 
 
 def test_names_are_shown_as_they_are_and_never_as_markup(capsys: pytest.CaptureFixture[str]) -> None:

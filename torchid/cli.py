@@ -23,6 +23,7 @@ from torchid.interrupts import interrupt_held_back as _interrupt_held_back
 
 if TYPE_CHECKING:
     from torchid.run.analysis_results import Scenario
+    from torchid.run.noise import NoiseSummary
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
@@ -163,6 +164,7 @@ def _identify(options: argparse.Namespace) -> None:
         verdict_table(robot.body_names, estimate.verdict),
         verdict_counts_table(run.by_state, estimate),
     )
+    _print_noise(run.noise)
     if run.extras:
         print_tables(extra_table(run.extras))
     if run.violations:
@@ -172,7 +174,7 @@ def _identify(options: argparse.Namespace) -> None:
     mass = estimate.phi.reshape(len(robot.bodies), -1)[:, 0].sum()
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
-    print(f"residual      {estimate.residual_std:.3g} standard deviations of the stated sensor noise")
+    print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
     if isinstance(estimate, BoundEstimate) and estimate.relative_price is not None:
@@ -193,6 +195,14 @@ def _identify(options: argparse.Namespace) -> None:
     timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
     print(fill(f"time          {run.samples} samples: {timed}", 100, subsequent_indent=" " * 14))
     print(f"written to    {run.experiment.config.output}")
+
+
+def _print_noise(found: NoiseSummary) -> None:
+    from torchid.report.tables import noise_advice, noise_table, print_tables
+
+    print_tables(noise_table([asdict(one) for one in found.groups]))
+    if found.suggested:
+        print(noise_advice(found.suggested))
 
 
 def _evaluate(options: argparse.Namespace) -> None:

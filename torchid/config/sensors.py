@@ -6,29 +6,47 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.config.types import STRICT, Positive
 from torchid.errors import ConfigError
 from torchid.problem.extras import CHANNELS
-from torchid.sensing.sensors import SensorNoise
 
 Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
+
+
+def _per_axis(value: object) -> float | tuple[float, float, float]:
+    """A positive number, or three."""
+    try:
+        if not isinstance(value, (list, tuple)):
+            return _POSITIVE.validate_python(value)
+        x, y, z = (_POSITIVE.validate_python(one) for one in value)
+    except ValueError as error:
+        raise ValueError("a number greater than 0, or three for the axes: [x, y, z]") from error
+    return x, y, z
+
+
+def _plain(value: float | tuple[float, float, float]) -> float | list[float]:
+    return list(value) if isinstance(value, tuple) else value
+
+
+_POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
+PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(_plain)]
 
 
 @dataclass(config=STRICT, frozen=True)
 class NoiseConfig:
     """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m].
 
-    None for sensors in limbs (`ft`) and base rows: as a contact's.
+    None: estimated from the training logs (`torchid.run.noise`); a guess, that of `SensorNoise`, where there are none.
     """
 
-    joint_torque: Positive = SensorNoise.joint_torque
-    contact_force: Positive = SensorNoise.contact_force
-    contact_moment: Positive = SensorNoise.contact_moment
-    base_force: Positive | None = None
-    base_moment: Positive | None = None
+    joint_torque: Positive | None = None
+    contact_force: Positive | None = None
+    contact_moment: Positive | None = None
+    base_force: PerAxis | None = None
+    base_moment: PerAxis | None = None
     ft_force: Positive | None = None
     ft_moment: Positive | None = None
 

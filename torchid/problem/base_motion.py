@@ -63,6 +63,26 @@ class BaseMotion:
         return None if self.quat_xyzw is None else rotation_matrix(self.quat_xyzw)
 
 
+def levelled(rotation_world_base: Tensor) -> Tensor:
+    """Axes of the levelled base in the base frame, (N, 3, 3), as columns.
+
+    The base is turned by the smallest rotation that makes vertical the axis which is nearest to it: a base that tilts
+    takes its horizontal axes along, and none of their noise into the vertical one. Which axis is nearest may change
+    where a base lies at 45 degrees; the turn is at most 55 degrees, so that it is always defined.
+
+    Args:
+        rotation_world_base: (N, 3, 3), base to world.
+    """
+    up = rotation_world_base[:, 2]  # vertical, in the base frame
+    place = up.abs().argmax(dim=1, keepdim=True)
+    nearest = torch.zeros_like(up).scatter(1, place, up.gather(1, place).sign())
+    x, y, z = torch.linalg.cross(nearest, up).unbind(1)
+    zero = torch.zeros_like(x)
+    turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
+    cosine = (nearest * up).sum(1)[:, None, None]
+    return torch.eye(3, dtype=up.dtype, device=up.device) + turn + turn @ turn / (1.0 + cosine)
+
+
 def base_motion(log: Log, robot: Robot) -> BaseMotion:
     """How the base moves in a preprocessed log; of a bolted base, how it is mounted.
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.parameters import Array
+from torchid.problem.base_motion import levelled
 from torchid.problem.extra_columns import dof_column, mixed_columns
 from torchid.problem.extras import ExtraTerms, extras_of
 from torchid.problem.plan import Columns, Planner, State, StatePlan
@@ -27,7 +28,7 @@ from torchid.regressor.kinematics import BodyStates, JointStates, body_states, j
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing.contacts import Contact
-from torchid.sensing.nullspace import null_space, whitened_null_space
+from torchid.sensing.nullspace import levelled_null_space, null_space
 from torchid.sensing.sensors import SensorSet
 
 
@@ -177,6 +178,10 @@ class RowBuilder(nn.Module):
             J[:, contact] = generalized_forces(self.tree, directions, body, at_base, joints).permute(2, 0, 1)
         return J
 
+    def noise_axes(self, rotation_world_base: Tensor | None) -> Tensor | None:
+        """Axes of the floors of the base rows, (B, 3, 3), as `levelled`; None without attitude: the base's own."""
+        return None if rotation_world_base is None or not self.tree.base_rows else levelled(rotation_world_base)
+
     def local_wrench(self, samples: Samples, contact: int, terms: ChunkTerms) -> Tensor:
         """Recorded wrench of a contact along its frame's axes, (B, 6)."""
         if samples.wrench is None:
@@ -220,7 +225,8 @@ class RowBuilder(nn.Module):
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(plan.wrench_std):
             f = f + (measured.mT @ self._measured_wrench(samples, plan, terms)[..., None])[..., 0]
-        for index, W in whitened_null_space(unmeasured, plan.row_std, measured, plan.wrench_std):
+        axes = self.noise_axes(terms.rotation_world_base) if self.sensors.noise.by_axis else None
+        for index, W in levelled_null_space(unmeasured, plan.row_std, measured, plan.wrench_std, axes):
             chosen = terms.select(index)
             rows = self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, plan, chosen, workspace)
             if plan.extras:

@@ -84,7 +84,13 @@ def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Ten
     """One standard deviation of each base row's floor and each torque sensor, as generalized forces (nv, B, nv)."""
     n, base = len(builder.columns.joint_rows), builder.tree.base_rows
     std = np.append(noise.base[:base], noise.dofs(builder.tree.n, n))
-    return torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
+    rows = torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
+    axes = builder.noise_axes(samples.rotation_world_base) if noise.by_axis else None
+    if axes is None:
+        return rows
+    force, moment, rest = rows.split([3, 3, len(std) - 6], dim=2)
+    turned = [(axes @ part.permute(1, 2, 0)).permute(2, 0, 1) for part in (force, moment)]
+    return torch.cat([*turned, rest], dim=2)
 
 
 def _wrench_noise(builder: RowBuilder, samples: Samples, state: State, noise: SensorNoise) -> Tensor:

@@ -87,6 +87,27 @@ def state_table(states: Sequence[Mapping[str, object]]) -> Table:
     return table
 
 
+def noise_table(groups: Sequence[Mapping[str, Any]]) -> Table:
+    """Standard deviations that rows were weighed with, by group: fields of `GroupNoise`."""
+    table = Table(title="Noise that rows are weighed with: standard deviations", title_justify="left")
+    for heading in ("", "used", "", "residuals show"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for one in groups:
+        shown = "-" if one["residual"] is None else f"{one['residual']:.3g}"
+        table.add_row(one["group"], f"{one['used']:.3g} {one['unit']}", one["origin"], shown)
+    return table
+
+
+def noise_advice(suggested: Mapping[str, Any]) -> str:
+    """What to state instead of noise that residuals contradict."""
+
+    def text(x: float | Sequence[float]) -> str:
+        return f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{one:g}" for one in x) + "]"
+
+    keys = ", ".join(f"{key}: {text(x)}" for key, x in suggested.items())
+    return f"noise         stated values contradict the residuals: state sensors.noise {{{keys}}}, or none of these"
+
+
 def legend_of_marks() -> str:
     """What the marks of verdicts stand for."""
     return ", ".join(f"{mark} {verdict}" for verdict, mark in MARKS.items() if mark)

@@ -24,8 +24,9 @@ from torchid.problem.streaming import free_parameters
 from torchid.run.accuracy import accuracies
 from torchid.run.analysis_results import Analysis, Scenario, write_analysis
 from torchid.run.estimation import frozen_parameters
-from torchid.run.experiment import set_up_scene
+from torchid.run.experiment import Scene, set_up_scene
 from torchid.run.folder import ANALYSIS, check_free
+from torchid.run.noise import estimated_noise, recorded_sensors, stating
 from torchid.run.progress import progress_bars
 from torchid.run.questions import Asked, asked, placed, scenarios
 from torchid.run.reading import LogReader
@@ -55,6 +56,8 @@ def analyze(config: AnalyzeConfig, source: object = "experiment") -> Analysis:
     ask = asked(scene, source)
     with progress_bars() as bars:
         train, test = _read(ask, bars)
+        scene = _weighed(scene, train, source)
+        ask = asked(scene, source)
         found = tuple(
             _answered(ask, name, states, train, bars) for name, states in scenarios(scene, train, source).items()
         )
@@ -75,6 +78,14 @@ def _read(ask: Asked, bars: Progress) -> tuple[list[Samples], list[Samples]]:
         bars.advance(reading)
 
     return reader.read(files.train, ask.proposal, done), reader.read(files.test, None, done)
+
+
+def _weighed(scene: Scene, train: Sequence[Samples], source: object) -> Scene:
+    """The scene with the noise that the training logs show of all sensors that they have."""
+    if not train:
+        return scene
+    found = estimated_noise(scene, recorded_sensors(scene, train), train, source)
+    return replace(scene, config=stating(scene.config, found))
 
 
 def _answered(ask: Asked, name: str, states: tuple[State, ...], train: Sequence[Samples], bars: Progress) -> Scenario:

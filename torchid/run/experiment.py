@@ -33,8 +33,8 @@ class Scene:
 
     @property
     def noise(self) -> SensorNoise:
-        """Of the sensors."""
-        return SensorNoise(**vars(self.config.sensors.noise))
+        """Of the sensors, as stated; a guess where it is not."""
+        return SensorNoise(**{name: x for name, x in vars(self.config.sensors.noise).items() if x is not None})
 
     @property
     def terms(self) -> ExtraTerms:

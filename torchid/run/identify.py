@@ -30,6 +30,7 @@ from torchid.run.estimation import assembled, batch_estimator, stated_conditions
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.fit import Fit, fitted
 from torchid.run.folder import check_free
+from torchid.run.noise import weighed
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import Identification, write_run
@@ -37,6 +38,7 @@ from torchid.run.robust import RobustSummary, loss_of, robust_fit
 from torchid.run.training import Training, check_training, training_folder
 
 _IMPLAUSIBLE = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
+_UNEXPLAINED = 0.5  # of the weighted forces' rms: recorded logs stay below 0.35
 
 
 @dataclass
@@ -80,11 +82,12 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             estimator = training or batch_estimator(config.estimator, conditions)
             reader = LogReader(experiment)
             logs = _read(reader, experiment, bars)
-        with clock("compress"):
-            scene = experiment.robot, experiment.contacts, experiment.sensors, experiment.terms
-            builder = RowBuilder(*scene).to(config.device)
-            states = state_reports(logs["train"], builder)
+        with clock("noise"):
+            states = state_reports(logs["train"], _builder(experiment))
             check_base(states, config.sensors.on_base_lost)
+            experiment, noise = weighed(experiment, logs["train"], source)
+        with clock("compress"):
+            builder = _builder(experiment)
             parts = _compressed(builder, logs["train"], bars)
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device, experiment.terms)
         with clock("solve"):
@@ -98,7 +101,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             fit, robust = _robust(fit, experiment, builder, solve, logs["train"], bars, source)
             del parts
             estimate, problem = fit.estimate, fit.assembly.problem
-            _check_sense(estimate, source)
+            _check_sense(estimate, problem, source)
             warn_of_confounded(fit.extras, source)
         with clock("identifiability"):
             alone = _by_state(experiment, builder, fit.parts, source)
@@ -112,6 +115,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             experiment,
             estimate,
             fit.extras,
+            noise,
             robust,
             states,
             alone,
@@ -138,6 +142,11 @@ def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str
         )
         for name in ("train", "validation", "test")
     }
+
+
+def _builder(experiment: Experiment) -> RowBuilder:
+    scene = experiment.robot, experiment.contacts, experiment.sensors, experiment.terms
+    return RowBuilder(*scene).to(experiment.config.device)
 
 
 def _compressed(builder: RowBuilder, train: Sequence[Samples], bars: Progress) -> list[Part]:
@@ -228,12 +237,17 @@ def _identified_metrics(
     return {name: evaluation.metrics(logs[name], phi[None])[0] for name in SETS if logs[name]}
 
 
-def _check_sense(estimate: Estimate, source: object) -> None:
+def _check_sense(estimate: Estimate, problem: LinearProblem, source: object) -> None:
     """Refuse a fit of nothing, and warn of one that the dynamics cannot explain."""
     if not estimate.rank:
         raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
     left = np.sqrt(estimate.cost / max(estimate.rows, 1))  # not corrected for the fit, which may be far from the best
+    share = np.sqrt(estimate.cost / max(problem.cost(np.zeros_like(estimate.phi)), np.finfo(float).tiny))
     if left > _IMPLAUSIBLE:
         found = f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
         advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
         warnings.warn(f"{source}: {found}; {advice}", NumericalWarning, stacklevel=3)
+    elif share > _UNEXPLAINED:
+        found = f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
+        warnings.warn(f"{source}: {found}; check units, frames, quaternion order and contact_active",
+                      NumericalWarning, stacklevel=3)  # fmt: skip

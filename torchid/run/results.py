@@ -29,6 +29,7 @@ from torchid.report.urdf_export import identified_urdf
 from torchid.run.calibration import Calibration
 from torchid.run.experiment import Experiment
 from torchid.run.folder import new_folder, write_json
+from torchid.run.noise import NoiseSummary
 from torchid.run.robust import RobustSummary
 from torchid.run.training import Training, body_eigenvalues
 
@@ -39,14 +40,15 @@ _PLOTTED_SAMPLES = 3000
 class Identification:
     """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
 
-    `extras`: unknowns beside the bodies' parameters. `robust`: how outliers were weighed down, if so. `mass`: how well
-    the total mass is known. `excluded`: condemned samples left out, by log. `adds`: what each training log, contact
-    state and sensor adds.
+    `extras`: unknowns beside the bodies' parameters. `noise`: what rows were weighed with. `robust`: how outliers were
+    weighed down, if so. `mass`: how well the total mass is known. `excluded`: condemned samples left out, by log.
+    `adds`: what each training log, contact state and sensor adds.
     """
 
     experiment: Experiment
     estimate: Estimate
     extras: list[ExtraEstimate]
+    noise: NoiseSummary
     robust: RobustSummary | None
     states: list[StateReport]
     by_state: dict[str, Estimate]
@@ -156,6 +158,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "total_mass_told_from_offsets": run.mass.told_apart,
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
+        "noise": {"groups": [asdict(one) for one in run.noise.groups], "suggested": run.noise.suggested},
         "robust": None if run.robust is None else asdict(run.robust),
         "violations": run.violations_by_name(),
         "solution": _solution_document(estimate),

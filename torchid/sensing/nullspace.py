@@ -81,3 +81,28 @@ def whitened_null_space(
             L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
             W = torch.linalg.solve_triangular(L, W.mT, upper=False).mT
         yield index, W
+
+
+def levelled_null_space(
+    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor, axes: Tensor | None
+) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    """As `whitened_null_space`, with noise of the base rows along other axes than the base's.
+
+    Args:
+        A: (B, k, m), the six base rows of the generalized force first.
+        row_std: (m,), base rows along `axes`.
+        J_m: (B, k_m, m).
+        wrench_std: (k_m,).
+        axes: (B, 3, 3), columns are unit vectors in the base frame; None: the base's own.
+    """
+    if axes is None:
+        yield from whitened_null_space(A, row_std, J_m, wrench_std)
+        return
+    axes = axes.detach()
+    for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std):
+        yield index, _along(W.mT, axes[index].mT).mT
+
+
+def _along(X: Tensor, axes: Tensor) -> Tensor:
+    """Rows (B, k, m) whose force and moment on the base are given by their components along some axes."""
+    return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,39 +20,59 @@ from torchid.wrenches import COMPONENTS
 NAMED_SETS = ("full", "contacts", "joints")
 
 
+PerAxis = float | tuple[float, float, float]
+"""One number for three axes, or one for each."""
+
+
 @dataclass(frozen=True)
 class SensorNoise:
     """Standard deviations of the sensors, and the least that a base row is ever trusted to.
 
     `base_force` and `base_moment` stand for what no force sensor sees (differentiated motion, soft contacts): without
     them a base row in flight, where no sensor contributes noise, would count as exact. By default one contact sensor's
-    noise. So are force/torque sensors in limbs.
+    noise. So are force/torque sensors in limbs. Three numbers are for the axes x, y, z of the levelled base, see
+    `torchid.problem.base_motion.levelled`. The defaults are a guess, for library users and as the point that
+    `torchid.problem.noise` starts from.
     """
 
     joint_torque: float = 0.5
     contact_force: float = 2.0
     contact_moment: float = 0.2
-    base_force: float | None = None
-    base_moment: float | None = None
+    base_force: PerAxis | None = None
+    base_moment: PerAxis | None = None
     ft_force: float | None = None
     ft_moment: float | None = None
 
     @property
     def base(self) -> Array:
-        """Floor of the six base rows, (6,) [N, N m]."""
+        """Floor of the six base rows along the levelled base's axes, (6,) [N, N m]."""
         force = self.contact_force if self.base_force is None else self.base_force
         moment = self.contact_moment if self.base_moment is None else self.base_moment
-        return np.array([force] * 3 + [moment] * 3)
+        return np.concatenate([np.broadcast_to(np.asarray(x, dtype=float), 3) for x in (force, moment)])
+
+    @property
+    def by_axis(self) -> bool:
+        """Whether the floors of the base rows differ from axis to axis."""
+        return bool(np.ptp(self.base.reshape(2, 3), axis=1).any())
+
+    @property
+    def limb(self) -> tuple[float, float]:
+        """Of a force and of a moment that a sensor in a limb reads [N, N m]."""
+        force = self.contact_force if self.ft_force is None else self.ft_force
+        moment = self.contact_moment if self.ft_moment is None else self.ft_moment
+        return force, moment
 
     def dofs(self, n: int, count: int) -> Array:
         """Of n joint torques, then of the wrenches of force/torque sensors in limbs, (count,) [N m, N, N m]."""
-        force = self.contact_force if self.ft_force is None else self.ft_force
-        moment = self.contact_moment if self.ft_moment is None else self.ft_moment
-        return np.append(np.full(n, self.joint_torque), np.tile([force] * 3 + [moment] * 3, (count - n) // 6))
+        return np.append(np.full(n, self.joint_torque), np.tile(np.repeat(self.limb, 3), (count - n) // 6))
 
     def times(self, factor: float) -> SensorNoise:
         """All of them, larger by a factor."""
-        scaled = {name: factor * x for name, x in vars(self).items() if x is not None}
+        scaled: dict[str, Any] = {
+            name: tuple(factor * one for one in x) if isinstance(x, tuple) else factor * x
+            for name, x in vars(self).items()
+            if x is not None
+        }
         return SensorNoise(**scaled)
 
     @property

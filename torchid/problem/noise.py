@@ -1,0 +1,380 @@
+"""Noise of the sensors and of the base rows from the residuals of a fit: variance components.
+
+A whitened, projected row mixes the noise of several sensors, so that no row shows that of one alone. But every sensor
+enters the rows of a sample along known directions, and differently in every posture and contact state: the variances
+are what makes the covariance of the residuals the one that was found (Rao's MINQUE, iterated, which is restricted
+maximum likelihood; Searle, Casella and McCulloch, "Variance Components", 1992, chapters 6 and 11).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+import torch
+from torch import Tensor
+
+from torchid.parameters import Array
+from torchid.problem.chunks import by_state
+from torchid.problem.linear import LinearProblem
+from torchid.problem.measured import measured_components
+from torchid.problem.plan import State
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples
+from torchid.problem.streaming import Part
+from torchid.problem.threads import one_thread
+from torchid.problem.triangular import TriangularFactor
+from torchid.sensing.sensors import SensorNoise
+
+BASE = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
+GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE, "ft_force", "ft_moment")
+"""Groups of one standard deviation each; base rows along the axes of the levelled base."""
+
+_SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # whose rows are kept: 1000 show a standard deviation to 2 to 3 %
+_THINNED = 4  # one in so many of these shows the leverage
+_NORMAL = 0.6745  # median of |x| of standard normal x
+_CLIP = 3.0  # residuals are clipped at three robust standard deviations: impacts count as no more
+_CLIPPED = 0.99501  # E[min(x^2, 9)] of standard normal x
+_HELD = 0.005  # weight of the variances so far against what residuals say: settles what these cannot tell apart
+_LEAST_STEP = 0.05  # of a variance, by which factor it may fall in one step
+_SHARE = 0.01  # least share of a group in the variance along its own directions: a tenth of the deviation there
+_SMALLEST = 1e-3  # of the guess, least standard deviation: what is left of exact logs is rounding
+_LEFT = 0.1  # least share of the residual's degrees of freedom that a group is taken to have
+_FEW = 20.0  # independent readings, fewer of which say nothing: a standard deviation to 16 %
+_UNSEEN = 1e-9  # share of a source's variance in the rows below which it is projected out
+_STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions of any group, most steps
+_CONFOUNDED = 0.5  # relative standard error of a standard deviation
+
+
+def by_group(noise: SensorNoise) -> dict[str, float]:
+    """Standard deviation of every group."""
+    limb = noise.limb
+    sensors = (noise.joint_torque, noise.contact_force, noise.contact_moment)
+    return dict(zip(GROUPS, [*sensors, *noise.base.tolist(), *limb], strict=True))
+
+
+def of_groups(values: Mapping[str, float]) -> SensorNoise:
+    """The noise of standard deviations by group."""
+    force, moment = ((values[names[0]], values[names[1]], values[names[2]]) for names in (BASE[:3], BASE[3:]))
+    plain = {name: values[name] for name in GROUPS if name not in BASE}
+    return SensorNoise(**plain, base_force=force, base_moment=moment)
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Samples of one log in one contact state.
+
+    `rows`, (B, nv, width + 1), whitened with the noise of the builder; `sources`, (B, E, nv), one standard deviation of
+    each source of noise in these rows.
+    """
+
+    log: str
+    state: State
+    oversampling: float
+    rows: Tensor
+    sources: Tensor
+
+
+class SampledRows:
+    """Rows of some thousand samples of the logs, kept to be whitened again with other noise.
+
+    Attributes:
+        builder: of the rows; its sensors' noise is the guess that variances are relative to.
+        groups: those that the sensors have, by place in `GROUPS`' order.
+        group_of: (E,), place among `groups` of every source of noise.
+    """
+
+    @one_thread()
+    @torch.no_grad()
+    def __init__(self, logs: Sequence[Samples], builder: RowBuilder) -> None:
+        """Compute the rows, of samples at random but always the same."""
+        self.builder = builder
+        names = _source_names(builder)
+        self.groups = tuple(name for name in GROUPS if name in names)
+        self.group_of = np.array([self.groups.index(name) for name in names], dtype=int)
+        guess = by_group(builder.sensors.noise)
+        self._std = torch.tensor([guess[name] for name in names], dtype=torch.float64)
+        nv = builder.tree.base_rows + len(builder.columns.joint_rows)
+        most = min(_SAMPLES, _BYTES // (8 * max(nv, 1) * (builder.width + 1 + len(names))))
+        self.chunks = [self._chunk(part, state) for part, state in _some(logs, max(most, 1))]
+
+    @property
+    def guess(self) -> Array:
+        """Standard deviation of each group that variances are relative to, (G,)."""
+        found = by_group(self.builder.sensors.noise)
+        return np.array([found[name] for name in self.groups])
+
+    @property
+    def oversampling(self) -> float:
+        """Rows per independent row."""
+        counts = np.array([[len(chunk.rows), len(chunk.rows) / chunk.oversampling] for chunk in self.chunks]).sum(0)
+        return float(counts[0] / counts[1])
+
+    def _chunk(self, samples: Samples, state: State) -> _Chunk:
+        rows, W = self.builder.rows_by_sample(samples.to(self.builder.device), state)
+        sources = (self._ways(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
+        return _Chunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
+
+    def _ways(self, samples: Samples) -> Tensor:
+        """Generalized force that a unit of each source makes, (B, E, nv)."""
+        builder, base = self.builder, self.builder.tree.base_rows
+        nv = base + len(builder.columns.joint_rows)
+        unit = torch.eye(nv, dtype=samples.time.dtype, device=samples.time.device)
+        ways = [unit[:base].expand(len(samples), -1, -1)]
+        if base and (axes := builder.noise_axes(samples.rotation_world_base)) is not None:
+            turned = ways[0].clone()
+            turned[:, :3, :3] = turned[:, 3:6, 3:6] = axes.mT
+            ways = [turned]
+        ways.append(unit[(base + np.flatnonzero(builder.sensors.torque)).tolist()].expand(len(samples), -1, -1))
+        components = measured_components(builder.contacts, builder.sensors)
+        if components.any():
+            J = builder.contact_jacobian(samples) * samples.active[..., None, None]
+            ways.append(J[:, torch.from_numpy(components)])
+        return torch.cat(ways, dim=1)
+
+    def whitened(self, variance: Array) -> Iterator[_Chunk]:
+        """The chunks, whitened with variances of the groups relative to the guess, (G,)."""
+        if (variance == 1.0).all():
+            yield from self.chunks
+            return
+        scale = torch.from_numpy(np.sqrt(variance)[self.group_of])[:, None]
+        for chunk in self.chunks:
+            sources = chunk.sources * scale
+            S = sources.mT @ sources
+            empty = S.diagonal(dim1=1, dim2=2) == 0.0  # rows that are none
+            L = torch.linalg.cholesky(S + torch.diag_embed(empty.to(S)))
+            rows = torch.linalg.solve_triangular(L, chunk.rows, upper=False)
+            sources = torch.linalg.solve_triangular(L, sources.mT, upper=False).mT
+            yield replace(chunk, rows=rows, sources=sources)
+
+    @one_thread()
+    def parts(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
+        """The rows, whitened anew and compressed.
+
+        With parameters of an earlier fit in the builder's columns, by log, rows that are far off count less, as in
+        Huber's loss: what impacts do to the parameters would look like noise of all rows.
+        """
+        parts: dict[tuple[str, State], Part] = {}
+        every = tuple(range(self.builder.width))
+        for chunk in self.whitened(variance):
+            key = chunk.log, chunk.state
+            part = parts.setdefault(key, Part(*key, TriangularFactor(self.builder.width), 0))
+            part.samples += len(chunk.rows)
+            some = chunk.rows[chunk.sources.abs().sum(1) > 0.0]
+            if columns is not None:
+                off = (some[:, :-1] @ columns[chunk.log] - some[:, -1]).abs()
+                some = some * (_CLIP / off).clamp_max(1.0).sqrt()[:, None]
+            part.factor.add(every, some, chunk.oversampling)
+        return list(parts.values())
+
+
+def _source_names(builder: RowBuilder) -> list[str]:
+    """The group of every source of noise, in the order of `SampledRows._ways`."""
+    n = builder.tree.n
+    limbs = ["ft_force"] * 3 + ["ft_moment"] * 3
+    dofs = ["joint_torque" if dof < n else limbs[(dof - n) % 6] for dof in np.flatnonzero(builder.sensors.torque)]
+    components = np.argwhere(measured_components(builder.contacts, builder.sensors))[:, 1]
+    contacts = ["contact_force" if k < 3 else "contact_moment" for k in components]
+    return [*BASE[: builder.tree.base_rows], *dofs, *contacts]
+
+
+def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State]]:
+    """About so many samples, at random so that no gait is in step with them, log by log and state by state.
+
+    Of filtered logs, four for every independent one: more would say little more.
+    """
+    rng, share = np.random.default_rng(0), min(1.0, most / max(sum(map(len, logs)), 1))
+    for log in logs:
+        count = min(len(log), max(round(min(share, 4.0 / log.oversampling) * len(log)), 1))
+        index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
+        some = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
+        for state, where in by_state(some, _CHUNK):
+            yield some[where], state
+
+
+@dataclass(frozen=True)
+class Components:
+    """Variances of the groups relative to the guess of `SampledRows`.
+
+    Attributes:
+        variance: (G,).
+        share: (G,), of the variance along a group's own directions that is its own, between 0 and 1.
+        told: (G,) bool, whether there are readings enough; where not, the variance stays what it was.
+        error: (G,), relative standard error of the standard deviation, large where groups are confounded.
+        change: largest relative change, since the start, of the noise along the directions of a group, whosever it is.
+    """
+
+    variance: Array
+    share: Array
+    told: np.ndarray
+    error: Array
+    change: float
+
+    @property
+    def at_most(self) -> np.ndarray:
+        """Groups whose noise drowns in that of others, of which only an upper bound is known, (G,) bool."""
+        return self.told & (self.share <= 1.5 * _SHARE)
+
+    @property
+    def confounded(self) -> np.ndarray:
+        """Groups of which residuals show little but their sum with others, (G,) bool."""
+        return self.told & ~self.at_most & (self.error > _CONFOUNDED)
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """Rows' residuals r and sources U of the guess, by chunk, and what the fit took of each group.
+
+    `r`: (B, nv), `U`: (B, E, nv); `left`, (G,), share of the degrees of freedom that the fit left; `independent`, (G,),
+    number of independent readings.
+    """
+
+    r: list[Tensor]
+    U: list[Tensor]
+    left: Array
+    independent: Array
+
+
+class VarianceComponents:
+    """Estimates variances of groups from residuals at fitted parameters."""
+
+    def __init__(self, rows: SampledRows, tied: Collection[str] = ()) -> None:
+        """Tie the variances of some groups together: one factor for all of them."""
+        self.rows = rows
+        count = len(rows.groups)
+        kept = [place for place, name in enumerate(rows.groups) if name in tied]
+        free = [place for place in range(count) if place not in kept]
+        blocks = [kept, *([place] for place in free)] if kept else [[place] for place in free]
+        self._blocks = np.zeros((count, len(blocks)))  # (G, unknown variances)
+        for number, block in enumerate(blocks):
+            self._blocks[block, number] = 1.0
+
+    @one_thread()
+    @torch.no_grad()
+    def estimate(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> Components:
+        """Variances that make the covariance of the residuals the one found.
+
+        Residuals are clipped; those of fitted parameters are small, for which each group is corrected by the leverage
+        of its own directions. A group is never less than a tenth of the standard deviation along these, nor than a
+        thousandth of the guess.
+
+        Args:
+            variance: (G,), to start from, with which the parameters were fitted.
+            columns: parameters in the builder's columns, (width,), by log.
+            problem: of the fit.
+        """
+        found, start = self._residuals(variance, columns, problem), variance
+        told = (found.independent > _FEW) @ self._blocks > 0.0
+        first, *_ = M, q, t, count = self._moments(found, variance)
+        for _ in range(_STEPS):
+            share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
+            step = self._step(M, q, told)
+            least = np.maximum(_SHARE / np.maximum(share, 1e-12), _SMALLEST**2 / variance)
+            step = np.where(told, np.maximum(step, _block_max(least, self._blocks)), 1.0)
+            factor = self._blocks @ step
+            variance = variance * factor
+            if _change(M, factor) < _STEADY:
+                break
+            M, q, t, count = self._moments(found, variance)
+        error = _relative_errors(M * np.sqrt(np.outer(found.left, found.left)) / self.rows.oversampling)
+        return Components(variance, share, self._blocks @ told > 0.0, error, _change(first, variance / start))
+
+    def _step(self, M: Array, q: Array, told: np.ndarray) -> Array:
+        """Factors of the unknown variances, so that the squares are those expected; where M cannot tell, near 1."""
+        B = self._blocks
+        M, q = B.T @ M @ B, B.T @ q
+        free, held = np.flatnonzero(told), _HELD * np.diag(M)
+        if not len(free):
+            return np.ones(len(q))
+        rest = (q - M[:, ~told].sum(1) + held)[free]
+        kept = M[np.ix_(free, free)] + np.diag(held[free])
+        size = 1.0 / np.sqrt(np.diag(kept))
+        L = np.linalg.cholesky(kept * size * size[:, None])
+        target = scipy.linalg.solve_triangular(L, size * (rest - _LEAST_STEP * kept.sum(1)), lower=True)
+        out = np.ones(len(q))
+        out[free] = _LEAST_STEP + size * scipy.optimize.nnls(L.T, target)[0]
+        return out
+
+    def _moments(self, found: _Residuals, variance: Array) -> tuple[Array, Array, Array, Array]:
+        """M (G, G) and q (G,) of the equations M x = q; variance of the groups in the rows and number of readings."""
+        of, count = self.rows.group_of, len(variance)
+        member = torch.zeros(len(of), count, dtype=torch.float64)
+        member[torch.arange(len(of)), torch.from_numpy(of)] = 1.0
+        scale = torch.from_numpy(np.sqrt(variance)[of])[:, None]
+        M, z, sizes = torch.zeros(count, count, dtype=torch.float64), [], []
+        for r, U in zip(found.r, found.U, strict=True):
+            sources = U * scale
+            S = sources.mT @ sources
+            S = S + torch.diag_embed((S.diagonal(dim1=1, dim2=2) == 0.0).to(S))
+            L = torch.linalg.cholesky(S)
+            white = torch.linalg.solve_triangular(L, sources.mT, upper=False)  # (B, nv, E)
+            y = torch.linalg.solve_triangular(L, r[..., None], upper=False)
+            M += member.T @ (white.mT @ white).square().sum(0) @ member
+            sizes.append(white.square().sum(1))
+            z.append((white.mT @ y)[..., 0])
+        size, score = torch.cat(sizes).numpy(), torch.cat(z).numpy()
+        q, t, n = (np.zeros(count) for _ in range(3))
+        for group in range(count):
+            own, scores = size[:, of == group], score[:, of == group]
+            seen = own > _UNSEEN
+            t[group], n[group] = own.sum(), seen.sum()
+            if seen.any():
+                q[group] = t[group] * _clipped_variance(scores[seen] / np.sqrt(own[seen]), own[seen])
+        return M.numpy(), q / found.left, t, n
+
+    def _residuals(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> _Residuals:
+        rows, of, directions = self.rows, self.rows.group_of, _fitted_directions(problem, self.rows.builder)
+        taken, size, readings = (np.zeros(len(variance)) for _ in range(3))
+        for chunk in rows.whitened(variance):
+            own = chunk.sources.square().sum(2)
+            some = slice(None, None, _THINNED)
+            leverage = (chunk.sources[some] @ (chunk.rows[some, :, :-1] @ directions)).square().sum((0, 2))
+            np.add.at(taken, of, chunk.oversampling * leverage.numpy())
+            np.add.at(size, of, own[some].sum(0).numpy())
+            np.add.at(readings, of, (own > _UNSEEN).sum(0).numpy() / chunk.oversampling)
+        left = 1.0 - np.divide(taken, size, out=np.zeros_like(size), where=size > 0.0)
+        r = [chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1] for chunk in rows.chunks]
+        U = [chunk.sources for chunk in rows.chunks]
+        return _Residuals(r, U, np.maximum(left, _LEFT), readings * np.maximum(left, 0.0))
+
+
+def _relative_errors(M: Array) -> Array:
+    """Of the standard deviations, (G,), of normal noise whose variances are told by the equations of M / 2."""
+    seen = np.diag(M) > 0.0
+    size = np.where(seen, np.diag(M), 1.0) ** -0.5
+    values, V = np.linalg.eigh(M * size * size[:, None])
+    return np.where(seen, size * np.sqrt(0.5 * (np.square(V) / np.maximum(values, 1e-9)).sum(1)), np.inf)
+
+
+def _change(M: Array, factor: Array) -> float:
+    """Largest relative change of the standard deviation along a group's directions, if variances change by factors."""
+    before = M.sum(1)
+    after = np.divide(M @ factor, before, out=np.ones_like(before), where=before > 0.0)
+    return float(np.abs(np.sqrt(after) - 1.0).max(initial=0.0))
+
+
+def _block_max(values: Array, blocks: Array) -> Array:
+    """The largest value of each block."""
+    return np.where(blocks > 0.0, values[:, None], 0.0).max(axis=0, initial=0.0)
+
+
+def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
+    """G, (width, rank), so that `|x G|^2` is the leverage of a whitened row x; offsets and the like are few."""
+    scale = problem.scale[problem.free]
+    _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=False, lapack_driver="gesvd")
+    kept = values > 1e-10 * values.max(initial=0.0)
+    G = np.zeros((builder.width, int(kept.sum())))
+    basis = scale[:, None] * Vh[kept].T / values[kept]
+    G[: builder.columns.count] = builder.columns.from_parameters()[:, problem.free] @ basis
+    return torch.from_numpy(G)
+
+
+def _clipped_variance(z: Array, weights: Array) -> float:
+    """Variance of readings with outliers clipped, the same as without clipping for normal ones."""
+    limit = _CLIP * float(np.median(np.abs(z))) / _NORMAL
+    if limit == 0.0:
+        limit = np.inf
+    return float(weights @ np.minimum(np.square(z), limit**2) / (_CLIPPED if limit < np.inf else 1.0) / weights.sum())
