@@ -392,7 +392,7 @@ def test_a_descent_has_the_documented_defaults(file: Path) -> None:
     }
     assert dataclasses.asdict(estimator.training) == {
         **{"epochs": 200, "batch_size": 256, "patience": None, "clip": 1.0, "damping": 1.0, "seed": 0},
-        **{"optimizer": {"name": "Adam", "lr": 0.05}, "schedule": {"name": "CosineAnnealingLR"}},
+        **{"optimizer": {"name": "Adam"}, "schedule": {"name": "CosineAnnealingLR"}},
         **{"evaluate_every": 10, "checkpoint_seconds": 5.0},
     }
 

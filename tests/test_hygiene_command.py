@@ -178,7 +178,7 @@ def test_a_recorded_arm_is_usable_and_its_stamps_are_seen_to_jitter(
 ) -> None:
     urdf, document = str(ARM / "kuka_lwr4.urdf"), tmp_path / "found.json"
     for name in ("run1", "run2"):
-        given = [str(ARM / f"{name}.npz"), "--urdf", urdf, "--fixed-base", "--json", str(document)]
+        given = [str(ARM / f"{name}.npz"), "--urdf", urdf, "--fixed-base", "--json", str(document), "--overwrite"]
         assert main(["check", *given]) == 0
         assert "verdict       usable\n" in capsys.readouterr().out
         (log,) = json.loads(document.read_text())["logs"]
@@ -189,7 +189,14 @@ def test_a_recorded_arm_is_usable_and_its_stamps_are_seen_to_jitter(
 def test_a_recorded_person_is_usable_and_weighs_less_than_the_urdf(tmp_path: Path) -> None:
     found, document = {}, tmp_path / "found.json"
     for name in ("squats1", "squatsAsym1", "static1"):
-        given = [str(HUMAN / f"{name}.npz"), "--urdf", str(HUMAN / "human.urdf"), "--json", str(document)]
+        given = [
+            str(HUMAN / f"{name}.npz"),
+            "--urdf",
+            str(HUMAN / "human.urdf"),
+            "--json",
+            str(document),
+            "--overwrite",
+        ]
         assert main(["check", *given]) == 0
         (found[name],) = json.loads(document.read_text())["logs"]
     weight = {name: next(x for x in log["findings"] if x["name"] == "weight") for name, log in found.items()}

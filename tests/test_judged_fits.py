@@ -29,6 +29,7 @@ from torchid.problem.states import StateReport, _of_base, check_base
 from torchid.report.metrics import GROUPS, Metrics
 from torchid.report.sums import WHITENED
 from torchid.report.verdict import verdict, worse_than_nominal
+from torchid.run.experiment import set_up
 from torchid.run.validation import complete
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
@@ -95,8 +96,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple[RowBuilder, Samples]) -> None:
-    builder, log = demo
+    _, log = demo
     metrics, config = json.loads((run / "metrics.json").read_text()), load_config(run / "config.yaml")
+    weighed = set_up(config)  # with the noise that the run has estimated
+    builder = RowBuilder(weighed.robot, weighed.contacts, weighed.sensors)
     robot, blocks, squares, rows = torchid.load_robot(DEMO / "quadruped.urdf"), in_folds([log], builder), 0.0, 0
     for fold in range(FOLDS):
         seen = [block for block in blocks if block.fold != fold]

@@ -236,7 +236,7 @@ def test_an_array_grows_by_rows_on_the_disk(tmp_path: Path) -> None:
 
 def test_an_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
     file = experiment(tmp_path, recorded(40_000), ".h5")
-    command = [sys.executable, "-m", "torchid", "identify", str(file), SMALL]
+    command = [sys.executable, "-m", "torchid", "identify", str(file), SMALL, f"output={tmp_path / 'run'}"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     descriptors = Path(f"/proc/{process.pid}/fd")
     deadline = clock.monotonic() + 60.0

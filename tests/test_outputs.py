@@ -455,6 +455,7 @@ def test_results_of_what_ships_go_to_the_working_folder_and_nothing_into_the_pac
 def test_calls_to_end_are_interrupts_even_in_the_background(number: signal.Signals, ignored: bool) -> None:
     """A shell starts commands in the background with SIGINT ignored; SIGHUP that `nohup` ignores stays ignored."""
     before = signal.getsignal(signal.SIGINT)
+    inherited = signal.signal(number, signal.SIG_DFL)  # whoever started the tests may have it ignored
     if ignored:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -470,6 +471,7 @@ def test_calls_to_end_are_interrupts_even_in_the_background(number: signal.Signa
                 signal.raise_signal(signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, before)
+        signal.signal(number, inherited)
     earlier = signal.signal(number, signal.SIG_IGN)
     try:
         with ending_interrupts():

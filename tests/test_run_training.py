@@ -177,6 +177,7 @@ def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Pa
 def test_metrics_and_parameters_are_those_of_the_best_epoch(run: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")
+    groups += ("projected_residual",)
     for name in ("train", "test"):
         assert set(metrics[name]) == {*groups, *(f"{group}_relative" for group in groups)}
         for group in ("joint_torque_rms", "base_force_rms", "base_moment_rms", "nullspace_rms"):
@@ -596,7 +597,7 @@ def test_a_descent_that_diverges_ends_in_one_line_and_is_not_in_the_way_of_the_n
     printed = capsys.readouterr()
     (line,) = printed.err.splitlines()
     assert line.startswith("torchid: estimator: training: a loss of ")
-    assert line.endswith("; accepted: smaller steps")
+    assert line.endswith("; accepted: a smaller lr")
     assert printed.out == ""
     assert [path.name for path in output.parent.iterdir()] == ["run.training"]
     assert {path.name.split(".")[0] for path in training_of(output).iterdir()} == {"config", "events", "manifest"}

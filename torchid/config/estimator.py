@@ -65,7 +65,7 @@ class TrainingConfig:
 
     epochs: Count = 200
     batch_size: Count = 256
-    optimizer: Named = dataclasses.field(default_factory=lambda: {"name": "Adam", "lr": 0.05})
+    optimizer: Named = dataclasses.field(default_factory=lambda: {"name": "Adam"})
     schedule: Named | None = dataclasses.field(default_factory=lambda: {"name": "CosineAnnealingLR"})
     patience: Count | None = None
     clip: Positive = 1.0

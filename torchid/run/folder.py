@@ -103,8 +103,9 @@ def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
     """
     top = os.path.realpath(output)
     for path in inputs:
-        if os.path.lexists(str(path)) and os.path.realpath(str(path)).startswith(top + os.sep):
-            found = f"holds {shown(str(path))}, which is an input"
+        place = os.path.realpath(str(path))
+        if os.path.lexists(str(path)) and place.startswith(top + os.sep):
+            found = f"holds {shown(os.path.relpath(place, top))}, which is an input"
             raise ConfigError(output, "output", found, "another output, or inputs that lie elsewhere")
 
 
