@@ -15,12 +15,12 @@ from rich.progress import Progress
 from torchid.analysis.contributions import Contributions, contributions
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning
-from torchid.estimators import Estimate, LeastSquares, violations
+from torchid.estimators import Conditions, Estimate, LeastSquares, violations
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.folds import folds_together, in_folds, states_together
 from torchid.problem.plan import State, state_name
-from torchid.problem.states import check_base, state_reports
+from torchid.problem.states import StateReport, check_base, state_reports
 from torchid.problem.streaming import Part, compress_parts
 from torchid.report.metrics import SETS, Evaluation, Metrics
 from torchid.run.calibration import Calibration, warn_of_confounded, warn_of_disagreement
@@ -29,7 +29,7 @@ from torchid.run.estimation import assembled, stand_in, stated_conditions
 from torchid.run.experiment import Experiment, set_up
 from torchid.run.fit import Fit, fits_without_folds, fitted
 from torchid.run.folder import RUN, check_free
-from torchid.run.noise import weighed
+from torchid.run.noise import NoiseSummary, weighed
 from torchid.run.plausibility import check_plausible
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
@@ -71,40 +71,62 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
         return _identify(config, source, resume)
 
 
+@dataclass
+class _Prepared:
+    """Logs on their way to a fit: read, with the noise and the ridge settled, cut into folds and compressed."""
+
+    experiment: Experiment
+    conditions: Conditions
+    logs: dict[str, list[Samples]]
+    excluded: Mapping[str, int]
+    states: list[StateReport]
+    noise: NoiseSummary
+    builder: RowBuilder
+    blocks: list[Samples]
+    parts: list[Part]
+    ridge: RidgeChoice | None
+
+
+def _prepare(config: ExperimentConfig, source: object, clock: _Clock, bars: Progress) -> _Prepared:
+    with clock("read"):
+        experiment = set_up(config, source)
+        conditions = stated_conditions(config.estimator, experiment.robot, source)
+        if config.estimator.name == "sgd":
+            descent_settings(config, source)  # before any work
+        reader = LogReader(experiment)
+        logs = _read(reader, experiment, bars)
+    with clock("noise"):
+        states = state_reports(logs["train"], _builder(experiment))
+        check_base(states, config.sensors.on_base_lost)
+        experiment, noise = weighed(experiment, logs["train"], source)
+    with clock("compress"):
+        builder = _builder(experiment)
+        blocks = in_folds(logs["train"], builder)
+        parts = _compressed(builder, blocks, bars)
+    with clock("ridge"):
+        experiment, ridge = _with_ridge(experiment, parts, blocks, builder, bars, source)
+    return _Prepared(experiment, conditions, logs, reader.excluded, states, noise, builder, blocks, parts, ridge)
+
+
 def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identification:
     clock = _Clock()
     with progress_bars() as bars:
-        with clock("read"):
-            experiment = set_up(config, source)
-            conditions = stated_conditions(config.estimator, experiment.robot, source)
-            if config.estimator.name == "sgd":
-                descent_settings(config, source)  # before any work
-            reader = LogReader(experiment)
-            logs = _read(reader, experiment, bars)
-        with clock("noise"):
-            states = state_reports(logs["train"], _builder(experiment))
-            check_base(states, config.sensors.on_base_lost)
-            experiment, noise = weighed(experiment, logs["train"], source)
-        with clock("compress"):
-            builder = _builder(experiment)
-            blocks = in_folds(logs["train"], builder)
-            parts = _compressed(builder, blocks, bars)
-        with clock("ridge"):
-            experiment, ridge = _with_ridge(experiment, parts, blocks, builder, bars, source)
+        ready = _prepare(config, source, clock, bars)
+        experiment, builder, logs, blocks = ready.experiment, ready.builder, ready.logs, ready.blocks
         evaluation = Evaluation(experiment.robot, experiment.contacts, config.device, experiment.terms)
         training = None
         with clock("solve"):
             settings = experiment.config.estimator
-            instead = stand_in(settings, conditions).solve
+            instead = stand_in(settings, ready.conditions).solve
             solve: Callable[[LinearProblem], Estimate] = instead
             if settings.name == "sgd":
-                check_plausible(fitted(parts, experiment, builder, instead, source), experiment, source)
+                check_plausible(fitted(ready.parts, experiment, builder, instead, source), experiment, source)
                 training = Training(experiment.config, experiment.robot, source)
                 evaluate = partial(_identified_metrics, evaluation, logs)
                 solve = partial(training.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
-            fit = fitted(parts, experiment, builder, solve, source)
+            fit = fitted(ready.parts, experiment, builder, solve, source)
             fit, robust = _robust(fit, experiment, builder, solve, blocks, bars, source)
-            del parts
+            ready.parts = []
             estimate, problem = fit.estimate, fit.assembly.problem
             mass = check_plausible(fit, experiment, source)
             warn_of_confounded(fit.extras, source)
@@ -118,23 +140,24 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             both, *without = (_calibrations(experiment, one) for one in (fit, *left_out))
             judge, of_blocks = Judge(evaluation, builder), states_together(fit.parts, builder)
             metrics, validation = _metrics(judge, logs["test"], blocks, of_blocks, (both, without), bars)
+        broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
         run = Identification(
-            experiment,
-            estimate,
-            fit.extras,
-            noise,
-            robust,
-            states,
-            alone,
-            adds,
-            metrics,
-            violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), conditions),
-            clock.seconds,
-            sum(map(len, logs["train"])),
-            reader.excluded,
-            mass,
-            validation,
-            ridge,
+            experiment=experiment,
+            estimate=estimate,
+            extras=fit.extras,
+            noise=ready.noise,
+            robust=robust,
+            states=ready.states,
+            by_state=alone,
+            adds=adds,
+            metrics=metrics,
+            violations=broken,
+            seconds=clock.seconds,
+            samples=sum(map(len, logs["train"])),
+            excluded=ready.excluded,
+            mass=mass,
+            validation=validation,
+            ridge=ready.ridge,
         )
         warn_of_worse(run.worse, source)
         bars.add_task("writing", total=None)
