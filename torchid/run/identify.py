@@ -30,14 +30,14 @@ from torchid.run.experiment import Experiment, set_up
 from torchid.run.fit import Fit, fits_without_folds, fitted
 from torchid.run.folder import RUN, check_free
 from torchid.run.noise import NoiseSummary, weighed
-from torchid.run.plausibility import check_plausible
+from torchid.run.plausibility import check_not_worse, check_plausible
 from torchid.run.progress import progress_bars
 from torchid.run.reading import LogReader
 from torchid.run.results import Identification, write_run
 from torchid.run.ridge import RidgeChoice, chosen_ridge
 from torchid.run.robust import RobustSummary, loss_of, robust_fit
 from torchid.run.training import Training, check_training, descent_settings, training_folder
-from torchid.run.validation import CrossValidation, Judge, Pair, warn_of_worse
+from torchid.run.validation import CrossValidation, Judge, Pair
 
 
 @dataclass
@@ -159,7 +159,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             validation=validation,
             ridge=ready.ridge,
         )
-        warn_of_worse(run.worse, source)
+        check_not_worse(run.worse, experiment, source)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], both, training)
     return run

@@ -11,7 +11,8 @@ from torchid.analysis.known import TotalMass, total_mass
 from torchid.analysis.plausible import implausible
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError
 from torchid.hygiene import Finding, check
-from torchid.hygiene.finding import CONDEMNED, SEVERITIES
+from torchid.hygiene.finding import SEVERITIES
+from torchid.report.verdict import ADVICE, Worse, verdict
 from torchid.run.check import log_to_check
 from torchid.run.experiment import Scene
 from torchid.run.fit import Fit
@@ -19,6 +20,7 @@ from torchid.run.fit import Fit
 _UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
 _SHARE = 0.5  # and of the weighted forces, where the noise was estimated to be as large; recorded logs stay below 0.35
 _GENERAL = ("forces", "weight")  # findings that say that something is off rather than what
+_PART = 0.05  # share of a log's samples from which on a finding may be the reason
 _USUAL = (
     "torques or wrenches of the opposite sign, a world whose z axis points down, flags of other contacts, a quaternion "
     "in another order, another unit, or masses in the URDF that are no masses"
@@ -48,7 +50,7 @@ def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
     if absurd is None and unexplained is None:
         return mass
     log, finding = next(_findings(scene), (None, None))
-    if finding is not None and (absurd is not None or finding.severity == CONDEMNED):
+    if finding is not None and (absurd is not None or finding.condemns_all):
         told = f"{log}: {finding.field}: {finding.found}"
         raise ImplausibleFitError(
             source, "logs", f"{absurd or unexplained}; torchid check finds in {told}", finding.advice
@@ -59,6 +61,26 @@ def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
     warnings.warn(f"{source}: {unexplained}{named}; {advice}", NumericalWarning, stacklevel=3)
     return mass
+
+
+def check_not_worse(found: list[Worse], scene: Scene, source: object) -> None:
+    """Stop where the URDF's parameters predict better and the checks condemn a training log; else say so.
+
+    Raises:
+        ImplausibleFitError: the parameters of a log that is not usable.
+
+    Warns:
+        NumericalWarning: the URDF's parameters predict better, for whatever reason.
+    """
+    if not found:
+        return
+    told, advice = verdict(found), ADVICE
+    log, finding = next(_findings(scene), (None, None))
+    if finding is not None:
+        told, advice = f"{told}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
+        if finding.condemns_all:
+            raise ImplausibleFitError(source, "logs", told, advice)
+    warnings.warn(f"{source}: {told}; {advice}", NumericalWarning, stacklevel=3)
 
 
 def _unexplained(fit: Fit) -> str | None:
@@ -74,7 +96,7 @@ def _unexplained(fit: Fit) -> str | None:
 
 
 def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
-    """What whole training logs suffer from, the most telling first."""
+    """What training logs suffer from as a whole or in a good part, the most telling first."""
     files = scene.config.logs
     if files is None:
         return
@@ -85,5 +107,10 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
             checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
         except InputError:  # larger than memory: nothing is known of it
             continue
-        found += [(path.name, one) for one in checked.findings if one.whole and one.severity in SEVERITIES[:2]]
-    yield from sorted(found, key=lambda pair: (SEVERITIES.index(pair[1].severity), pair[1].name in _GENERAL))
+        grave = (one for one in checked.findings if one.severity in SEVERITIES[:2])
+        found += [(path.name, one) for one in grave if one.mask(len(checked.log)).mean() > _PART]
+    yield from sorted(found, key=lambda pair: _order(pair[1]))
+
+
+def _order(finding: Finding) -> tuple[bool, int, bool]:
+    return not finding.whole, SEVERITIES.index(finding.severity), finding.name in _GENERAL

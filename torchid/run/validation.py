@@ -9,14 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchid.errors import NumericalWarning, TorchidWarning
+from torchid.errors import TorchidWarning
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.measured import read_components
 from torchid.problem.streaming import Part, compress_parts
 from torchid.problem.threads import one_thread
 from torchid.report.metrics import Evaluation, Metrics
 from torchid.report.sums import ForceSums
-from torchid.report.verdict import ADVICE, Worse, verdict
 from torchid.run.calibration import Calibration
 
 Progress = Callable[[int], None]
@@ -157,13 +156,3 @@ def complete(log: Samples, builder: RowBuilder) -> Samples:
     lost = touched if log.wrench is None else touched & ~torch.isfinite(log.wrench)
     known &= ~lost.flatten(1).any(1)
     return log if bool(known.all()) else log[known]
-
-
-def warn_of_worse(found: list[Worse], source: object) -> None:
-    """Say where the URDF's parameters predict better.
-
-    Warns:
-        NumericalWarning: they do.
-    """
-    if found:
-        warnings.warn(f"{source}: {verdict(found)}; {ADVICE}", NumericalWarning, stacklevel=3)
