@@ -84,7 +84,8 @@ def vanishing_ridge(problem: LinearProblem, conditions: Conditions, prior: Prior
         return found
     unit, steps, searched = max(held.misfit, path.data.floor), list[_Step](), False
     for share in _RIDGES:
-        step = path.at(float(share * unit / max(1.0, steps[0].prior if steps else 1.0)))
+        ridge = float(share * unit / max(1.0, steps[0].prior if steps else 1.0))
+        step = path.towards(ridge, steps[-1].ridge) if steps else path.at(ridge)
         if step is None:
             break
         steps.append(step)
@@ -93,7 +94,8 @@ def vanishing_ridge(problem: LinearProblem, conditions: Conditions, prior: Prior
             found, searched = held.searched(step.x), True
         if found is not None:
             return found
-        if path.away(step) > _FAR * REACH:
+        blocked = step.ridge > ridge and _change(steps) <= _NEAR * max(step.misfit, path.data.floor)
+        if blocked or path.away(step) > _FAR * REACH:
             break
         if len(steps) > 1 and _change(steps) <= _SETTLED * max(step.misfit, path.data.floor) and _stays(steps, _STAYS):
             return step.vanishing
@@ -136,6 +138,14 @@ class _Path:
                 return None
         misfit = self.data.objective(x)
         return _Step(ridge, conic, x, misfit, (conic.objective(x) - misfit) / ridge)
+
+    def towards(self, ridge: float, before: float) -> _Step | None:
+        """The minimizer with the ridge that is nearest to `ridge`, coming from `before`, which rounding leaves."""
+        while ridge <= 0.5 * before:
+            if (step := self.at(ridge)) is not None:
+                return step
+            ridge = float(np.sqrt(ridge * before))
+        return None
 
     def away(self, step: _Step) -> float:
         """Distance from the nominal parameters, in units of their scale."""
