@@ -70,7 +70,7 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
         if field in NAN_ALLOWED:
             advice = "leave these samples out; a filter would lose the channels throughout"
         else:
-            advice = "leave these samples out (preprocessing.exclude_condemned): motion must be known throughout"
+            advice = "leave these samples out (exclude_condemned): motion must be known throughout"
         yield Finding("not measured", CONDEMNED, field, text, advice, tuple(holes), spans)
     if gone:
         entire = all(share == 1.0 for _, share in gone.values())
