@@ -13,6 +13,8 @@ from typing import Any
 import torch
 from grown import Chance, tree
 
+from torchid.run.checkpoint import save_checkpoint
+
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
 
 
@@ -351,6 +353,9 @@ def checkpoint(chance: Chance, folder: Path) -> Path:
     """States of any tree, or archives with any instructions of pickles."""
     path = folder / "checkpoint.pt"
 
+    def plain() -> Any:
+        return chance.of([1, 1.5, "x", None, torch.zeros(chance.below(5)), chance.word(), (1, 2)])
+
     def leaf() -> Any:
         return chance.of(
             [
@@ -369,6 +374,9 @@ def checkpoint(chance: Chance, folder: Path) -> Path:
             ]
         )
 
+    if chance(0.2):
+        save_checkpoint(folder, {"state": tree(chance, 4, plain)})
+        return path
     if chance(0.5):
         torch.save(tree(chance, 4, leaf), path)
         if chance(0.5):

@@ -113,7 +113,7 @@ def named_files(folder: Path, count: int) -> Iterator[tuple[str, list[str]]]:
             [["--figure", str(folder / "out" / f"{name}.svg")], ["--json", str(folder / "out" / f"{name}.json")], []]
         )
         np.savez(folder / f"{name}.npz", **content)
-        yield f"{seed} {name!r}", ["check", *outputs, "--", str(folder / f"{name}.npz")]
+        yield f"{seed} {name!r}", ["check", "--overwrite", *outputs, "--", str(folder / f"{name}.npz")]
         (folder / f"{name}.npz").unlink()
 
 
