@@ -67,7 +67,7 @@ def check(problem: LinearProblem, conditions: Conditions, prior: Prior, method: 
     value = prior_value(prior, phi[bodies], nominal[bodies], scale[bodies])
     alike = least_prior(problem, conditions, prior, found.estimate.phi, RANK)
     assert value <= alike * (1.0 + accuracy) + accuracy
-    assert np.abs((phi - nominal) / scale).max() < 1e3
+    assert np.abs((phi - nominal) / scale).max() < 1e3  # what data determine may be far away
     return found
 
 
@@ -120,14 +120,11 @@ def structural(name: str, states: int, sensors: str, friction: bool, noise: floa
 
 
 def check_structural(problem: LinearProblem, prior: Prior, method: Method) -> None:
-    """Bodies whose truth is a fifth of a scale from nominal: no mass is absurd, and no parameter grows without bound.
-
-    Least squares ends at most 6 scales away. At an active condition the misfit falls on as inertias grow: 36 measured.
-    """
+    """Bodies whose truth is a fifth of a scale from nominal: no mass is absurd, and no parameter is beyond belief."""
     found = fit(problem, Conditions(), prior, method)
     phi, scale = (x.reshape(-1, 12) for x in (found.estimate.phi, problem.scale))
     assert violations(phi, scale, Conditions(), 1e-7) == []
-    assert np.abs((found.estimate.phi - problem.nominal) / problem.scale).max() < 100.0
+    assert np.abs((found.estimate.phi - problem.nominal) / problem.scale).max() < 10.0
     total, nominal = (float(x[::12].sum()) for x in (found.estimate.phi, problem.nominal))
     assert total == pytest.approx(nominal, rel=0.5)
     assert found.estimate.objective <= problem.cost(problem.nominal) / problem.rows

@@ -31,6 +31,7 @@ _CLOSE = 0.1  # of the excess: how closely it is met
 _TRIES = 12
 _RESOLVED = 1e-7  # of the prior
 _FAR = 10.0  # times the reach of the data: where no limit is looked for any more
+_BELIEVED = 10.0  # scales: a limit further away follows the noise
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ def vanishing_ridge(problem: LinearProblem, conditions: Conditions, prior: Prior
     prior alone is minimized. Else the ridge is so small that a hundredth of it changes nothing.
 
     A limit need not exist: nothing bounds a body's inertia from above, and at an active condition the misfit can go on
-    falling, ever more slowly, while parameters that the data do not determine grow without bound. Then the least prior
-    is taken among all whose misfit is at most what the true parameters' is expected to be.
+    falling, ever more slowly, while parameters that the data do not determine grow without bound, or until one is tens
+    or hundreds of its scales away. Then the least prior is taken among all whose misfit is at most what the true
+    parameters' is expected to be.
 
     Args:
         problem: the data.
@@ -75,7 +77,7 @@ def vanishing_ridge(problem: LinearProblem, conditions: Conditions, prior: Prior
         InputError: the conditions exclude each other, or a prior of matter starts from bodies that cannot exist.
 
     Warns:
-        NumericalWarning: there is no limit.
+        NumericalWarning: there is no limit, or none to believe.
     """
     path = _Path(problem, conditions, prior)
     interior(path.data)  # names what is excluded
@@ -98,9 +100,12 @@ def vanishing_ridge(problem: LinearProblem, conditions: Conditions, prior: Prior
         if blocked or path.away(step) > _FAR * REACH:
             break
         if len(steps) > 1 and _change(steps) <= _SETTLED * max(step.misfit, path.data.floor) and _stays(steps, _STAYS):
-            return step.vanishing
-    if len(steps) == 1 or (len(steps) > 1 and path.away(steps[-1]) <= _BOUNDED * path.away(steps[-2])):
-        return steps[-1].vanishing  # as near to the limit as rounding allows
+            break
+    if not steps:
+        raise np.linalg.LinAlgError("no ridge gives a minimizer")
+    as_near_as_rounding_allows = len(steps) == 1 or path.away(steps[-1]) <= _BOUNDED * path.away(steps[-2])
+    if as_near_as_rounding_allows and path.furthest(steps[-1]) <= _BELIEVED:
+        return steps[-1].vanishing
     return path.near_the_least(steps, held.rank)
 
 
@@ -151,6 +156,10 @@ class _Path:
         """Distance from the nominal parameters, in units of their scale."""
         return float(np.linalg.norm(self.data.deviations @ step.x))
 
+    def furthest(self, step: _Step) -> float:
+        """Largest distance of a parameter from its nominal value, in units of its scale."""
+        return float(np.abs(self.data.deviations @ step.x).max())
+
     def prior_alone(self) -> ConicProblem:
         """The same conditions without data."""
         nothing = np.zeros((0, len(self.problem.nominal)))
@@ -163,8 +172,6 @@ class _Path:
         That is the least, at the end of `steps`, and the noise's variance for each combination that the data determine;
         the stated noise's where no more rows than those are left to show it.
         """
-        if not steps:
-            raise np.linalg.LinAlgError("no ridge gives a minimizer")
         rows, least, oversampling = self.problem.rows, steps[-1].misfit, self.problem.oversampling
         noise = residual_std(least * rows, rows, rank, oversampling) if rows > rank else 1.0
         target = least + max(rank * oversampling * noise**2 / max(rows, 1), self.data.floor)
@@ -184,7 +191,7 @@ class _Path:
         message = (
             "estimator: with ridge 0 the misfit goes on falling while parameters that the data do not determine grow "
         )
-        message += f"without bound ({self.away(steps[-1]):.0f} scales); taken is the least prior at the misfit "
+        message += f"beyond belief ({self.furthest(steps[-1]):.0f} scales); taken is the least prior at the misfit "
         message += f"expected of the true parameters, as with ridge {below.ridge:.1g}; accepted: a ridge"
         warnings.warn(message, NumericalWarning, stacklevel=6)
         return below.vanishing
