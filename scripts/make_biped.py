@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from torchid.simulation.biped import biped_urdf
+from paper.biped import biped_urdf
 
 if __name__ == "__main__":
     (Path(__file__).resolve().parents[1] / "torchid" / "demo" / "biped.urdf").write_bytes(biped_urdf())

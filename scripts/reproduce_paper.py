@@ -12,12 +12,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from paper.report import study_tables, write_study
+from paper.settings import Study
+from paper.study import Reproduction
+
 from torchid.boundary import guarded
+from torchid.commands.folder import STUDY, check_free, new_folder
 from torchid.config import load_simulation
 from torchid.report.tables import print_tables
-from torchid.run.folder import STUDY, check_free, new_folder
-from torchid.study import Reproduction, Study
-from torchid.study.write import study_tables, write_study
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SIMULATION = CONFIGS / "biped_simulation.yaml"

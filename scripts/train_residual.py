@@ -21,13 +21,13 @@ from torch import Tensor, nn
 
 import torchid
 from torchid.boundary import guarded
+from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError
 from torchid.estimators import ResidualEffect, Sgd, Trainer
+from torchid.fitting.experiment import set_up
 from torchid.problem import MiniBatches
 from torchid.report.tensorboard import RunEvents
-from torchid.run.experiment import set_up
-from torchid.run.reading import LogReader
 
 DEMO = Path(torchid.__file__).parent / "demo" / "quadruped.yaml"
 

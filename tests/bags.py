@@ -13,8 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError
-from torchid.logs import Log, read_log
-from torchid.logs.ros.topics import Topics
+from torchid.logs import Log, Topics, read_log
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 #: One message: topic, receipt [ns], type and content.

@@ -54,7 +54,7 @@ def biped_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `torchid simulate` writes of the shipped biped, every motion cut to seconds."""
     from simulated import short
 
-    from torchid.run.simulate import simulate
+    from torchid.commands.simulate import simulate
 
     output = tmp_path_factory.mktemp("simulations") / "biped"
     simulate(short(output))

@@ -10,8 +10,8 @@ import numpy as np
 from physical import pseudo
 from synthetic import Array
 
-from torchid.estimators.conditions import Conditions
-from torchid.problem.linear import LinearProblem
+from torchid.estimators import Conditions
+from torchid.problem import LinearProblem
 
 ACCURACY = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11}
 

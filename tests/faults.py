@@ -12,7 +12,8 @@ from demo import DEMO
 from motions import position, slope, uniform, velocity
 from numpy.typing import NDArray
 
-from torchid.hygiene import Checked, Finding, check
+from torchid.log_checks import Checked, Finding
+from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact

@@ -15,12 +15,12 @@ from typing import Any
 
 _SERVER = """
 import json, os, resource, signal, sys
-import torchid.run.results, torchid.run.evaluate, torchid.run.analyze, torchid.run.analysis_results, torchid.run.convert
+import torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.analyze, torchid.commands.convert
 from matplotlib.figure import Figure
 from torchid.cli import main
 names = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure", "tree_figure",
          "accuracy_figure")
-for module in (torchid.run.results, torchid.run.evaluate, torchid.run.analysis_results):
+for module in (torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze):
     for name in names:
         if hasattr(module, name):
             setattr(module, name, lambda *_, **__: Figure())

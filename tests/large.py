@@ -12,11 +12,11 @@ from demo import DEMO
 from motions import RATE, angles, position
 from scipy.spatial.transform import Rotation
 
+from torchid.commands.reading import LogReader
 from torchid.config import load_config
+from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
 from torchid.problem import Samples
-from torchid.run.experiment import set_up
-from torchid.run.reading import LogReader
 
 SAMPLES = 14_000  # three blocks and a bit
 SMALL = "preprocessing.memory_gb=0.0001"

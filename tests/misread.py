@@ -14,12 +14,11 @@ from synthetic import Oracle, load, make_log
 from welded import SENSORS, machine
 
 from torchid.logs import Log
-from torchid.problem import RowBuilder
-from torchid.problem.extras import ExtraTerms
-from torchid.problem.measured import read_components
+from torchid.parameters import COMPONENTS
+from torchid.problem import ExtraTerms, RowBuilder
+from torchid.problem.extras import read_components
 from torchid.robot import Robot
 from torchid.sensing import Contact
-from torchid.wrenches import COMPONENTS
 
 KINDS = {"f": "force", "m": "moment"}
 CONTACTS = (Contact("sole", "flat"), Contact("thigh", "point"), Contact("fin", "line", "z"))

@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 from synthetic import Array, Oracle
 from walking import Machine, Truth, recorded, robot_of, specific_force, truth
 
+from torchid.commands.identify import identify
 from torchid.config import load_config
 from torchid.errors import TorchidError
-from torchid.hygiene import NOTE, Checked, check
-from torchid.logs import Log
+from torchid.log_checks import NOTE, Checked
+from torchid.log_checks.check import check
+from torchid.logs import Log, write_log
 from torchid.logs.quaternion import sign_continuous
-from torchid.logs.write import write_log
-from torchid.run import identify
 
 SENSORS = ("full", "contacts", "joints")
 CUTOFF = 10.0

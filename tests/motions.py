@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from torchid.logs import Log
-from torchid.logs.fields import FloatArray
+from torchid.logs.log import FloatArray
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 RATE = 500.0

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from synthetic import Array
 
 from torchid import parameters
-from torchid.estimators.conditions import Conditions, Enclosure, Mirror
+from torchid.estimators import Conditions, Enclosure, Mirror
 from torchid.estimators.consistent import Method, Prior
-from torchid.problem.linear import LinearProblem, parameter_scale
+from torchid.problem import LinearProblem
+from torchid.problem.linear import parameter_scale
 
 PRIORS: tuple[Prior, ...] = ("euclidean", "pullback", "entropic")
 METHODS: tuple[Method, ...] = ("barrier", "certified")

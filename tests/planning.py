@@ -13,13 +13,11 @@ import torch
 from synthetic import Oracle, load, random_states
 from urdfs import joint, link, write
 
-from torchid.analysis.candidates import Candidate, candidates, sensor_set
-from torchid.problem.plan import State
+from torchid.problem.contact_state import State
 from torchid.robot import Robot
-from torchid.sensing import Contact
-from torchid.sensing.nullspace import null_space
-from torchid.sensing.projection import base_rank, base_singular_values
-from torchid.sensing.sensors import SensorSet
+from torchid.sensing import Contact, SensorSet
+from torchid.sensing.projection import base_rank, base_singular_values, null_space
+from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
 
 RANDOM = "random"  # an axis
 

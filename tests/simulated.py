@@ -18,9 +18,8 @@ import torchid
 from torchid.config import FootConfig, MotionConfig, SimulationConfig, StepsConfig, load_simulation
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.logs import Log
-from torchid.problem import bind
+from torchid.problem import Evaluation, bind
 from torchid.problem.predict import force_series
-from torchid.report.metrics import Evaluation
 from torchid.simulation import Stability
 
 SHIPPED = Path(__file__).resolve().parents[1] / "configs" / "biped_simulation.yaml"

@@ -9,13 +9,11 @@ import pytest
 import torch
 from synthetic import SOLO12, load
 
-from torchid.analysis.accuracy import error_directions
-from torchid.analysis.structure import structural_samples
 from torchid.estimators import LeastSquares
-from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.linear import LinearProblem
-from torchid.report.expected import expected_errors
-from torchid.report.metrics import GROUPS, Evaluation
+from torchid.identifiability.expected_error import error_directions, expected_errors
+from torchid.identifiability.structure import structural_samples
+from torchid.problem import Evaluation, LinearProblem, RowBuilder, Samples, compress, linear_problem
+from torchid.problem.metrics import GROUPS
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 

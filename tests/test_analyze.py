@@ -15,17 +15,16 @@ from refusals import files_in, refusal
 from synthetic import Oracle
 
 import torchid
-from torchid.analysis.base_check import PostureSummary, StateCheck
 from torchid.cli import main
+from torchid.commands.analyze import analyze
+from torchid.commands.reading import LogReader
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
-from torchid.report.accuracy import SetAccuracy, accuracy_figure
-from torchid.report.expected import ExpectedErrors
-from torchid.report.metrics import GROUPS
-from torchid.report.plan_tables import check_lines
+from torchid.identifiability.expected_error import ExpectedErrors
+from torchid.problem.metrics import GROUPS
+from torchid.report.analysis import SetAccuracy, accuracy_figure, check_lines
 from torchid.report.tree_figure import tree_figure
-from torchid.run import analyze
-from torchid.run.reading import LogReader
+from torchid.sensor_planning.check import PostureSummary, StateCheck
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 FEET = tuple(f"{leg}_foot" for leg in LEGS)

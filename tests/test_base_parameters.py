@@ -16,14 +16,13 @@ from synthetic import ANYMAL, DRONE, G1, ROBOTS, SOLO12, TALOS, TIAGO, UR5, Arra
 from urdfs import BASE, inertial, joint, link, write
 
 from torchid import parameters
-from torchid.analysis.base_parameters import BaseParameters, base_parameters
-from torchid.analysis.rank import rank_and_gap, structural_rank
-from torchid.analysis.relations import relations, unseen
-from torchid.analysis.structure import structural_problem
 from torchid.errors import NumericalWarning
 from torchid.estimators import LeastSquares
-from torchid.problem.linear import LinearProblem
-from torchid.problem.threads import one_thread
+from torchid.identifiability.base_parameters import BaseParameters, base_parameters, relations, unseen
+from torchid.identifiability.rank import rank_and_gap, structural_rank
+from torchid.identifiability.structure import structural_problem
+from torchid.problem import LinearProblem
+from torchid.problem.chunks import one_thread
 from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.sensing import named_sensors

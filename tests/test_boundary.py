@@ -19,7 +19,7 @@ from rich.text import Text
 
 from torchid.boundary import guarded
 from torchid.cli import main
-from torchid.config.scan import check_yaml
+from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError, TorchidWarning, during
 from torchid.guards import read_bytes
 from torchid.report.tables import people_console, print_tables, table_text

@@ -9,7 +9,7 @@ from demo import shortened_demo
 from refusals import files_in
 
 from torchid.cli import main
-from torchid.run import check
+from torchid.commands import check
 
 
 @pytest.fixture

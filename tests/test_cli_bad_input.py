@@ -15,8 +15,8 @@ from refusals import files_in, refusal
 
 from torchid.cli import _interrupt_held_back, main
 from torchid.config import load_config
+from torchid.fitting.experiment import set_up
 from torchid.problem.extras import extras_of
-from torchid.run.experiment import set_up
 
 Edit = Callable[[Path], None]
 

@@ -23,8 +23,8 @@ from physical import (
 )
 from synthetic import Array
 
-from torchid.estimators.conditions import Conditions, Enclosure, Mirror, Violation, mirrored_parameters, violations
-from torchid.estimators.consistent import project
+from torchid.estimators import Conditions, Enclosure, Mirror, Violation, project, violations
+from torchid.estimators.conditions import mirrored_parameters
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)

@@ -10,11 +10,11 @@ import pytest
 import yaml
 from refusals import assert_unknown_key, assert_wrong_value
 
+from torchid.commands.training import descent_settings
 from torchid.config import ExperimentConfig, dump_config, load_config
 from torchid.config.experiment import EstimatorConfig, PreprocessingConfig
 from torchid.errors import ConfigError, InputError, TorchidWarning
 from torchid.estimators import Sgd
-from torchid.run.training import descent_settings
 
 LEAST: dict[str, Any] = {
     "robot": {"urdf": "robot.urdf"}, "logs": {"train": ["a.npz"]}, "sensors": "full", "output": "out",

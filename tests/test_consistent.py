@@ -28,9 +28,8 @@ from synthetic import Array, transform
 
 from torchid import parameters
 from torchid.errors import InputError
-from torchid.estimators import LeastSquares
-from torchid.estimators.conditions import Conditions, violations
-from torchid.estimators.consistent import Consistent, Method, Prior
+from torchid.estimators import Conditions, Consistent, LeastSquares, violations
+from torchid.estimators.consistent import Method, Prior
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)

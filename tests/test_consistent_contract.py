@@ -24,11 +24,10 @@ from physical import (
 from scipy.optimize import nnls
 
 from torchid.errors import InputError, NumericalWarning
-from torchid.estimators import certified
+from torchid.estimators import Conditions, Consistent, Enclosure, Mirror, certified, violations
 from torchid.estimators.barrier import solve_barrier
-from torchid.estimators.conditions import Conditions, Enclosure, Mirror, violations
 from torchid.estimators.conic import Solution
-from torchid.estimators.consistent import Consistent, Method, Prior
+from torchid.estimators.consistent import Method, Prior
 from torchid.estimators.formulate import conic_problem
 from torchid.problem.linear import parameter_scale
 

@@ -14,11 +14,10 @@ from true_robots import true_parameters
 
 import torchid
 from torchid import parameters
-from torchid.estimators import Consistent, LeastSquares
-from torchid.estimators.conditions import Conditions, violations
+from torchid.estimators import Conditions, Consistent, LeastSquares, violations
 from torchid.logs import Log
-from torchid.problem import RowBuilder, bind, compress, linear_problem
-from torchid.problem.linear import LinearProblem, parameter_scale
+from torchid.problem import LinearProblem, RowBuilder, bind, compress, linear_problem
+from torchid.problem.linear import parameter_scale
 from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors

@@ -24,12 +24,12 @@ from synthetic import Array
 from test_structure import BOTH, FLIGHT, LEFT, RIGHT, biped
 
 from torchid import parameters
-from torchid.analysis.structure import structural_problem
 from torchid.errors import InputError
-from torchid.estimators import LeastSquares
-from torchid.estimators.conditions import Conditions, Enclosure, violations
-from torchid.estimators.consistent import Consistent, ConsistentEstimate, Method, Prior
-from torchid.problem.linear import LinearProblem, parameter_scale
+from torchid.estimators import Conditions, Consistent, ConsistentEstimate, Enclosure, LeastSquares, violations
+from torchid.estimators.consistent import Method, Prior
+from torchid.identifiability.structure import structural_problem
+from torchid.problem import LinearProblem
+from torchid.problem.linear import parameter_scale
 from torchid.sensing import named_sensors
 
 RANK = 1e-10  # what counts as determined

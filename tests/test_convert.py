@@ -17,7 +17,7 @@ from refusals import files_in, refusal
 
 from torchid.cli import main
 from torchid.logs import Log, read_log, write_log
-from torchid.logs import write as write_module
+from torchid.logs import read as write_module
 
 TYPES = (".npz", ".h5", ".csv", ".parquet")
 BAGS = (".bag", ".mcap", ".db3")
@@ -176,7 +176,7 @@ def test_bad_input_exits_2_with_one_line_and_writes_nothing(
 def test_a_conversion_that_is_interrupted_leaves_nothing(
     log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from torchid.logs import table as table_module
+    from torchid.logs import tables as table_module
 
     def interrupted(_: Any, path: Path, *__: Any) -> None:
         path.write_text("half")

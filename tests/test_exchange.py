@@ -7,13 +7,12 @@ from functools import cache
 import pytest
 from synthetic import SOLO12, load
 
-from torchid.analysis.candidates import Candidate, candidates, sensor_set
-from torchid.analysis.demands import demands
-from torchid.analysis.exchange import exchanged
-from torchid.analysis.minimal_sets import Component, all_minimal_sets, components
-from torchid.analysis.ranking import SetRanking, best_first
-from torchid.analysis.structure import structural_problem, structural_samples
+from torchid.identifiability.structure import structural_problem, structural_samples
 from torchid.sensing import Contact, SensorNoise
+from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
+from torchid.sensor_planning.demands import demands
+from torchid.sensor_planning.ranking import SetRanking, best_first, exchanged
+from torchid.sensor_planning.search import Component, all_minimal_sets, components
 
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
 STATES = ((True,) * 4,)

@@ -15,11 +15,11 @@ from true_robots import predicted, true_parameters, worst
 from unknowns import Fit, fit
 from welded import SENSORS
 
-from torchid.analysis.base_parameters import base_parameters
-from torchid.analysis.structure import structural_problem
 from torchid.estimators import Consistent
-from torchid.problem import bind
-from torchid.problem.extras import CHANNELS, ExtraTerms, extras_of
+from torchid.identifiability.base_parameters import base_parameters
+from torchid.identifiability.structure import structural_problem
+from torchid.problem import ExtraTerms, bind
+from torchid.problem.extras import CHANNELS, extras_of
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 

@@ -17,12 +17,11 @@ from welded import SENSORS, machine
 
 from torchid.cli import main
 from torchid.config import load_config
+from torchid.fitting.calibration import Calibration
+from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
-from torchid.problem import bind
-from torchid.problem.extras import ExtraTerms
-from torchid.report.parameters_json import read_parameters, read_shared_extras
-from torchid.run.calibration import Calibration
-from torchid.run.experiment import set_up
+from torchid.problem import ExtraTerms, bind
+from torchid.report.parameter_files import read_parameters, read_shared_extras
 
 EXACT = 1e-7
 

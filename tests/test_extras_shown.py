@@ -11,12 +11,12 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import to_rgba
 from rich.console import Console
 
-from torchid.analysis.calibration import ExtraEstimate
 from torchid.errors import ConfoundedWarning
+from torchid.fitting.calibration import warn_of_confounded
+from torchid.identifiability.confounding import ExtraEstimate
 from torchid.problem.extras import Extra
-from torchid.report.extra_figure import extra_figure
-from torchid.report.extra_table import extra_table
-from torchid.run.calibration import warn_of_confounded
+from torchid.report.figures import extra_figure
+from torchid.report.tables import extra_table
 
 
 def found(what: str, joint: str, log: str, unit: str = "N m") -> ExtraEstimate:

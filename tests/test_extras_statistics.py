@@ -16,17 +16,18 @@ from unknowns import Fit, fit
 from urdfs import BASE, inertial, joint, link, write
 from welded import SENSORS, machine
 
-from torchid.analysis.known import APART, total_mass
 from torchid.config import load_config
 from torchid.errors import ConfigError
-from torchid.logs import Log, preprocess
-from torchid.problem import RowBuilder, Samples, bind
+from torchid.identifiability.confounding import APART, total_mass
+from torchid.logs import Log
+from torchid.logs.preprocess import preprocess
+from torchid.parameters import COMPONENTS
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind
 from torchid.problem.chunks import by_state
-from torchid.problem.extras import CHANNELS, ExtraTerms
-from torchid.problem.streaming import free_parameters
+from torchid.problem.compression import free_parameters
+from torchid.problem.extras import CHANNELS
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors, with_ft_sensors
-from torchid.wrenches import COMPONENTS
 
 CONTACTS = (Contact("sole", "flat"), Contact("fin", "point"))
 STATES = [[True, False], [True, True], [False, True], [False, False]]

@@ -19,14 +19,14 @@ from welded import REAL, SENSORS, machine
 from torchid import parameters
 from torchid.errors import LogError, UnknownNameError
 from torchid.estimators import LeastSquares
+from torchid.identifiability.rank import state_reports
+from torchid.parameters import COMPONENTS
 from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
 from torchid.problem.chunks import by_state
 from torchid.problem.predict import force_series
-from torchid.problem.states import state_reports
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
-from torchid.wrenches import COMPONENTS
 
 EXACT = 1e-14  # of the largest number; 3e-15 measured
 

@@ -14,14 +14,14 @@ from grown import LETTERS, Chance, Grow, grown
 from hostile import Tally, examined
 
 from torchid.cli import main
+from torchid.commands.training import load_checkpoint
 from torchid.config import load_analysis, load_config, load_simulation
-from torchid.config.topics import load_topics
+from torchid.config.experiment import load_topics
 from torchid.errors import InputError
 from torchid.logs import Topics, read_log
 from torchid.parameters import PARAMETERS
-from torchid.report.parameters_json import read_parameters, read_shared_extras
+from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.robot import body_extents, load_robot
-from torchid.run.checkpoint import load_checkpoint
 from torchid.text import is_plain
 
 DEMO = Path(grown_logs.__file__).parents[1] / "torchid" / "demo"

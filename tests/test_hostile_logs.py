@@ -18,8 +18,7 @@ from torchid.errors import LogError
 from torchid.guards import MAX_FIELDS, MAX_LETTERS, MAX_NAMES
 from torchid.logs import read_log, write_log
 from torchid.logs.blocks import open_blocks
-from torchid.logs.checks import LARGEST
-from torchid.logs.fields import NAN_ALLOWED
+from torchid.logs.log import LARGEST, NAN_ALLOWED
 
 SUFFIXES = (".npz", ".h5")
 COUNTS = [60, pytest.param(600, marks=pytest.mark.slow)]

@@ -16,11 +16,10 @@ from hostile_commands import Commands
 from refusals import files_in
 
 from torchid.cli import main
+from torchid.commands.folder import RUN, claimed, new_folder, replaceable, write_json
+from torchid.commands.manifest import MANIFEST
 from torchid.errors import ConfigError, LogError
 from torchid.logs import read_log, write_log
-from torchid.run.claim import claimed
-from torchid.run.folder import RUN, new_folder, replaceable, write_json
-from torchid.run.manifest import MANIFEST
 
 WHOLE = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "hparams", "forces.png", "errors.png"}
 NOBODY = 65534
@@ -238,7 +237,7 @@ def test_a_folder_is_claimed_by_one_process_until_that_ends(tmp_path: Path) -> N
     """Even if it is killed; what it leaves has a hidden name and hinders nobody."""
 
     def child(call: str) -> subprocess.Popen[str]:
-        code = f"from pathlib import Path; from torchid.run.claim import claimed\n{call}"
+        code = f"from pathlib import Path; from torchid.commands.folder import claimed\n{call}"
         return subprocess.Popen(
             [sys.executable, "-c", code, str(tmp_path / "x" / "run")], stdin=-1, stdout=-1, stderr=-1, text=True
         )

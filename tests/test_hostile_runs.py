@@ -18,10 +18,10 @@ from hostile_settings import DOCUMENTS
 from matplotlib.figure import Figure
 
 from torchid.cli import main
+from torchid.commands.training import CHECKPOINT, load_checkpoint
 from torchid.estimators.state import check_alike
-from torchid.report.parameters_json import read_parameters
+from torchid.report.parameter_files import read_parameters
 from torchid.robot import load_robot
-from torchid.run.checkpoint import CHECKPOINT, load_checkpoint
 
 FIGURES = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
 SGD = "estimator={name: sgd, ridge: 0.001, training: {epochs: 2}}"
@@ -34,11 +34,11 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     demo = shortened_demo(folder / "demo", 120)
     with pytest.MonkeyPatch.context() as patch:
         for name in FIGURES:
-            patch.setattr(f"torchid.run.results.{name}", lambda *_, **__: Figure())
-            patch.setattr(f"torchid.run.evaluate.{name}", lambda *_, **__: Figure(), raising=False)
+            patch.setattr(f"torchid.commands.results.{name}", lambda *_, **__: Figure())
+            patch.setattr(f"torchid.commands.evaluate.{name}", lambda *_, **__: Figure(), raising=False)
         assert main(["identify", str(demo / "quadruped.yaml"), f"output={folder / 'run'}"]) == 0
         with pytest.MonkeyPatch.context() as stopped:
-            stopped.setattr("torchid.run.results.write_json", lambda *_: signal.raise_signal(signal.SIGINT))
+            stopped.setattr("torchid.commands.results.write_json", lambda *_: signal.raise_signal(signal.SIGINT))
             assert main(["identify", str(demo / "quadruped.yaml"), f"output={folder / 'sgd'}", SGD]) == 1
         yield folder
 

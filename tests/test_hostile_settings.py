@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchid.config import load_analysis, load_config
-from torchid.config.scan import check_yaml
+from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError
 from torchid.guards import MAX_DEPTH, MAX_NODES
 from torchid.text import is_plain, shown

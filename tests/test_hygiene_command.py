@@ -16,9 +16,9 @@ from motions import DATA, value
 from refusals import files_in, refusal
 
 from torchid.cli import main
-from torchid.hygiene import check
+from torchid.log_checks.check import check
 from torchid.logs import Log, read_log, write_log
-from torchid.report.hygiene_figure import hygiene_figure
+from torchid.report.log_checks import hygiene_figure
 
 HUMAN, ARM = DATA / "human_squats", DATA / "kuka_lwr4"
 ELSEWHERE = pytest.mark.skipif(not DATA.is_dir(), reason=f"recorded logs are not in {DATA}")

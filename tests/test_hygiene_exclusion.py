@@ -17,9 +17,10 @@ from motions import value
 from torchid.cli import main
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Estimate, LeastSquares
-from torchid.hygiene import check, without_condemned
-from torchid.hygiene.exclusion import excluded
-from torchid.logs import Log, preprocess, read_log, write_log
+from torchid.log_checks import without_condemned
+from torchid.log_checks.check import check, excluded
+from torchid.logs import Log, read_log, write_log
+from torchid.logs.preprocess import preprocess
 from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
 from torchid.sensing import SensorNoise, named_sensors
 

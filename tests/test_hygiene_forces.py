@@ -15,8 +15,10 @@ from recordings import in_world
 from scipy.spatial.transform import Rotation
 from synthetic import PANDA, Oracle, load
 
-from torchid.hygiene import CONDEMNED, SUSPICIOUS, Checked, check
-from torchid.logs import Log, preprocess, read_log
+from torchid.log_checks import CONDEMNED, SUSPICIOUS, Checked
+from torchid.log_checks.check import check
+from torchid.logs import Log, read_log
+from torchid.logs.preprocess import preprocess
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact
 

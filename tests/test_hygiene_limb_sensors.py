@@ -12,7 +12,8 @@ from faults import found, only
 from synthetic import Array
 from welded import machine
 
-from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, Checked, check
+from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked
+from torchid.log_checks.check import check
 from torchid.logs import Log
 from torchid.regressor import Regressor
 from torchid.robot import load_robot

@@ -10,11 +10,11 @@ from mistaken import MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, ju
 from motions import value
 from walking import MACHINES, robot_of, truth
 
-from torchid.hygiene import NOTE
-from torchid.hygiene.exchanges import exchanges
-from torchid.hygiene.model import bound, filtered
-from torchid.hygiene.scales import gains, motion_cutoff, stretch
-from torchid.hygiene.standing import slip
+from torchid.log_checks import NOTE
+from torchid.log_checks.contacts import slip
+from torchid.log_checks.mistakes import exchanges
+from torchid.log_checks.model import bound, filtered
+from torchid.log_checks.scales import gains, motion_cutoff, stretch
 
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 #: Cells of the whole table that are not named, and why: see docs/checking.md.

@@ -11,9 +11,9 @@ import pytest
 from faults import HERE, changed, demo_log, found, moving, only, places, with_rates
 from motions import DATA, position, value
 
-from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, check
-from torchid.hygiene.jumps import jumps
-from torchid.hygiene.repair import repaired
+from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS
+from torchid.log_checks.check import check, repaired
+from torchid.log_checks.spikes import jumps
 from torchid.logs import Log
 
 Array = np.ndarray[Any, Any]

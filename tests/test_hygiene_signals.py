@@ -12,9 +12,10 @@ from faults import changed, demo_log, demo_robot, found, moving, of_demo, only, 
 from motions import angles, omega_base, position, slope, uniform, value, velocity
 from scipy.spatial.transform import Rotation
 
-from torchid.hygiene import CONDEMNED, NOTE, SUSPICIOUS, Checked, check
-from torchid.hygiene.rates import compare
-from torchid.hygiene.weight import weight
+from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked
+from torchid.log_checks.check import check
+from torchid.log_checks.motion import compare
+from torchid.log_checks.weight import weight
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.quaternion import angular_velocity_base
 

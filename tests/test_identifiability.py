@@ -11,15 +11,12 @@ import torch
 from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
 
 from torchid import parameters
-from torchid.analysis.contributions import Contributions, SensorContribution, contributions
-from torchid.analysis.information import Knowledge, prior_directions
-from torchid.analysis.sensor_information import sensor_information
 from torchid.estimators import LeastSquares
-from torchid.estimators.result import VERDICTS
-from torchid.problem import LinearProblem, RowBuilder, Samples, bind
-from torchid.problem.elimination import assemble
-from torchid.problem.extras import ExtraTerms
-from torchid.problem.streaming import Part, compress, compress_parts, merged
+from torchid.estimators.least_squares import VERDICTS
+from torchid.identifiability.contributions import Contributions, SensorContribution, contributions
+from torchid.identifiability.information import Knowledge, prior_directions, sensor_information
+from torchid.problem import ExtraTerms, LinearProblem, RowBuilder, Samples, assemble, bind, compress, compress_parts
+from torchid.problem.compression import Part, merged
 from torchid.report.tables import contribution_table, table_text, verdict_table
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors

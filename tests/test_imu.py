@@ -19,7 +19,8 @@ from welded import SENSORS, machine
 
 from torchid.errors import InputError, LogError, UnknownNameError
 from torchid.estimators import LeastSquares
-from torchid.logs import Log, preprocess
+from torchid.logs import Log
+from torchid.logs.preprocess import preprocess
 from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
 from torchid.problem.base_motion import base_motion
 from torchid.regressor import Regressor

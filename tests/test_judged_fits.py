@@ -16,21 +16,20 @@ from synthetic import SOLO12, UR5, Oracle, load, make_log
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import torchid
-from torchid.analysis.known import TotalMass
-from torchid.analysis.plausible import absurd, force_gain, implausible
 from torchid.cli import main
+from torchid.commands.plausibility import absurd, force_gain, implausible
 from torchid.config import load_config
 from torchid.errors import BaseLostError
 from torchid.estimators import LeastSquares
-from torchid.logs import preprocess, read_log
-from torchid.problem import LinearProblem, RowBuilder, Samples, bind, compress, compress_parts, linear_problem
-from torchid.problem.folds import FOLDS, folds_together, in_folds, states_together
-from torchid.problem.states import StateReport, _of_base, check_base
-from torchid.report.metrics import GROUPS, Metrics
-from torchid.report.sums import WHITENED
-from torchid.report.verdict import verdict, worse_than_nominal
-from torchid.run.experiment import set_up
-from torchid.run.validation import complete
+from torchid.fitting.cross_validation import complete
+from torchid.fitting.experiment import set_up
+from torchid.identifiability.confounding import TotalMass
+from torchid.identifiability.rank import StateReport, _of_base, check_base
+from torchid.logs import read_log
+from torchid.logs.preprocess import preprocess
+from torchid.problem import LinearProblem, Metrics, RowBuilder, Samples, bind, compress, compress_parts, linear_problem
+from torchid.problem.compression import FOLDS, folds_together, in_folds, states_together
+from torchid.problem.metrics import GROUPS, WHITENED, verdict, worse_than_nominal
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 DEMO = Path(torchid.__file__).parent / "demo"

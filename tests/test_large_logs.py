@@ -25,7 +25,7 @@ from motions import RATE
 from torchid.errors import InputError, LogError, TorchidWarning
 from torchid.logs import read_log, write_log
 from torchid.logs.blocks import open_blocks, size_of
-from torchid.logs.plan import plan
+from torchid.logs.timeline import plan
 
 SETTINGS = {
     "differentiated": ({}, 0.0),

@@ -30,15 +30,15 @@ from large import (
 from refusals import refusal
 
 from torchid.cli import main
+from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.estimators import LeastSquares
+from torchid.fitting.experiment import set_up
 from torchid.logs import read_log
 from torchid.logs.blocks import open_blocks, size_of
 from torchid.logs.spill import Spill, SpillError
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.calibrate import calibrated
-from torchid.run.experiment import set_up
-from torchid.run.reading import LogReader
+from torchid.problem.predict import calibrated
 
 IDENTIFY = ("estimator.ridge=0.001", "sensors=joints")
 
@@ -81,7 +81,7 @@ def recalibrated(file: Path, terms: str, *more: str) -> tuple[Samples, Samples]:
 def test_calibrated_readings_of_a_large_log_stay_on_the_disk_and_those_of_a_small_one_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchid.problem.calibrate._ROWS", 700)
+    monkeypatch.setattr("torchid.problem.predict._ROWS", 700)
     file, both = experiment(tmp_path, recorded(3_000)), "{joint_torque: log, contact_force: all}"
     (raw, whole), (_, large) = (recalibrated(file, both, *more) for more in ((), (SMALL, f"output={tmp_path / 'run'}")))
     assert (file_of(whole.torque), file_of(whole.wrench)) == ("", "")
@@ -119,7 +119,7 @@ def test_a_table_takes_one_file_for_each_field_however_many_batches_it_is_read_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_in: list[str]
 ) -> None:
     experiment(tmp_path, recorded(2_000), ".parquet")
-    monkeypatch.setattr("torchid.logs.table._ROWS", 100)
+    monkeypatch.setattr("torchid.logs.tables._ROWS", 100)
     with open_blocks(tmp_path / "log.parquet", tmp_path) as blocks:
         assert len(blocks) == 2_000
         assert len(made_in) == 1 + len(blocks.fields), "time too"
@@ -266,9 +266,9 @@ def links(folder: Path) -> list[str]:
 READ = """
 import json, sys, threading, time, torch
 from torchid.config import load_config
-from torchid.problem.calibrate import calibrated
-from torchid.run.experiment import set_up
-from torchid.run.reading import LogReader
+from torchid.problem.predict import calibrated
+from torchid.fitting.experiment import set_up
+from torchid.commands.reading import LogReader
 def used():
     lines = open("/proc/self/status").read().splitlines()
     return next(int(line.split()[1]) / 1024.0 for line in lines if line.startswith("RssAnon"))

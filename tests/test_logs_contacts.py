@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from motions import jittered, uniform, value
 
-from torchid.logs import Log, preprocess
-from torchid.logs.fields import BoolArray, FloatArray
-from torchid.logs.plan import plan
-from torchid.logs.timeline import JITTER
+from torchid.logs import Log
+from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.preprocess import preprocess
+from torchid.logs.timeline import JITTER, plan
 
 CUTOFF = 10.0  # Hz: a reach of 0.1 s
 

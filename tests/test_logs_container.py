@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from torchid.errors import LogError
-from torchid.logs.container import translated
+from torchid.logs.containers import translated
 
 
 def line_of(text: str) -> str:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from motions import RATE, jittered, moving_log, position, sine_log, uniform, value
 
-from torchid.logs import Log, preprocess
-from torchid.logs.fields import FloatArray
-from torchid.logs.spline import spline_derivatives
+from torchid.logs import Log
+from torchid.logs.log import FloatArray
+from torchid.logs.preprocess import preprocess
+from torchid.logs.timeline import spline_derivatives
 
 
 @pytest.mark.parametrize("hertz", [3.0, 10.0, 20.0, 40.0, 100.0])

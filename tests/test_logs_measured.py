@@ -12,7 +12,8 @@ import pytest
 from motions import uniform, value
 
 from torchid.errors import TorchidWarning
-from torchid.logs import Log, preprocess
+from torchid.logs import Log
+from torchid.logs.preprocess import preprocess
 
 
 def test_contact_flags_hold_until_the_next_sample() -> None:

@@ -26,8 +26,9 @@ from motions import (
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, LogError, TorchidWarning
-from torchid.logs import Log, preprocess, read_log
-from torchid.logs.fields import FloatArray
+from torchid.logs import Log, read_log
+from torchid.logs.log import FloatArray
+from torchid.logs.preprocess import preprocess
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, rotate, sign_continuous
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"

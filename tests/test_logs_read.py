@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, LogError, UnknownNameError
-from torchid.logs import Log, container, read_log, write_log
+from torchid.logs import Log, read_log, write_log
+from torchid.logs import containers as container
 
 DATA = Path(__file__).parents[1].parent / "shared" / "data"
 N = 6

@@ -14,8 +14,9 @@ import pytest
 
 from torchid.errors import LogError, UnknownNameError
 from torchid.guards import MAX_COLUMNS
-from torchid.logs import Log, read_log, table, write_log
-from torchid.logs.checks import LARGEST
+from torchid.logs import Log, read_log, write_log
+from torchid.logs import tables as table
+from torchid.logs.log import LARGEST
 
 Columns = dict[str, Sequence[Any]]
 SUFFIXES = (".csv", ".parquet")

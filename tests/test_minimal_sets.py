@@ -14,14 +14,11 @@ from hypothesis import strategies as st
 from planning import MACHINES, RANDOM, Machine, axes_and_devices, minimal_of, states_of, subsets, sufficient_sets, tried
 from synthetic import G1, load
 
-from torchid.analysis.candidates import candidates
-from torchid.analysis.cheapest_set import cheapest_set
-from torchid.analysis.demands import demands
-from torchid.analysis.inequalities import inequalities
-from torchid.analysis.least_cost import least_cost
-from torchid.analysis.minimal_sets import all_minimal_sets, components
 from torchid.errors import SensorError
 from torchid.sensing import Contact
+from torchid.sensor_planning.candidates import candidates
+from torchid.sensor_planning.demands import demands
+from torchid.sensor_planning.search import all_minimal_sets, cheapest_set, components, inequalities, least_cost
 
 machines = pytest.mark.parametrize("name", MACHINES)
 
@@ -67,10 +64,10 @@ def test_rank_inequalities_prove_the_least_cost_where_one_demand_has_too_many_co
     choice = axes_and_devices(machine, robot, dict(zip([c.name for c in bare], prices, strict=True)))
     wanted = demands(robot, machine.contacts, machine.states, choice)
     if combinations is None:
-        monkeypatch.setattr("torchid.analysis.least_cost._DEVICES", -1)
+        monkeypatch.setattr("torchid.sensor_planning.search._DEVICES", -1)
         assert {least_cost(demand, choice).bound for demand in wanted} == {0.0}
     else:
-        monkeypatch.setattr("torchid.analysis.least_cost._COMBINATIONS", combinations)
+        monkeypatch.setattr("torchid.sensor_planning.search._COMBINATIONS", combinations)
     expected = (subsets(len(choice)) @ prices)[sufficient].min()
     least = cheapest_set(wanted, choice)
     assert (least.proven, least.cost) == (True, expected)

@@ -15,15 +15,15 @@ from true_robots import true_parameters
 
 from torchid.config import load_config
 from torchid.estimators import Estimate, LeastSquares
+from torchid.fitting.experiment import Experiment, set_up
+from torchid.fitting.fit import fitted
+from torchid.fitting.noise import NoiseSummary, estimated_noise, recorded_sensors, stating, weighed
 from torchid.parameters import MASS, PER_BODY
 from torchid.problem import RowBuilder, Samples, bind, compress_parts
 from torchid.problem.base_motion import levelled
 from torchid.problem.noise import by_group
-from torchid.run.experiment import Experiment, set_up
-from torchid.run.fit import fitted
-from torchid.run.noise import NoiseSummary, estimated_noise, recorded_sensors, stating, weighed
 from torchid.sensing import SensorNoise
-from torchid.sensing.nullspace import levelled_null_space
+from torchid.sensing.projection import levelled_null_space
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 STATES = [[True] * 4, [False, True, True, True], [True, True, False, True]]

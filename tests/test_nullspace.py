@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from synthetic import Array
 from torch import Tensor
 
-from torchid.sensing.nullspace import null_space
+from torchid.sensing.projection import null_space
 
 
 def orthogonal(rng: np.random.Generator, size: int) -> Array:

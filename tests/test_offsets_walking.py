@@ -19,16 +19,15 @@ from synthetic import Array, load
 from unknowns import Fit, fit
 
 from torchid import parameters
-from torchid.analysis.calibration import ExtraEstimate
-from torchid.analysis.known import APART, total_mass
 from torchid.cli import main
 from torchid.estimators import LeastSquares
-from torchid.logs import Log, preprocess, read_log, write_log
-from torchid.problem import Samples, bind
-from torchid.problem.extras import ExtraTerms
+from torchid.identifiability.confounding import APART, ExtraEstimate, total_mass
+from torchid.logs import Log, read_log, write_log
+from torchid.logs.preprocess import preprocess
+from torchid.parameters import COMPONENTS
+from torchid.problem import ExtraTerms, Samples, bind
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors, with_ft_sensors
-from torchid.wrenches import COMPONENTS
 
 pytest.importorskip("mujoco", reason="the simulation needs mujoco, which the extra sim installs")
 

@@ -20,13 +20,21 @@ from refusals import refusal
 
 import torchid
 from torchid.cli import main
+from torchid.commands.folder import (
+    EVALUATION,
+    RUN,
+    SIMULATION,
+    TRAINING,
+    check_free,
+    new_folder,
+    refuse_inputs,
+    replaceable,
+)
+from torchid.commands.manifest import MANIFEST, read_manifest
+from torchid.commands.training import Training
 from torchid.config import load_analysis, load_simulation
 from torchid.errors import ConfigError, TorchidWarning
-from torchid.interrupts import ending_interrupts, interrupt_held_back
-from torchid.run.folder import EVALUATION, RUN, SIMULATION, TRAINING, check_free, new_folder, refuse_inputs, replaceable
-from torchid.run.manifest import MANIFEST, read_manifest
-from torchid.run.training import Training
-from torchid.staging import staging
+from torchid.staging import ending_interrupts, interrupt_held_back, staging
 
 ROOT = Path(__file__).resolve().parents[1]
 Add = Callable[[Path], None]
@@ -222,8 +230,8 @@ def test_a_folder_that_may_not_be_changed_is_refused_before_any_work(tmp_path: P
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-import torchid.run.folder as folder, torchid.staging as staging
-from torchid.run.manifest import Contents
+import torchid.commands.folder as folder, torchid.staging as staging
+from torchid.commands.manifest import Contents
 stop, output, calls = int(sys.argv[1]), Path(sys.argv[2]), 0
 def counted(function):
     def call(*args, **kwargs):

@@ -14,7 +14,7 @@ from synthetic import Array
 from torch import Tensor
 
 from torchid.estimators import PenaltyWeights
-from torchid.estimators.penalties import penalties, pseudo_inertias
+from torchid.estimators.sgd import penalties, pseudo_inertias
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)

@@ -11,14 +11,14 @@ from synthetic import load
 from welded import SENSORS, machine
 
 from torchid import parameters
-from torchid.analysis.base_check import check_set
-from torchid.analysis.candidates import candidates, chosen_from, sensor_set
-from torchid.analysis.demands import demands
-from torchid.analysis.planner import Question, plan_sensors
-from torchid.analysis.stack import MotionStack, sparse_set
 from torchid.errors import UnknownNameError
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors, with_ft_sensors
+from torchid.sensor_planning.candidates import candidates, chosen_from, sensor_set
+from torchid.sensor_planning.check import check_set
+from torchid.sensor_planning.demands import demands
+from torchid.sensor_planning.planner import Question, plan_sensors
+from torchid.sensor_planning.ranking import MotionStack, sparse_set
 
 LEG = Machine(
     {"leg": ("base", (RANDOM, RANDOM, RANDOM, "weld", RANDOM, RANDOM)), "arm": ("base", (RANDOM, "weld"))},

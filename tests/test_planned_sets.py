@@ -12,14 +12,13 @@ from synthetic import Array
 from true_robots import KINDS, Kind, World, driving, fit, predicted, unseen, world, worst
 
 from torchid import parameters
-from torchid.analysis.base_check import check_set
-from torchid.analysis.candidates import Candidate, candidates, sensor_set
-from torchid.analysis.planner import Question, SensorPlan, plan_sensors
-from torchid.analysis.stack import MotionStack, sparse_set
-from torchid.analysis.standing import standing_samples, standing_states
-from torchid.analysis.structure import structural_problem
+from torchid.identifiability.structure import standing_samples, standing_states, structural_problem
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.regressor import FrameJacobian
+from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
+from torchid.sensor_planning.check import check_set
+from torchid.sensor_planning.planner import Question, SensorPlan, plan_sensors
+from torchid.sensor_planning.ranking import MotionStack, sparse_set
 
 EXACT = 1e-8
 PER_STATE = 250

@@ -12,22 +12,19 @@ import torch
 from planning import MACHINES, Machine, sees_the_base, states_of, tried
 from synthetic import ANYMAL, G1, PANDA, SOLO12, Oracle, load, random_states
 
-from torchid.analysis.base_check import LostBase, base_values, check_set
-from torchid.analysis.branches import branches, needs
-from torchid.analysis.candidates import Candidate, candidates, chosen_from, sensor_set
-from torchid.analysis.cheapest_set import cheapest_set
-from torchid.analysis.demands import demands
-from torchid.analysis.least_cost import least_cost
-from torchid.analysis.minimal_sets import all_minimal_sets, components
-from torchid.analysis.postures import random_postures
-from torchid.analysis.screws import simplest_basis, wrench_words
 from torchid.errors import SensorError, UnknownNameError
+from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
-from torchid.problem.plan import State
-from torchid.problem.rows import RowBuilder
+from torchid.problem import RowBuilder
+from torchid.problem.contact_state import State
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors
-from torchid.sensing.nullspace import null_space
+from torchid.sensing.projection import null_space
+from torchid.sensor_planning.candidates import Candidate, candidates, chosen_from, sensor_set
+from torchid.sensor_planning.check import LostBase, base_values, check_set, simplest_basis, wrench_words
+from torchid.sensor_planning.demands import demands
+from torchid.sensor_planning.planner import branches, needs
+from torchid.sensor_planning.search import all_minimal_sets, cheapest_set, components, least_cost
 
 SOLES = (Contact("left_ankle_roll_link", "flat"), Contact("right_ankle_roll_link", "flat"))
 HAND = Contact("left_rubber_hand", "point")

@@ -26,10 +26,10 @@ from true_robots import (
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
+from torchid.identifiability.rank import check_base, state_reports
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
-from torchid.problem.states import check_base, state_reports
 from torchid.sensing import SensorSet, chosen_sensors, named_sensors
 
 

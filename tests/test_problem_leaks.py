@@ -12,7 +12,8 @@ from simulated import BIPED, LIFTING, SOLES
 from synthetic import Array, load
 
 from torchid.estimators import Estimate, LeastSquares
-from torchid.logs import Log, preprocess, read_log
+from torchid.logs import Log, read_log
+from torchid.logs.preprocess import preprocess
 from torchid.problem import RowBuilder, bind, compress, linear_problem
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors
 

@@ -9,7 +9,7 @@ import torch
 from synthetic import SOLO12, load
 
 from torchid.problem import RowBuilder
-from torchid.problem.threads import share_out
+from torchid.problem.chunks import share_out
 from torchid.sensing import Contact, named_sensors
 
 

@@ -25,8 +25,8 @@ from synthetic import Array
 
 from torchid import parameters
 from torchid.errors import InputError
-from torchid.estimators.conditions import Conditions, Mirror, violations
-from torchid.estimators.consistent import Method, Prior, project
+from torchid.estimators import Conditions, Mirror, project, violations
+from torchid.estimators.consistent import Method, Prior
 
 seeds = st.integers(0, 2**32 - 1)
 

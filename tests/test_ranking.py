@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from synthetic import G1, PANDA, SOLO12, load
 
-from torchid.analysis.candidates import Candidate, candidates, sensor_set
-from torchid.analysis.ranking import SetRanking, best_first
-from torchid.analysis.structure import structural_samples
+from torchid.identifiability.structure import structural_samples
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.threads import one_thread
+from torchid.problem.chunks import one_thread
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise
+from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
+from torchid.sensor_planning.ranking import SetRanking, best_first
 
 NOISE = SensorNoise(joint_torque=0.7, contact_force=3.0, contact_moment=0.4, base_force=5.0, base_moment=1.0)
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))

@@ -28,9 +28,9 @@ from synthetic import (
 from torchid import parameters
 from torchid.errors import UnknownNameError
 from torchid.regressor import FrameJacobian, Regressor, motion_from_state
-from torchid.regressor.dynamics import all_wrench_columns, joint_directions, joint_row, joint_rows
+from torchid.regressor.columns import reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import body_states, joint_states
-from torchid.regressor.reduction import reduced_layout, reduction_matrix
+from torchid.regressor.regressor import all_wrench_columns, joint_directions, joint_row, joint_rows
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 

@@ -14,14 +14,14 @@ from test_training_residual import Fixed, Springs, with_cable
 from torch import Tensor, nn
 
 from torchid import parameters
+from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.estimators import LeastSquares, Sgd, SgdEstimate, Trainer
 from torchid.estimators.residual import WEIGHTS, choose_weight
+from torchid.fitting.experiment import set_up
 from torchid.problem import MiniBatches, RowBuilder, Samples, compress, linear_problem
 from torchid.regressor import Regressor
-from torchid.run.experiment import set_up
-from torchid.run.reading import LogReader
 from torchid.sensing import SensorNoise, named_sensors
 
 RIDGE, NOISE = 1e-3, SensorNoise(joint_torque=0.1, contact_force=0.5, contact_moment=0.05)

@@ -18,8 +18,8 @@ from urdfs import INERTIAL, ball, inertial, joint, link, table, words, write
 
 from torchid.errors import TorchidWarning, UrdfError
 from torchid.parameters import mass_com_inertia
-from torchid.robot import load_robot
-from torchid.robot.shapes import Extent, ShapeKind, body_extents
+from torchid.robot import Extent, body_extents, load_robot
+from torchid.robot.shapes import ShapeKind
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 300.0]])

@@ -16,8 +16,7 @@ import torchid
 from torchid.errors import ConfigError
 from torchid.estimators.conditions import mirrored_parameters
 from torchid.problem.linear import parameter_scale
-from torchid.robot import Robot
-from torchid.robot.symmetry import mirror_pairs
+from torchid.robot import Robot, mirror_pairs
 
 DEMO = Path(torchid.__file__).parent / "demo"
 GO1 = ROBOTS / "go1_description/urdf/go1.urdf"

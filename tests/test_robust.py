@@ -21,19 +21,15 @@ from true_robots import true_parameters
 from urdfs import inertial, joint, link, write
 
 from torchid import parameters
-from torchid.analysis.calibration import estimate_extras
 from torchid.cli import main
 from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares, violations
-from torchid.problem import RowBuilder, Samples, bind
-from torchid.problem.elimination import assemble
-from torchid.problem.extras import ExtraTerms
-from torchid.problem.robust import TUNING, Reweighting, RobustLoss
-from torchid.problem.rows import ChunkTerms
-from torchid.problem.streaming import Part, compress_parts
-from torchid.problem.workspace import Workspace
+from torchid.fitting.fit import Fit
+from torchid.fitting.robust import TUNING, Reweighting, RobustLoss, RobustSummary, loss_of, robust_fit
+from torchid.identifiability.confounding import estimate_extras
+from torchid.problem import ExtraTerms, RowBuilder, Samples, assemble, bind, compress_parts
+from torchid.problem.compression import Part
+from torchid.problem.rows import ChunkTerms, Workspace
 from torchid.robot import Robot
-from torchid.run.fit import Fit
-from torchid.run.robust import RobustSummary, loss_of, robust_fit
 from torchid.sensing import SensorNoise, named_sensors
 
 LOSSES = tuple(TUNING)
@@ -290,7 +286,7 @@ def whitened(bench: Bench, log: Samples) -> tuple[Array, Array]:
 def test_the_fixed_point_is_that_of_other_algorithms_at_the_same_scale(
     arm: Bench, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchid.run.robust._CONVERGED", 1e-9)
+    monkeypatch.setattr("torchid.fitting.robust._CONVERGED", 1e-9)
     monkeypatch.setattr(Reweighting, "median_scale", 1.1)
     log = arm.noisy(np.random.default_rng(4), 0.05, SPIKE)
     first, fit, found = arm.fits(kind, log, passes=400)
@@ -315,7 +311,7 @@ def test_the_order_of_chunks_and_the_number_of_threads_do_not_matter(
     logs = [replace(bench.noisy(rng, 0.005), source=name) for name in ("a", "b")]
     found = []
     for order, options in ((logs, {"threads": 1}), (logs[::-1], {"threads": 3, "chunk": 37})):
-        monkeypatch.setattr("torchid.run.robust.compress_parts", partial(compress_parts, **options))
+        monkeypatch.setattr("torchid.fitting.robust.compress_parts", partial(compress_parts, **options))
         found.append(bench.fits(kind, *order)[1:])
     (one, one_found), (other, other_found) = found
     size = np.abs(one.estimate.phi).max()

@@ -20,11 +20,11 @@ import torchid
 from torchid.cli import main
 from torchid.config import load_config
 from torchid.errors import TorchidWarning
-from torchid.estimators.result import VERDICTS
+from torchid.estimators.least_squares import VERDICTS
+from torchid.identifiability.rank import StateReport
 from torchid.parameters import PARAMETERS
-from torchid.problem.states import StateReport
+from torchid.report import identified_urdf
 from torchid.report.tables import print_tables, state_table
-from torchid.report.urdf_export import identified_urdf
 
 DEMO = Path(torchid.__file__).parent / "demo"
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -18,18 +18,18 @@ from test_config import LEAST
 from urdfs import INERTIAL, ball, inertial, joint, link, table, write
 
 import torchid
+from torchid.commands.identify import identify
 from torchid.config import dump_config, load_config
 from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError
-from torchid.estimators.conditions import Conditions, mirrored_parameters, violations
+from torchid.estimators import Conditions, violations
+from torchid.estimators.conditions import mirrored_parameters
+from torchid.fitting.experiment import conditions_from
+from torchid.fitting.fit import batch_estimator
 from torchid.parameters import PARAMETERS
 from torchid.problem import RowBuilder, bind, compress, linear_problem
 from torchid.problem.linear import parameter_scale
-from torchid.robot import Robot
-from torchid.robot.shapes import body_extents
-from torchid.run import identify
-from torchid.run.conditions import conditions_from
-from torchid.run.estimation import batch_estimator
+from torchid.robot import Robot, body_extents
 from torchid.sensing import Contact, named_sensors
 
 DEMO = Path(torchid.__file__).parent / "demo"
@@ -271,7 +271,7 @@ def demo(folder: Path, **estimator: Any) -> Path:
 
 def test_a_run_meets_its_conditions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of a run but its figures, which take ten times as long."""
-    monkeypatch.setattr(sys.modules["torchid.run.identify"], "write_run", lambda *_: None)
+    monkeypatch.setattr(sys.modules["torchid.commands.identify"], "write_run", lambda *_: None)
     bounds = {"trunk": {"m": [9.5, 9.5]}, "front_left_shank_link": {"fc": [0.35, None]}}
     file = demo(tmp_path, symmetry={"left": "left", "right": "right"}, bounds=bounds, frozen=["rear_right_shank_link"])
     robot = load(DEMO / "quadruped.urdf")

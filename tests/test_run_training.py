@@ -30,14 +30,13 @@ from tensorboard.summary.writer import event_file_writer
 import torchid
 from torchid import parameters
 from torchid.cli import main
+from torchid.commands.training import CHECKPOINT, load_checkpoint, save_checkpoint
 from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.estimators import Trainer
-from torchid.estimators.result import VERDICTS
+from torchid.estimators.least_squares import VERDICTS
 from torchid.problem.linear import parameter_scale
-from torchid.report.metrics import GROUPS, SHOWN
-from torchid.report.sums import WHITENED
-from torchid.run.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint
+from torchid.problem.metrics import GROUPS, SHOWN, WHITENED
 
 DEMO = Path(torchid.__file__).parent / "demo"
 EPOCHS, EVERY = 16, 5
@@ -89,7 +88,7 @@ def run(experiment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are empty: drawing them is most of the time of so short a run."""
     for name in FIGURES:
-        monkeypatch.setattr(f"torchid.run.results.{name}", lambda *_: Figure())
+        monkeypatch.setattr(f"torchid.commands.results.{name}", lambda *_: Figure())
 
 
 def command(experiment: Path, output: Path, *more: str) -> list[str]:
@@ -260,7 +259,7 @@ def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None
 SERVER = """
 import os, sys, time
 from matplotlib.figure import Figure
-import torchid.run.results as results
+import torchid.commands.results as results
 from torchid.cli import main
 from torchid.estimators import Trainer
 for name in {figures}:
@@ -371,7 +370,7 @@ def test_an_interrupt_before_the_first_checkpoint_leaves_nothing_in_the_way(
 ) -> None:
     output = tmp_path / "runs" / "run"
     with pytest.MonkeyPatch.context() as context:
-        context.setattr("torchid.run.training.save_checkpoint", lambda *_: signal.raise_signal(signal.SIGINT))
+        context.setattr("torchid.commands.training.save_checkpoint", lambda *_: signal.raise_signal(signal.SIGINT))
         assert main(command(experiment, output)) == 1
     assert capsys.readouterr().err == "torchid: interrupted in epoch 0; --resume goes on after epoch 0\n"
     monkeypatch.setattr(Trainer, "finished", True)  # what matters is that it starts
@@ -387,7 +386,7 @@ def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
         signal.raise_signal(signal.SIGINT)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr("torchid.run.results.write_json", stopped)
+        monkeypatch.setattr("torchid.commands.results.write_json", stopped)
         assert main(command(experiment, output, "--resume")) == 1
     assert [path.name for path in output.parent.iterdir()] == ["run.training"]
     assert load_checkpoint(training_of(output))["trainer"]["epoch"] == EPOCHS

@@ -9,8 +9,8 @@ import pytest
 from synthetic import ANYMAL, Oracle, load, make_log
 
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError
+from torchid.identifiability.rank import StateReport, check_base, state_reports
 from torchid.problem import RowBuilder, bind
-from torchid.problem.states import StateReport, check_base, state_reports
 from torchid.sensing import Contact, SensorNoise, SensorSet, check_contacts, chosen_sensors, named_sensors
 
 FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]

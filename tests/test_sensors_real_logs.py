@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from motions import DATA
 
-from torchid.analysis.known import APART
 from torchid.cli import main
 from torchid.errors import ConfoundedWarning
+from torchid.identifiability.confounding import APART
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from paper.biped import HALF_LENGTH, HALF_WIDTH, SOLE, SPHERE, biped_urdf, segments
 from scipy.spatial.transform import Rotation
 from simulated import BIPED, SOLES
 from synthetic import Array, load
@@ -12,9 +13,7 @@ from synthetic import Array, load
 from torchid import parameters
 from torchid.config import FootConfig
 from torchid.robot import Robot
-from torchid.simulation.biped import HALF_LENGTH, HALF_WIDTH, SOLE, SPHERE, biped_urdf, segments
-from torchid.simulation.feet import find_feet
-from torchid.simulation.plant import Plant
+from torchid.simulation.plant import Plant, find_feet
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 """Swaps left and right; acts on poses and pseudo-inertias alike."""

@@ -15,9 +15,9 @@ from refusals import files_in, refusal
 from simulated import BIPED, SHIPPED, SOLES, STOOD
 
 from torchid.cli import main
+from torchid.commands.folder import SIMULATION, new_folder
 from torchid.config import load_simulation
 from torchid.errors import InputError
-from torchid.run.folder import SIMULATION, new_folder
 from torchid.simulation import Recording, set_up_simulation
 
 FEET = [{"frame": sole} for sole in SOLES]
@@ -172,7 +172,7 @@ def test_an_interrupted_simulation_leaves_neither_files_nor_processes(
         assert multiprocessing.active_children() != []
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("torchid.run.simulate.wait", interrupted)
+    monkeypatch.setattr("torchid.commands.simulate.wait", interrupted)
     before = files_in(folder)
     assert main(["simulate", str(folder / "sim.yaml")]) == 1
     assert capsys.readouterr().err == "torchid: interrupted; nothing was written\n"
@@ -186,7 +186,7 @@ def test_a_simulation_that_fails_at_its_end_leaves_nothing(
     def full_disk(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchid.run.simulate._in_processes", lambda *_: {"m": STOOD})
+    monkeypatch.setattr("torchid.commands.simulate._in_processes", lambda *_: {"m": STOOD})
     monkeypatch.setattr("json.dumps", full_disk)
     before = files_in(folder)
     assert main(["simulate", str(folder / "sim.yaml")]) == 1
@@ -198,7 +198,7 @@ def test_without_mujoco_a_simulation_says_how_to_install_it(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in list(sys.modules):
-        if name.startswith("torchid.simulation") or name == "torchid.run.simulate":
+        if name.startswith("torchid.simulation") or name == "torchid.commands.simulate":
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     line = refusal(["simulate", str(folder / "sim.yaml")], folder, capsys)

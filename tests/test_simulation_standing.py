@@ -31,13 +31,13 @@ from simulated import (
 )
 from synthetic import ANYMAL, G1, SOLO12
 
-from torchid.config import BoundsConfig, FootConfig, SensorImperfectionsConfig, SimulationConfig
-from torchid.config.simulation import MotionConfig, WaveConfig
+from torchid.commands.simulate import simulate
+from torchid.config import BoundsConfig, FootConfig, MotionConfig, SensorImperfectionsConfig, SimulationConfig
+from torchid.config.simulation import WaveConfig
 from torchid.errors import InputError, UrdfError
 from torchid.logs import read_log
-from torchid.run.simulate import simulate
 from torchid.simulation import set_up_simulation
-from torchid.simulation.feet import find_feet
+from torchid.simulation.plant import find_feet
 
 THRESHOLD = 30.0  # N, from which on the shipped simulation counts a foot as standing
 

@@ -14,10 +14,10 @@ from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
 from true_robots import true_parameters
 
 from torchid.estimators import Estimate, LeastSquares
-from torchid.logs import Log, preprocess, read_log, write_log
-from torchid.logs.plan import FILTER_ORDER
-from torchid.problem import LinearProblem, RowBuilder, bind, compress, linear_problem
-from torchid.problem.samples import Samples
+from torchid.logs import Log, read_log, write_log
+from torchid.logs.preprocess import preprocess
+from torchid.logs.timeline import FILTER_ORDER
+from torchid.problem import LinearProblem, RowBuilder, Samples, bind, compress, linear_problem
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 

@@ -9,8 +9,8 @@ import pytest
 
 import torchid
 from torchid import parameters
-from torchid.analysis.structure import structural_samples
-from torchid.estimators.result import IDENTIFIED, UNSEEN
+from torchid.estimators.least_squares import IDENTIFIED, UNSEEN
+from torchid.identifiability.structure import structural_samples
 from torchid.problem import RowBuilder, compress, linear_problem
 from torchid.sensing import Contact, named_sensors
 

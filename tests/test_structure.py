@@ -14,12 +14,10 @@ from synthetic import G1, PANDA, SOLO12, TIAGO, UR5, Array, Oracle, load
 
 import torchid
 from torchid import parameters
-from torchid.analysis.base_parameters import BaseParameters, base_parameters
-from torchid.analysis.rank import structural_rank
-from torchid.analysis.relations import unseen
-from torchid.analysis.standing import standing_samples, standing_states
-from torchid.analysis.structure import structural_problem, structural_samples
-from torchid.problem.plan import State
+from torchid.identifiability.base_parameters import BaseParameters, base_parameters, unseen
+from torchid.identifiability.rank import structural_rank
+from torchid.identifiability.structure import standing_samples, standing_states, structural_problem, structural_samples
+from torchid.problem.contact_state import State
 from torchid.regressor import motion_from_state
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from paper.results import NOMINAL, TRUE, Record, Results, findings
 from script_calls import call
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchid.report.metrics import GROUPS, Metrics
-from torchid.study.findings import findings
-from torchid.study.results import NOMINAL, TRUE, Record, Results
+from torchid.problem import Metrics
+from torchid.problem.metrics import GROUPS
 
 SETS = ("full", "contacts", "joints", "reduced")
 CONDITIONS = ("exact sensors", "white noise", "bias and gain", "delay", "joint friction", "all")

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from paper.fits import Series, series_of
+from paper.report import error_table, study_figures
+from paper.results import NOMINAL, TRUE, Record, Results
+from paper.settings import SHOWN
 from simulated import BIPED, LIFTING, SOLES
 from synthetic import load
 
-from torchid.logs import preprocess, read_log
-from torchid.problem import Samples, bind
+from torchid.logs import read_log
+from torchid.logs.preprocess import preprocess
+from torchid.problem import Evaluation, Metrics, Samples, bind
+from torchid.problem.metrics import BASE_ROWS, GROUPS
 from torchid.problem.predict import force_series, in_null_space
-from torchid.report.metrics import BASE_ROWS, GROUPS, Evaluation, Metrics
 from torchid.report.tables import table_text
 from torchid.sensing import Contact
-from torchid.study.results import NOMINAL, TRUE, Record, Results
-from torchid.study.series import Series, series_of
-from torchid.study.settings import SHOWN
-from torchid.study.tables import error_table
-from torchid.study.write import study_figures
 
 ROBOT = load(BIPED)
 EVALUATION = Evaluation(ROBOT, [Contact(frame, "flat") for frame in SOLES])

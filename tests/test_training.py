@@ -17,17 +17,17 @@ from torch import Tensor, nn
 
 import torchid
 from torchid import parameters
+from torchid.commands.reading import LogReader
+from torchid.commands.training import load_checkpoint, save_checkpoint
 from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.estimators import Epoch, LeastSquares, Sgd, SgdEstimate, Trainer
 from torchid.estimators.optimizers import optimizer_names
+from torchid.fitting.experiment import set_up
 from torchid.problem import LinearProblem, MiniBatches, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
 from torchid.regressor import Regressor
 from torchid.robot import Robot
-from torchid.run.checkpoint import load_checkpoint, save_checkpoint
-from torchid.run.experiment import set_up
-from torchid.run.reading import LogReader
 from torchid.sensing import SensorNoise, named_sensors
 
 DEMO = Path(torchid.__file__).parent / "demo" / "quadruped.yaml"

@@ -14,15 +14,13 @@ from recordings import Miscalibration
 from synthetic import Array
 from unknowns import fit
 
-from torchid.analysis.calibration import disagreements
-from torchid.logs import Log, preprocess
-from torchid.logs.transitions import UNLOADED_MARGIN_S, unloaded
-from torchid.problem import RowBuilder, Samples, bind
-from torchid.problem.extras import ExtraTerms
-from torchid.problem.streaming import Part, compress_parts
-from torchid.problem.unloaded import unloaded_channels
+from torchid.identifiability.confounding import disagreements
+from torchid.logs import Log
+from torchid.logs.preprocess import UNLOADED_MARGIN_S, preprocess, unloaded
+from torchid.parameters import COMPONENTS
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind, compress_parts
+from torchid.problem.compression import Part, unloaded_channels
 from torchid.sensing import SensorNoise, named_sensors
-from torchid.wrenches import COMPONENTS
 
 EVERY = {"contact_force": "log", "contact_moment": "log"}
 OFFSETS = ExtraTerms(offsets=EVERY)

@@ -20,11 +20,10 @@ from test_regressor_oracle import without_shapes
 
 from torchid import parameters
 from torchid.errors import TorchidWarning
-from torchid.estimators import Consistent
-from torchid.estimators.conditions import Conditions, violations
+from torchid.estimators import Conditions, Consistent, violations
 from torchid.problem import RowBuilder, bind, compress, linear_problem
 from torchid.problem.linear import parameter_scale
-from torchid.report.urdf_export import identified_urdf
+from torchid.report import identified_urdf
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
 

@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 
 from true_robots import hide
 
-from torchid.analysis.calibration import ExtraEstimate, estimate_extras
 from torchid.estimators import Consistent, Estimate, LeastSquares
-from torchid.problem import RowBuilder, Samples
-from torchid.problem.elimination import Assembly, assemble
-from torchid.problem.extras import ExtraTerms
-from torchid.problem.measured import read_components
-from torchid.problem.streaming import compress_parts
+from torchid.identifiability.confounding import ExtraEstimate, estimate_extras
+from torchid.problem import ExtraTerms, RowBuilder, Samples, assemble, compress_parts
+from torchid.problem.elimination import Assembly
+from torchid.problem.extras import read_components
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning, doing_of
-from torchid.interrupts import begin, ending_interrupts, written
+from torchid.staging import begin, ending_interrupts, written
 from torchid.text import EscapedStream, one_line
 
 #: What the machine refuses, and not the user's files nor the program: no room, no memory, no permission.

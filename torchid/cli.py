@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING
 from torchid import __version__
 from torchid.boundary import guarded, plain_streams
 from torchid.errors import during
-from torchid.interrupts import interrupt_held_back as _interrupt_held_back
+from torchid.staging import interrupt_held_back as _interrupt_held_back
 
 if TYPE_CHECKING:
-    from torchid.analysis.known import TotalMass
-    from torchid.report.verdict import Worse
-    from torchid.run.analysis_results import Scenario
-    from torchid.run.noise import NoiseSummary
-    from torchid.run.results import Identification
-    from torchid.run.validation import CrossValidation
+    from torchid.commands import Identification
+    from torchid.commands.analyze import Scenario
+    from torchid.fitting.cross_validation import CrossValidation
+    from torchid.fitting.noise import NoiseSummary
+    from torchid.identifiability.confounding import TotalMass
+    from torchid.problem.metrics import Worse
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
@@ -108,19 +108,19 @@ def _parser() -> argparse.ArgumentParser:
 
 def _identify(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
+        from torchid.commands.identify import identify
         from torchid.config import load_config
         from torchid.estimators import Estimate
-        from torchid.report.extra_table import extra_table
         from torchid.report.tables import (
             contribution_table,
             error_tables,
+            extra_table,
             print_tables,
             state_table,
             verdict_counts_table,
             verdict_table,
             violation_table,
         )
-        from torchid.run import identify
 
     run = identify(load_config(options.file, options.overrides), options.file, options.resume)
     estimate, robot = run.estimate, run.experiment.robot
@@ -147,8 +147,8 @@ def _identify(options: argparse.Namespace) -> None:
 
 def _print_fit(run: Identification) -> None:
     """Key figures, a line each."""
+    from torchid.commands.training import body_eigenvalues
     from torchid.estimators import BoundEstimate, ConsistentEstimate, SgdEstimate
-    from torchid.run.training import body_eigenvalues
 
     estimate, robot = run.estimate, run.experiment.robot
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
@@ -175,14 +175,14 @@ def _print_fit(run: Identification) -> None:
 
 
 def _print_headline(worse: list[Worse]) -> None:
-    from torchid.report.verdict import ADVICE, verdict
+    from torchid.problem.metrics import ADVICE, verdict
 
     for line in (f"WORSE THAN URDF: {verdict(worse)}", f"{ADVICE}; the results are written all the same, status 0"):
         print(fill(line, 100, subsequent_indent="  "))
 
 
 def _print_validation(found: CrossValidation) -> None:
-    from torchid.report.verdict import JUDGED, described
+    from torchid.problem.metrics import JUDGED, described
 
     texts = (described(group, found.identified.rms.get(group), found.nominal.rms.get(group)) for group in JUDGED)
     text = f"held out      each of {found.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
@@ -209,8 +209,8 @@ def _print_noise(found: NoiseSummary) -> None:
 
 def _evaluate(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
+        from torchid.commands.evaluate import evaluate
         from torchid.report.tables import error_tables, print_tables
-        from torchid.run import evaluate
 
     metrics, output = evaluate(options.run, options.log, options.device)
     print_tables(*error_tables(metrics))
@@ -219,10 +219,10 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 def _analyze(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
+        from torchid.commands.analyze import analyze
         from torchid.config import load_analysis
-        from torchid.report.accuracy import accuracy_table
+        from torchid.report.analysis import accuracy_table
         from torchid.report.tables import print_tables
-        from torchid.run import analyze
 
     found = analyze(load_analysis(options.file, options.overrides), options.file)
     for scenario in found.scenarios:
@@ -233,7 +233,7 @@ def _analyze(options: argparse.Namespace) -> None:
 
 
 def _print_scenario(scenario: Scenario) -> None:
-    from torchid.report.plan_tables import branch_table, check_lines, check_table, removal_table, set_text, sets_table
+    from torchid.report.analysis import branch_table, check_lines, check_table, removal_table, set_text, sets_table
     from torchid.report.tables import print_tables
 
     plan, base = scenario.plan, scenario.base
@@ -260,9 +260,9 @@ def _print_scenario(scenario: Scenario) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     with _interrupt_held_back():
-        from torchid.report.hygiene_tables import heading, hygiene_table, not_checked
+        from torchid.commands.check import check_files, check_outputs, write_outputs
+        from torchid.report.log_checks import heading, hygiene_table, not_checked
         from torchid.report.tables import print_tables
-        from torchid.run.check import check_files, check_outputs, write_outputs
 
     check_outputs(options.json, options.figure, options.overwrite, (options.file, options.urdf, options.topics))
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
@@ -281,7 +281,7 @@ def _check(options: argparse.Namespace) -> int:
 
 def _convert(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
-        from torchid.run.convert import convert
+        from torchid.commands.convert import convert
 
     log = convert(options.source, options.target, options.topics, options.overwrite)
     print(f"written to    {options.target}: {len(log)} samples, {', '.join(log.arrays())}")
@@ -289,9 +289,9 @@ def _convert(options: argparse.Namespace) -> None:
 
 def _simulate(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
+        from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
         from torchid.report.tables import print_tables, stability_table
-        from torchid.run.simulate import simulate
 
     config = load_simulation(options.file, options.overrides)
     found = simulate(config, options.file)

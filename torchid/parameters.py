@@ -1,8 +1,4 @@
-"""The order of the parameters of a body, and the linear algebra that depends on it.
-
-This is the only module that spells the order (Mistry et al. 2009, eq. 4): twelve numbers per body, inertia about
-the origin of the body's link frame.
-"""
+"""The order of a body's parameters and of a wrench's components, and the linear algebra that depends on the former."""
 
 from __future__ import annotations
 
@@ -127,3 +123,6 @@ def perturbed(phi: Array, error: float, rng: np.random.Generator) -> Array:
         factors = 1.0 + error * rng.uniform(-1.0, 1.0, 5)
         out[body, INERTIAL] = inertial_vector(factors[0] * mass, factors[1:4] * com, factors[4] * inertia)
     return out
+
+
+COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")

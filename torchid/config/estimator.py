@@ -16,7 +16,7 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from torchid.config.types import STRICT, NotNegative, Number, Positive, Seed, no_flag
+from torchid.config.sensors import STRICT, NotNegative, Number, Positive, Seed, no_flag
 from torchid.errors import ConfigError
 
 

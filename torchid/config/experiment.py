@@ -1,4 +1,4 @@
-"""The experiment file of `torchid identify`."""
+"""The experiment file of `torchid identify` and `torchid analyze`."""
 
 from __future__ import annotations
 
@@ -11,22 +11,107 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from torchid.config.analysis import AnalysisConfig
 from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, check_keys
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
     SCOPES_ACCEPTED,
+    STRICT,
+    Choice,
+    Device,
+    FileName,
+    NotNegative,
+    Positive,
+    Seed,
     Sensors,
     SensorsConfig,
     check_choice,
     spelled_out,
 )
-from torchid.config.topics import JOINTS_ACCEPTED
-from torchid.config.types import STRICT, Device, NotNegative, Positive
 from torchid.errors import ConfigError, TorchidWarning
-from torchid.logs.kinds import bag_files
-from torchid.logs.ros.topics import Topics, check_topics
+from torchid.logs import Topics
+from torchid.logs.containers import bag_files
+from torchid.logs.ros.topics import check_topics
+
+
+@dataclass(config=STRICT, frozen=True)
+class _Logs:
+    topics: Topics
+
+
+@dataclass(config=STRICT, frozen=True)
+class _TopicsFile:
+    logs: _Logs
+
+
+def _topics_alone(settings: Settings, _: Settings) -> Settings:
+    """The settings without all that is not `logs.topics`."""
+    logs = settings.get("logs")
+    return {"logs": {key: x for key, x in logs.items() if key == "topics"} if isinstance(logs, dict) else {}}
+
+
+JOINTS_ACCEPTED = "the name of a topic, or a mapping with topic and joints"
+"""What a message says of the one topic that every bag needs."""
+
+_KIND = FileKind(
+    settings=_TopicsFile,
+    name="experiment",
+    keys="logs.topics",
+    list_example="logs.topics.joint_states.joints=[l_knee]",
+    prepare=_topics_alone,
+    accepted={"logs.topics.joint_states": JOINTS_ACCEPTED},
+)
+
+
+def load_topics(path: str | Path) -> Topics:
+    """Read what the topics of a bag hold from an experiment file, whatever else it says or leaves out.
+
+    Raises:
+        ConfigError: unreadable file, no `logs.topics`, a value of the wrong kind.
+        UnknownNameError: a key that does not exist; the message names the nearest that do.
+    """
+    topics = load(_KIND, Path(path)).logs.topics
+    check_topics(path, topics)
+    return topics
+
+
+Name = Annotated[str, Field(min_length=1)]
+Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
+
+
+@dataclass(config=STRICT, frozen=True)
+class CandidatesConfig:
+    """Sensors that could be mounted: torques of these joints (None: all), and at the contacts whole devices or axes.
+
+    `ft_sensors`: fixed joints that could carry a force/torque sensor, whole devices unless `contacts` are axes.
+    """
+
+    joint_torques: list[str] | None = None
+    contacts: Literal["device", "axis", "none"] = "device"
+    ft_sensors: list[str] = dataclasses.field(default_factory=list)
+
+
+@dataclass(config=STRICT, frozen=True)
+class AnalysisConfig:
+    """What is asked of the sensors.
+
+    `scenarios`: contact states by scenario, each the frames in contact; None: the states of the training logs, or,
+    without logs, all contacts at once. `keep`: candidates that are mounted anyway, `exclude`: that cannot be; `costs`
+    by candidate or by kind (joint_torque, contact, ft_sensor), a channel. `criterion`: the base survives the projection
+    of every sample (None, for a floating base), or many samples together determine all that full sensing would (None,
+    for a bolted one). `compare`: sensor sets whose accuracy is predicted from the training logs and measured on the
+    test logs; `prior_error`: how far off the URDF may be, against the size of each body.
+    """
+
+    scenarios: Annotated[Scenarios, Field(min_length=1)] | None = None
+    candidates: CandidatesConfig = dataclasses.field(default_factory=CandidatesConfig)
+    keep: list[str] = dataclasses.field(default_factory=list)
+    exclude: list[str] = dataclasses.field(default_factory=list)
+    costs: dict[str, Positive] = dataclasses.field(default_factory=dict)
+    criterion: Literal["per_sample", "stack"] | None = None
+    compare: dict[Name, Choice] = dataclasses.field(default_factory=dict)
+    prior_error: Annotated[Positive, Field(le=100.0)] = 0.2
+    seed: Seed = 0
 
 
 @dataclass(config=STRICT, frozen=True)

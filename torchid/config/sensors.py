@@ -1,17 +1,47 @@
-"""Sensors in a settings file: a named set or sensors by name, and their noise."""
+"""The values that settings are made of, and the sensors of an experiment file with their noise."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from torchid.config.types import STRICT, Positive
 from torchid.errors import ConfigError
 from torchid.problem.extras import CHANNELS
+
+STRICT = ConfigDict(extra="forbid")
+
+
+def no_flag(value: object) -> object:
+    """The value, unless it is true or false, which pydantic takes for 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError("a number")  # and not 1.0 for `true`
+    return value
+
+
+def _torch_device(value: str) -> str:
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", value):
+        raise ValueError("cpu, cuda, cuda:0, ...")
+    return value
+
+
+def _file_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", value):
+        raise ValueError("a name of letters, digits, _, - and ., at most 100")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(no_flag), Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
+Seed = Annotated[int, BeforeValidator(no_flag), Field(ge=0)]
+FileName = Annotated[str, AfterValidator(_file_name)]
+Device = Annotated[str, AfterValidator(_torch_device)]
+
 
 Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
 
@@ -39,7 +69,7 @@ PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis
 class NoiseConfig:
     """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m].
 
-    None: estimated from the training logs (`torchid.run.noise`); a guess, that of `SensorNoise`, where there are none.
+    None: estimated from the training logs (`torchid.fitting.noise`), or those of `SensorNoise` where there are none.
     """
 
     joint_torque: Positive | None = None

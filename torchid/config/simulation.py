@@ -11,7 +11,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
-from torchid.config.types import STRICT, FileName, NotNegative, Number, Positive, Seed
+from torchid.config.sensors import STRICT, FileName, NotNegative, Number, Positive, Seed
 from torchid.errors import ConfigError
 
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]

@@ -3,11 +3,9 @@
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror, Violation, violations
 from torchid.estimators.consistent import Consistent, ConsistentEstimate, project
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
-from torchid.estimators.least_squares import LeastSquares
-from torchid.estimators.penalties import PenaltyWeights
+from torchid.estimators.least_squares import BoundEstimate, Estimate, LeastSquares
 from torchid.estimators.residual import ResidualEffect, WeightChoice
-from torchid.estimators.result import BoundEstimate, Estimate
-from torchid.estimators.sgd import Sgd
+from torchid.estimators.sgd import PenaltyWeights, Sgd
 from torchid.estimators.training import Epoch, SgdEstimate, Trainer
 
 __all__ = [

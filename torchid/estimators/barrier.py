@@ -13,7 +13,7 @@ from torch import Tensor
 from torchid.errors import InputError, NumericalWarning
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.parameters import Array
-from torchid.problem.threads import one_thread
+from torchid.problem.chunks import one_thread
 
 _SHRINK = 0.02  # of the barrier's weight from stage to stage; 0.1 takes a fifth more steps, 0.01 no fewer
 _CENTRED = 0.25  # squared Newton decrement at which a full step ends a stage

@@ -11,7 +11,7 @@ from torchid.errors import InputError, NumericalWarning
 from torchid.estimators.barrier import interior
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.parameters import Array
-from torchid.problem.threads import one_thread
+from torchid.problem.chunks import one_thread
 
 _LOOSE = 1e-6  # relative gap that is worth another try, and in the end a warning
 _OUTSIDE = 1e-8  # how far conditions may be missed, in units of the scale: most solutions are within; or another try,

@@ -14,11 +14,10 @@ from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, check_parameters
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.estimators.formulate import Prior, conic_problem
-from torchid.estimators.least_squares import LeastSquares
-from torchid.estimators.result import BoundEstimate, rounding_reported
+from torchid.estimators.least_squares import BoundEstimate, LeastSquares, rounding_reported
 from torchid.estimators.vanishing import Vanishing, vanishing_ridge
 from torchid.parameters import Array
-from torchid.problem.linear import LinearProblem
+from torchid.problem import LinearProblem
 
 Method = Literal["barrier", "certified"]
 
@@ -184,6 +183,6 @@ def _solve(conic: ConicProblem, method: Method, tolerance: float = 1e-9) -> Solu
         return Solution(np.zeros(0), conic.constant, 0.0, 0)
     if method == "barrier":
         return solve_barrier(conic, tolerance)
-    from torchid.estimators.certified import solve_certified  # CVXPY takes a second to import
+    from torchid.estimators.certified import solve_certified
 
     return solve_certified(conic)

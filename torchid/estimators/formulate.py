@@ -13,7 +13,7 @@ from torchid.errors import InputError
 from torchid.estimators.conditions import Conditions, Enclosure, mirrored_parameters
 from torchid.estimators.conic import SAME, ConicProblem, Row, independent, with_room
 from torchid.parameters import PER_BODY, Array
-from torchid.problem.linear import LinearProblem
+from torchid.problem import LinearProblem
 
 Prior = Literal["euclidean", "pullback", "entropic"]
 

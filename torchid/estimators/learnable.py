@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.parameters import PER_BODY
-from torchid.problem.linear import LinearProblem
-from torchid.problem.threads import one_thread
+from torchid.problem import LinearProblem
+from torchid.problem.chunks import one_thread
 
 _LEAST_FRICTION = 0.01  # of its scale: where friction starts if the URDF has none, since 0 is out of reach
 _LEAST_EIGENVALUE = 1e-3  # above the margin, where the URDF's body is not that far inside

@@ -10,10 +10,9 @@ import torch
 from torch import nn
 
 from torchid.estimators.least_squares import LeastSquares
-from torchid.estimators.loss import Loss
+from torchid.estimators.sgd import Loss
 from torchid.parameters import INERTIAL, PER_BODY, Array
-from torchid.problem.batches import MiniBatches
-from torchid.problem.linear import LinearProblem
+from torchid.problem import LinearProblem, MiniBatches
 
 WEIGHTS = (10.0, 1.0, 0.1, 0.01, 0.001, 0.0)
 """What is tried: a module that could give any force gives 1 / (1 + weight) of what the parameters leave."""

@@ -1,15 +1,84 @@
-"""The settings of mini-batch descent."""
+"""Mini-batch descent: its settings, its objective, and the penalties that keep bodies physical."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 import numpy as np
+import torch
+from torch import Tensor, nn
 
+from torchid import parameters
+from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.optimizers import try_out
-from torchid.estimators.penalties import PenaltyWeights
+from torchid.problem import Batch, LinearProblem, MiniBatches
+
+
+@dataclass(frozen=True)
+class PenaltyWeights:
+    """Weights of the penalties beside the mean squared whitened residual.
+
+    Attributes:
+        eigenvalue: squares of what the eigenvalues of scaled pseudo-inertias lack to the margin.
+        log_det: minus the logarithms of these eigenvalues above the margin, a barrier.
+        mass: squares of negative masses, in units of their scale.
+        friction: squares of negative friction, in units of its scale.
+    """
+
+    eigenvalue: float = 10.0
+    log_det: float = 0.0
+    mass: float = 10.0
+    friction: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise ValueError(f"penalties.{item.name}: found {value}; accepted: a finite number of at least 0")
+
+    @property
+    def curvature(self) -> float:
+        """Bound of the squares' second derivatives, in units of the scale; what is off the diagonal is there twice."""
+        return 2.0 * (2.0 * self.eigenvalue + self.mass + self.friction)
+
+
+def pseudo_inertias(scaled: Tensor) -> Tensor:
+    """Pseudo-inertias (L, 4, 4) of parameters (L, 12), differentiable (`parameters.pseudo_inertia` is not)."""
+    return torch.tensordot(scaled[:, parameters.INERTIAL], torch.from_numpy(parameters.PSEUDO_BASIS).to(scaled), dims=1)
+
+
+def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWeights) -> dict[str, Tensor]:
+    """Weighted penalties by name; those of weight 0 are left out.
+
+    Args:
+        scaled: (L, 12), parameters in units of their scale.
+        bodies: (L',) int, bodies whose inertia is asked to be possible; friction is asked to be of all.
+        margin: least eigenvalue asked for.
+        weights: of the terms.
+    """
+    out: dict[str, Tensor] = {}
+    if weights.eigenvalue or weights.log_det:
+        eigenvalues = torch.linalg.eigvalsh(pseudo_inertias(scaled[bodies]))
+        if weights.eigenvalue:
+            out["eigenvalue"] = weights.eigenvalue * (margin - eigenvalues).clamp_min(0.0).square().sum()
+        if weights.log_det:
+            out["log_det"] = -weights.log_det * _extended_log(eigenvalues - margin).sum()
+    if weights.mass:
+        out["mass"] = weights.mass * scaled[bodies, parameters.MASS].clamp_max(0.0).square().sum()
+    if weights.friction:
+        out["friction"] = weights.friction * scaled[:, parameters.FRICTION].clamp_max(0.0).square().sum()
+    return out
+
+
+def _extended_log(x: Tensor, least: float = 1e-4) -> Tensor:
+    """The logarithm, and below `least` its tangent: a descent that starts outside still finds its way in."""
+    inside = x.clamp_min(least)
+    return inside.log() + (x - inside) / least
+
 
 Consistency = Literal["log_cholesky", "penalties"]
 ResidualMode = Literal["joint", "parameters_first", "alternating"]
@@ -79,3 +148,100 @@ class Sgd:
         if not (np.isfinite(self.margin) and 0.0 <= self.margin < 1.0):
             raise ValueError(f"margin: found {self.margin}; accepted: a number from 0 to 1, without 1")
         try_out(self.optimizer, self.optimizer_options, self.schedule, self.schedule_options, self.epochs)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Terms of the loss of a batch, and sums of squares of its projected whitened forces, both by name."""
+
+    losses: dict[str, Tensor]
+    squares: dict[str, Tensor]
+
+    def total(self) -> Tensor:
+        """Sum of the terms."""
+        return torch.stack(list(self.losses.values())).sum()
+
+    def plus(self, other: Terms, share: float) -> Terms:
+        """These and those of another batch, which holds this share of the samples, without their gradients."""
+        losses = {name: self.losses.get(name, 0.0) + share * x.detach() for name, x in other.losses.items()}
+        return Terms(losses, {name: self.squares.get(name, 0.0) + x for name, x in other.squares.items()})
+
+
+class Loss(nn.Module):
+    """The loss of a batch, such that its mean over an epoch is the loss of all samples.
+
+    Attributes:
+        learnable: parameters of the bodies.
+        residual: module r(q, v, a) -> (B, nv) [N, N m] whose output adds to K phi, or None.
+        residual_weight: of the mean square of the module's whitened force; None, which counts as 0, until it is chosen.
+    """
+
+    def __init__(
+        self,
+        settings: Sgd,
+        problem: LinearProblem,
+        batches: MiniBatches,
+        learnable: LearnableParameters,
+        residual: nn.Module | None,
+    ) -> None:
+        """Fix what is trained on which logs."""
+        super().__init__()
+        self.settings = settings
+        self.learnable, self.residual = learnable, residual
+        self.residual_weight = settings.residual_weight
+        self._columns = batches.columns
+        self._per_row = batches.samples / max(problem.rows, 1)
+        self.register_buffer(
+            "_bodies", torch.from_numpy(problem.free_bodies()).to(batches.columns.device), persistent=False
+        )
+
+    def forward(self, batch: Batch) -> Terms:
+        """Terms of one batch."""
+        settings, phi = self.settings, self.learnable()
+        rigid, other = self.forces(batch, phi)
+        share = self._per_row / len(batch)
+        misfit = (rigid if other is None else rigid + other) - batch.f
+        losses = {"data": share * misfit.square().sum()}
+        if settings.ridge:
+            deviation = (phi - self.learnable.nominal) / self.learnable.scale
+            losses["prior"] = settings.ridge * deviation.square().sum()
+        if settings.consistency == "penalties":
+            scaled, bodies = self.learnable.by_body(phi), self.get_buffer("_bodies")
+            losses |= penalties(scaled, bodies, settings.margin, settings.penalties)
+        forces = {"rigid_body": rigid, "measured": batch.f}
+        if other is not None:
+            forces["residual"] = other
+            if self.residual_weight:
+                losses["residual"] = self.residual_weight * share * other.square().sum()
+        return Terms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
+
+    def forces(self, batch: Batch, phi: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Whitened projected forces, (B, nv), of parameters (12 L,) and of the residual module."""
+        rigid = batch.K @ (self._columns @ phi)
+        if self.residual is None:
+            return rigid, None
+        r = self.residual(batch.q, batch.v, batch.a)
+        if r.shape != batch.f.shape:
+            raise ValueError(f"residual: found a force of shape {tuple(r.shape)}; accepted: {tuple(batch.f.shape)}")
+        return rigid, (batch.W.mT @ r[..., None])[..., 0]
+
+    @torch.no_grad()
+    def mean_square(self, batches: MiniBatches) -> float:
+        """Mean squared whitened residual over all rows of some logs, the module evaluating."""
+        total, rows, phi = 0.0, 0, self.learnable()
+        with self.evaluating():
+            for batch in batches.chunks():
+                rigid, other = self.forces(batch, phi)
+                misfit = (rigid if other is None else rigid + other) - batch.f
+                total, rows = total + float(misfit.square().sum()), rows + batch.rows
+        return total / max(rows, 1)
+
+    @contextmanager
+    def evaluating(self) -> Iterator[None]:
+        """The module evaluates, and trains again afterwards if it did before."""
+        training = self.training
+        self.eval()
+        try:
+            yield
+        finally:
+            self.train(training)

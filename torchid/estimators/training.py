@@ -16,17 +16,14 @@ from torch import Tensor, nn
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
-from torchid.estimators.least_squares import LeastSquares
-from torchid.estimators.loss import Loss, Terms
+from torchid.estimators.least_squares import BoundEstimate, LeastSquares, rounding_reported
 from torchid.estimators.optimizers import METHODS, make_optimizer, make_schedule, step_schedule
 from torchid.estimators.residual import WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
-from torchid.estimators.result import BoundEstimate, rounding_reported
-from torchid.estimators.sgd import Sgd
+from torchid.estimators.sgd import Loss, Sgd, Terms
 from torchid.estimators.state import check_state
 from torchid.parameters import Array
-from torchid.problem.batches import Batch, MiniBatches
-from torchid.problem.linear import LinearProblem
-from torchid.problem.threads import one_thread
+from torchid.problem import Batch, LinearProblem, MiniBatches
+from torchid.problem.chunks import one_thread
 
 _BLOCKS, _EVERY = 20, 4  # a quarter of the samples is held out to choose the weight of a residual module, in 5 blocks
 _FEWEST = 2  # blocks that a standard error can be had from

@@ -12,10 +12,10 @@ from torchid.estimators.barrier import interior, solve_barrier
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic import REACH, ConicProblem, Solution
 from torchid.estimators.formulate import Prior, conic_problem
-from torchid.estimators.result import residual_std
+from torchid.estimators.least_squares import residual_std
 from torchid.parameters import Array
-from torchid.problem.linear import LinearProblem
-from torchid.problem.threads import one_thread
+from torchid.problem import LinearProblem
+from torchid.problem.chunks import one_thread
 
 _RIDGES = 10.0 ** -np.arange(0.0, 15.0, 2.0)  # of the least misfit without conditions, or of what is as good as none
 _SETTLED = (

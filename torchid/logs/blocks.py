@@ -15,14 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.logs.checks import as_names, as_real, check_shape, check_time
-from torchid.logs.container import Container, open_container, translated
-from torchid.logs.fields import NAMES, SHAPES, FloatArray, shape_of
-from torchid.logs.kinds import Kind, kind_to_read
-from torchid.logs.log import Log
+from torchid.logs.containers import Container, Kind, kind_to_read, open_container, translated
+from torchid.logs.log import NAMES, SHAPES, FloatArray, Log, as_names, as_real, check_shape, check_time, shape_of
 from torchid.logs.read import check_fields_given, checked_log
 from torchid.logs.spill import Sliced, Spill
-from torchid.logs.table import table_blocks, table_size
+from torchid.logs.tables import table_blocks, table_size
 
 GIGABYTE = 1e9
 _ACCEPTED = "a plain array of numbers, truth values or text"

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torchid.errors import LogError
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
-from torchid.logs.fields import NAMES, SHAPES, VARIANTS, UnknownFieldError, is_quaternion, shape_of
+from torchid.logs.log import NAMES, SHAPES, VARIANTS, UnknownFieldError, is_quaternion, shape_of
+from torchid.parameters import COMPONENTS
 from torchid.text import is_plain, shown
-from torchid.wrenches import COMPONENTS
 
 #: The one column of text: the same in every row.
 TEXT = "imu_frame"

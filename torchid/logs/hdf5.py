@@ -1,9 +1,11 @@
-"""HDF5 files (the only module with h5py): what one declares, its arrays one at a time, and writing one."""
+"""HDF5 files (the only module with h5py): what one declares, its chunks measured before unpacking, its arrays."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,128 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError
-from torchid.guards import MAX_SMALL, check_fields, check_names
-from torchid.logs.chunks import Measured, chunk_bytes
+from torchid.guards import CHUNK_BYTES, MAX_CHUNKS, MAX_SMALL, check_fields, check_names
 from torchid.logs.spill import Sliced
+
+DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
+_SUM = 4  # bytes that a checksum adds
+_PIECE = 2**22  # bytes that are unpacked at a time
+_ACCEPTED = "gzip or lzf, shuffle and fletcher32, each once (h5repack rewrites others)"
+
+
+def chunk_bytes(item: Any, file_size: int) -> int:
+    """Bytes of one chunk of a dataset as it is in memory, 0 if it has none.
+
+    Raises:
+        ValueError: far more chunks than a file of this size can hold.
+    """
+    if not item.chunks:
+        return 0
+    count = math.prod(-(-size // step) for size, step in zip(item.shape, item.chunks, strict=True))
+    most = MAX_CHUNKS + file_size // CHUNK_BYTES
+    if count > most:
+        raise ValueError(f"{count} chunks, more than the {most} that a file of {file_size} bytes may have")
+    return math.prod(item.chunks) * int(item.dtype.itemsize)
+
+
+class Measured:
+    """A dataset of compressed chunks, each of which is measured before it is read for the first time."""
+
+    def __init__(self, item: Any) -> None:
+        """Take a dataset of chunks; ValueError where they are compressed in a way that is not read."""
+        self._item, self._size = item, math.prod(item.chunks) * _stored_size(item)
+        plist = item.id.get_create_plist()
+        self._filters = [int(plist.get_filter(k)[0]) for k in range(plist.get_nfilters())]
+        pressed = [x for x in self._filters if x in (DEFLATE, LZF)]
+        known = set(self._filters) <= {DEFLATE, SHUFFLE, FLETCHER32, LZF}
+        if not known or len(pressed) > 1 or len(set(self._filters)) < len(self._filters):
+            raise ValueError(f"chunks filtered by {self._filters}; these are read: {_ACCEPTED}")
+        self._measured: set[int] = set()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of all of it."""
+        return tuple(self._item.shape)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of its elements."""
+        return np.dtype(self._item.dtype)
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        """Some rows; ValueError where a chunk of them does not hold what it should."""
+        self.measure(rows)
+        return np.asarray(self._item[rows])
+
+    def measure(self, rows: slice) -> None:
+        """Raise ValueError where a chunk that holds some of the rows holds more or less than it should."""
+        if not self._filters:
+            return
+        start, stop, _ = rows.indices(self.shape[0])
+        step, *others = self._item.chunks
+        across = [range(0, size, of) for size, of in zip(self.shape[1:], others, strict=True)]
+        for row in range(start // step, -(-stop // step)):
+            if row not in self._measured:
+                for rest in itertools.product(*across):
+                    self._measure((row * step, *rest))
+                self._measured.add(row)
+
+    def _measure(self, offset: tuple[int, ...]) -> None:
+        stored = self._item.id.get_chunk_info_by_coord(offset)
+        if not stored.size or stored.byte_offset is None:
+            return  # not there: the fill value stands for it
+        if stored.size > 2 * self._size + _PIECE:
+            raise ValueError(f"a chunk of {stored.size} bytes for {self._size}")
+        mask, data = self._item.id.read_direct_chunk(offset)
+        found, held = len(data), memoryview(data)
+        for place in reversed(range(len(self._filters))):
+            kind = self._filters[place]
+            if mask >> place & 1:
+                continue
+            if kind == FLETCHER32:
+                found, held = found - _SUM, held[:-_SUM]
+            elif kind in (DEFLATE, LZF):
+                found = (_inflated if kind == DEFLATE else _lzf)(held, self._size + _SUM)
+        if found != self._size:
+            raise ValueError(f"a chunk that holds {found} bytes, where {self._size} are declared")
+
+
+def _stored_size(item: Any) -> int:
+    """Bytes of one element in a chunk: of text of any length, its length and where it stands."""
+    address: int = item.file.id.get_create_plist().get_sizes()[0]
+    return address + 8 if item.dtype.hasobject else int(item.dtype.itemsize)
+
+
+def _inflated(data: memoryview, most: int) -> int:
+    """Bytes of what zlib compressed; ValueError where there is more than `most` or the end is missing."""
+    press, found, left = zlib.decompressobj(), 0, bytes(data)
+    while not press.eof and left:
+        found += len(press.decompress(left, _PIECE))
+        left = press.unconsumed_tail
+        if found > most:
+            raise ValueError(f"a chunk that holds more than {most} bytes, which are declared")
+    if not press.eof:
+        raise ValueError("a chunk that ends too soon")
+    return found
+
+
+def _lzf(data: memoryview, most: int) -> int:
+    """Bytes of what LZF compressed: runs of letters, and repetitions, whose lengths alone are looked at."""
+    found, at, size = 0, 0, len(data)
+    while at < size:
+        control = data[at]
+        if control < 32:
+            found, at = found + control + 1, at + control + 2
+        elif control < 224:
+            found, at = found + (control >> 5) + 2, at + 2
+        else:
+            found, at = found + (data[at + 1] if at + 1 < size else 0) + 9, at + 3
+        if found > most:
+            raise ValueError(f"a chunk that holds more than {most} bytes, which are declared")
+    if at != size:
+        raise ValueError("a chunk that ends too soon")
+    return found
+
 
 _OVERHEAD = 4096  # bytes that an array takes up beside its numbers
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchid.logs.fields import FloatArray
+from torchid.logs.log import FloatArray
 
 
 def sign_continuous(quat: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Read a log file, check everything in it and bring it to canonical frames and orders."""
+"""Read a log file, check everything in it, bring it to canonical frames and orders; write one."""
 
 from __future__ import annotations
 
@@ -11,18 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, during
-from torchid.logs.checks import (
-    as_flags,
-    as_frame,
-    as_names,
-    as_real,
-    check_finite,
-    check_shape,
-    check_time,
-    unit_quaternion,
-)
-from torchid.logs.container import open_container, translated
-from torchid.logs.fields import (
+from torchid.logs.containers import Kind, kind_to_read, kind_to_write, open_container, save_arrays, translated
+from torchid.logs.log import (
     EXCLUSIVE,
     NAMES,
     NAN_ALLOWED,
@@ -31,17 +21,24 @@ from torchid.logs.fields import (
     SHAPES,
     VARIANTS,
     FloatArray,
+    Log,
     UnknownFieldError,
+    as_flags,
+    as_frame,
+    as_names,
+    as_real,
+    check_finite,
+    check_shape,
+    check_time,
     is_quaternion,
     labels_of,
     shape_of,
+    unit_quaternion,
 )
-from torchid.logs.kinds import Kind, kind_to_read
-from torchid.logs.log import Log
 from torchid.logs.quaternion import rotate, rotate_back, sign_continuous
 from torchid.logs.ros.read import read_bag
 from torchid.logs.ros.topics import Topics
-from torchid.logs.table import read_table
+from torchid.logs.tables import read_table, save_table
 
 
 def read_log(
@@ -164,3 +161,25 @@ def _canonical(source: str, fields: dict[str, Any]) -> Log:
                 turn = rotate if name.endswith("_base") else rotate_back
                 fields[canonical] = turn(quat, fields.pop(name))
     return Log(source=source, **fields)
+
+
+def write_log(log: Log, path: str | os.PathLike[str]) -> None:
+    """Write `log` to a .npz, .h5, .hdf5, .csv or .parquet file that `read_log` gives back unchanged.
+
+    The file appears complete or not at all: it is written under a temporary name in its folder, then renamed.
+
+    Raises:
+        LogError: the extension is unknown or the file cannot be written.
+    """
+    save = save_table if kind_to_write(Path(path)) is Kind.TABLE else save_arrays
+    arrays: dict[str, NDArray[Any]] = {
+        name: array
+        for name, array in log.arrays().items()
+        if 0 not in array.shape[1:] or name == "joint_position"  # what there is none of needs no field
+    }
+    for name, names in log.names.items():
+        if names or name == "joint_names":
+            arrays[name] = np.array(names, dtype=np.str_)
+    if log.imu_frame:
+        arrays["imu_frame"] = np.array(log.imu_frame)
+    save(Path(path), arrays)

@@ -1,18 +1,20 @@
 """From bound logs to a compressed linear problem."""
 
 from torchid.problem.batches import Batch, MiniBatches
+from torchid.problem.compression import compress, compress_parts, linear_problem
 from torchid.problem.elimination import assemble
 from torchid.problem.extras import ExtraTerms
-from torchid.problem.linear import LinearProblem
+from torchid.problem.linear import LinearProblem, TriangularFactor
+from torchid.problem.metrics import Evaluation, Metrics
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, bind
-from torchid.problem.streaming import compress, compress_parts, linear_problem
-from torchid.problem.triangular import TriangularFactor
 
 __all__ = [
     "Batch",
+    "Evaluation",
     "ExtraTerms",
     "LinearProblem",
+    "Metrics",
     "MiniBatches",
     "RowBuilder",
     "Samples",

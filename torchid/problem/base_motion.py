@@ -13,7 +13,8 @@ from torch import Tensor
 from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
 from torchid.parameters import Array
-from torchid.regressor.motion import GRAVITY_WORLD, motion_from_state, rotation_matrix
+from torchid.regressor import motion_from_state
+from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.robot import Robot
 
 _POSE_FIELDS = (

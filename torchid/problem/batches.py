@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from torchid.parameters import Array
-from torchid.problem.chunks import by_state
+from torchid.problem.chunks import by_state, one_thread
 from torchid.problem.predict import predicted_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.threads import one_thread
 
 _CHUNK = 1024  # samples whose rows are computed together: a batch alone would lose to dispatch
 _MEMORY = 2**30  # bytes of rows that are kept from epoch to epoch

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchid.parameters import Array
+from torchid.problem.chunks import one_thread
+from torchid.problem.compression import Part, linear_problem, merged, posed
 from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
 from torchid.problem.rows import RowBuilder
-from torchid.problem.streaming import Part, linear_problem, merged, posed
-from torchid.problem.threads import one_thread
 from torchid.robot import Robot
 
 _DEPENDENT = 1e-10  # a singular value of the unknowns' unit columns below this share of the largest is rounding

@@ -1,4 +1,4 @@
-"""Unknowns beside the bodies' parameters: offsets and scales of the sensors, and what actuators add."""
+"""Unknowns beside the bodies' parameters: offsets and scales of the measured components, and what actuators add."""
 
 from __future__ import annotations
 
@@ -7,11 +7,27 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchid.problem.measured import read_components
+from torchid.parameters import COMPONENTS
 from torchid.robot import Robot
-from torchid.sensing.contacts import Contact
-from torchid.sensing.sensors import SensorSet
-from torchid.wrenches import COMPONENTS
+from torchid.sensing import Contact, SensorSet
+
+
+def read_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
+    """Recorded components (C, 6) that the measured ones are computed from: along world axes, whole vectors."""
+    measured = measured_components(contacts, sensors)
+    if not in_world:
+        return measured
+    whole = measured.reshape(-1, 2, 3).any(axis=2)
+    return np.repeat(whole, 3, axis=1)
+
+
+def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
+    """Measured components (C, 6) that the contacts can exert, along the frames' axes."""
+    possible = np.zeros((len(contacts), 6), dtype=bool)
+    for index, contact in enumerate(contacts):
+        possible[index, list(contact.components)] = True
+    return possible & sensors.wrench
+
 
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
 """Kinds of sensor channels, as `SensorNoise` has them."""

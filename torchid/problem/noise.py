@@ -18,16 +18,14 @@ import torch
 from torch import Tensor
 
 from torchid.parameters import Array
-from torchid.problem.chunks import by_state
-from torchid.problem.linear import LinearProblem
-from torchid.problem.measured import measured_components
-from torchid.problem.plan import State
+from torchid.problem.chunks import by_state, one_thread
+from torchid.problem.compression import Part
+from torchid.problem.contact_state import State
+from torchid.problem.extras import measured_components
+from torchid.problem.linear import LinearProblem, TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
-from torchid.problem.streaming import Part
-from torchid.problem.threads import one_thread
-from torchid.problem.triangular import TriangularFactor
-from torchid.sensing.sensors import SensorNoise
+from torchid.sensing import SensorNoise
 
 BASE = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
 GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE, "ft_force", "ft_moment")

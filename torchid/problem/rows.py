@@ -1,9 +1,4 @@
-"""Whitened, projected rows of the linear problem, one contact state at a time.
-
-In a contact state the projection mixes only the base and the joints between the base and a touching body. Every other
-measured joint keeps its own row, which is zero outside its subtree. Both kinds go to the factor as blocks with just
-the columns they can touch.
-"""
+"""Whitened, projected rows of the linear problem, one contact state at a time."""
 
 from __future__ import annotations
 
@@ -17,19 +12,31 @@ from torch import Tensor, nn
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled
-from torchid.problem.extra_columns import dof_column, mixed_columns
+from torchid.problem.contact_state import Columns, Planner, State, StatePlan, dof_column, mixed_columns
 from torchid.problem.extras import ExtraTerms, extras_of
-from torchid.problem.plan import Columns, Planner, State, StatePlan
 from torchid.problem.samples import Samples
-from torchid.problem.workspace import Workspace
-from torchid.regressor.dynamics import all_wrench_columns, friction_columns, joint_directions, joint_row
 from torchid.regressor.jacobian import generalized_forces, wrench_map, wrenches_at_base
 from torchid.regressor.kinematics import BodyStates, JointStates, body_states, joint_states
+from torchid.regressor.regressor import all_wrench_columns, friction_columns, joint_directions, joint_row
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
-from torchid.sensing.contacts import Contact
-from torchid.sensing.nullspace import levelled_null_space, null_space
-from torchid.sensing.sensors import SensorSet
+from torchid.sensing import Contact, SensorSet
+from torchid.sensing.projection import levelled_null_space, null_space
+
+
+class Workspace:
+    """Named buffers, one worker's alone. Keeps the latest of each name only."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._buffers: dict[str, Tensor] = {}
+
+    def zeros(self, name: str, like: Tensor, *shape: int) -> Tensor:
+        """A buffer that is zero wherever callers with the same name and shape never write."""
+        found = self._buffers.get(name)
+        if found is None or (found.shape, found.dtype, found.device) != (shape, like.dtype, like.device):
+            found = self._buffers[name] = torch.zeros(shape, dtype=like.dtype, device=like.device)
+        return found
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,15 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
-from torchid.logs.fields import FloatArray
-from torchid.logs.transitions import unloaded_readings
+from torchid.logs.log import FloatArray
+from torchid.logs.preprocess import unloaded_readings
+from torchid.parameters import COMPONENTS
 from torchid.problem.base_motion import BaseMotion, base_motion
-from torchid.problem.measured import read_components
-from torchid.regressor.motion import GRAVITY_WORLD, Motion, rotation_matrix
+from torchid.problem.extras import read_components
+from torchid.regressor import Motion
+from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.robot import Robot
-from torchid.sensing.contacts import Contact
-from torchid.sensing.sensors import SensorSet
-from torchid.wrenches import COMPONENTS
+from torchid.sensing import Contact, SensorSet
 
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
 

@@ -1,7 +1,7 @@
 """Batched kinematics and the regressor K(q, v, a)."""
 
 from torchid.regressor.jacobian import FrameJacobian
-from torchid.regressor.motion import Motion, motion_from_state
+from torchid.regressor.kinematics import Motion, motion_from_state
 from torchid.regressor.regressor import Regressor
 
 __all__ = ["FrameJacobian", "Motion", "Regressor", "motion_from_state"]

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from torchid.parameters import Array
-from torchid.regressor.dynamics import joint_directions
-from torchid.regressor.kinematics import BodyStates, body_states, cross, joint_states
-from torchid.regressor.motion import GRAVITY_WORLD, motion_from_state
+from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross, joint_states, motion_from_state
+from torchid.regressor.regressor import joint_directions
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 

@@ -1,7 +1,5 @@
-"""What a run leaves behind: metrics, tables, figures, TensorBoard events, parameters and a URDF."""
+"""What a run leaves behind: tables, figures, TensorBoard events, parameters and a URDF."""
 
-from torchid.report.metrics import Evaluation, Metrics
-from torchid.report.parameters_json import parameters_document
-from torchid.report.urdf_export import identified_urdf
+from torchid.report.parameter_files import identified_urdf, parameters_document
 
-__all__ = ["Evaluation", "Metrics", "identified_urdf", "parameters_document"]
+__all__ = ["identified_urdf", "parameters_document"]

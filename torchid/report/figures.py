@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +11,21 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
+from matplotlib.ticker import LogFormatter
 
 from torchid import parameters
 from torchid.errors import during
-from torchid.parameters import Array
-from torchid.report.metrics import BASE_ROWS, SHOWN, Metrics, group_name
+from torchid.estimators import Estimate
+from torchid.estimators.least_squares import FIXED
+from torchid.identifiability.confounding import ExtraEstimate
+from torchid.parameters import PARAMETERS, PER_BODY, Array
+from torchid.problem import Metrics
+from torchid.problem.metrics import BASE_ROWS, SHOWN, group_name
+from torchid.report.tables import MARKS, legend_of_marks
 from torchid.text import escaped
 
 STYLE: dict[Any, Any] = {
@@ -157,4 +166,80 @@ def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], most:
         hidden = len(groups[group]) - len(found)
         axis.set_title(group + (f", {hidden} more not shown" if hidden else ""), loc="left", fontsize=9)
     axes[-1].set_xlabel("information lost without it [bits]")
+    return figure
+
+
+_ROWS = 40  # in a panel; the rest is in parameters.json
+_MOST = 4  # standard errors beyond this many times the largest value are cut off
+_LANES = 5  # logs side by side in a row; more start again at its top
+
+
+@matplotlib.rc_context(STYLE)
+def extra_figure(found: Sequence[ExtraEstimate]) -> Figure:
+    """A panel for each unit, a row for each unknown, a point for each log with its 95 % interval.
+
+    Hollow points cannot be told from other unknowns.
+    """
+    units = list(dict.fromkeys(x.extra.unit for x in found))
+    logs = list(dict.fromkeys(x.log for x in found))
+    rows = {unit: list(dict.fromkeys(x.extra.label for x in found if x.extra.unit == unit))[:_ROWS] for unit in units}
+    height = 1.2 + 0.24 * sum(map(len, rows.values())) + 0.6 * len(units)
+    figure = Figure(figsize=(9.0, max(height, 2.4)), layout="constrained")
+    heights = [len(rows[unit]) + 1 for unit in units]
+    axes = figure.subplots(len(units), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
+    colors = {log: f"C{number}" for number, log in enumerate(logs)}
+    for axis, unit in zip(axes[:, 0], units, strict=True):
+        shown = [x for x in found if x.extra.unit == unit and x.extra.label in rows[unit]]
+        _draw_panel(axis, shown, rows[unit], colors)
+        axis.set_xlabel(f"[{unit}]" if unit != "1" else "scale less 1 [1]")
+    axes[0, 0].set_title("95 % intervals; hollow: not told from other unknowns", loc="left", fontsize=8)
+    # of all panels, and never hollow: a log need not have a point in every one of them
+    keys = [Line2D([], [], marker="o", linestyle="", color=color) for color in colors.values()]
+    names = [Path(log).name or "all logs" for log in logs]
+    figure.legend(keys, names, loc="outside upper right", ncols=min(len(logs), 4))
+    return figure
+
+
+def _draw_panel(axis: Axes, found: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
+    """Values with their intervals, the logs of a row below each other around its middle."""
+    reach = _MOST * max(abs(x.value) for x in found) or 1.0
+    logs = [log for log in colors if any(x.log == log for x in found)]
+    for number, log in enumerate(logs):
+        points = [x for x in found if x.log == log]
+        below = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
+        values, place = [x.value for x in points], [rows.index(x.extra.label) + below for x in points]
+        error = [min(1.96 * x.standard_error, reach) if math.isfinite(x.standard_error) else reach for x in points]
+        axis.errorbar(values, place, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
+        fill = [colors[log] if x.told_apart else "white" for x in points]
+        axis.scatter(values, place, c=fill, edgecolors=colors[log], s=22, zorder=3)
+    axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
+    axis.set_yticks(range(len(rows)), rows, fontsize=8)
+    axis.set_ylim(len(rows) - 0.5, -0.5)
+
+
+@matplotlib.rc_context(STYLE | {"axes.grid": False})
+def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Figure:
+    """Share of the data in every parameter, with the mark of its verdict, and the singular values of the problem."""
+    verdicts = estimate.verdict.reshape(-1, PER_BODY)
+    shown = np.flatnonzero((verdicts != FIXED).any(axis=1))
+    share = estimate.data_share.reshape(-1, PER_BODY)[shown]
+    figure = Figure(figsize=(11.0, 0.24 * len(shown) + 1.8), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1.9, 1.0])
+    image = left.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    for row, body in enumerate(shown):
+        for column, verdict in enumerate(verdicts[body]):
+            color = "white" if share[row, column] > 0.6 else "black"
+            left.text(column, row, MARKS[verdict], ha="center", va="center", fontsize=8, color=color)
+    left.set_xticks(range(PER_BODY), PARAMETERS, fontsize=7)
+    left.set_yticks(range(len(shown)), [body_names[int(body)] for body in shown], fontsize=7)
+    left.set_title(legend_of_marks(), loc="left", fontsize=8)
+    figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
+    values = estimate.singular_values
+    right.semilogy(np.arange(1, len(values) + 1), values, ".", color="tab:blue", markersize=4)
+    right.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
+    right.axvline(estimate.rank + 0.5, color="0.5", linewidth=0.8)
+    right.set_title(f"singular values, rank {estimate.rank}", loc="left", fontsize=8)
+    right.set_xlabel("number")
+    right.set_ylabel("singular value [standard deviations per scale]")
+    right.grid(visible=True)
     return figure

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from torch.utils.tensorboard import SummaryWriter
 
-from torchid.analysis.information import Knowledge
 from torchid.estimators import BoundEstimate, Epoch, Estimate
-from torchid.report.metrics import SETS, SHOWN, Metrics
+from torchid.identifiability.information import Knowledge
+from torchid.problem import Metrics
+from torchid.problem.metrics import SETS, SHOWN
 
 _CHARTED = (*SETS, "left_out")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")

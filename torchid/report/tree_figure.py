@@ -11,10 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from torchid.parameters import COMPONENTS
 from torchid.report.figures import STYLE
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
-from torchid.sensing import COMPONENTS, Contact
+from torchid.sensing import Contact
 
 _TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = "tab:blue", "tab:green", "tab:purple", "0.75", "0.3"
 _COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4  # inches

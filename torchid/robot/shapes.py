@@ -21,7 +21,7 @@ from yourdfpy.urdf import Inertial
 from torchid.errors import TorchidWarning, UrdfError
 from torchid.guards import MAX_AXES, MAX_NUMBER, MAX_POINTS, MAX_SHAPES
 from torchid.parameters import Array
-from torchid.robot.mesh_files import MeshError, mesh_content
+from torchid.robot.meshes import MeshError, mesh_content
 from torchid.robot.robot import Robot
 from torchid.robot.urdf import parse_xml, read_urdf
 from torchid.text import shown

@@ -1,12 +1,17 @@
 """Contacts, sensor sets, and the projection that removes unmeasured forces."""
 
-from torchid.sensing.contacts import Contact, check_contacts
 from torchid.sensing.projection import ProjectedGroup, Projection
-from torchid.sensing.sensors import SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
-from torchid.wrenches import COMPONENTS
+from torchid.sensing.sensors import (
+    Contact,
+    SensorNoise,
+    SensorSet,
+    check_contacts,
+    chosen_sensors,
+    named_sensors,
+    with_ft_sensors,
+)
 
 __all__ = [
-    "COMPONENTS",
     "Contact",
     "ProjectedGroup",
     "Projection",

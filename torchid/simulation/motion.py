@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from torchid.config import MotionConfig, StepsConfig
 from torchid.errors import InputError, UnknownNameError
-from torchid.logs.fields import BoolArray
+from torchid.logs.log import BoolArray
 from torchid.parameters import Array
-from torchid.simulation.controller import ALOFT, Goal
-from torchid.simulation.stance import Stance
+from torchid.simulation.controller import ALOFT, Goal, Stance
 
 BODY = ("com_x", "com_y", "com_z", "base_roll", "base_pitch", "base_yaw")  # what waves move, besides joints
 LEAD_S = 2.0  # waves grow to their amplitude in this time, before the log begins

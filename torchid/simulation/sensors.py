@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from torchid.config import SensorImperfectionsConfig
 from torchid.errors import InputError
 from torchid.logs import Log
-from torchid.logs.fields import BoolArray
+from torchid.logs.log import BoolArray
 from torchid.parameters import Array
-from torchid.simulation.recording import exact
+from torchid.simulation.simulation import exact
 
 
 def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: str | None = None) -> Log:

@@ -1,4 +1,4 @@
-"""One motion of a simulation file, from the URDF to an exact recording."""
+"""One motion of a simulation file, from the URDF to an exact recording, and whether the robot stayed on its feet."""
 
 from __future__ import annotations
 
@@ -6,17 +6,226 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
-from torchid.config import MotionConfig, SimulationConfig
-from torchid.errors import InputError
-from torchid.logs.fields import BoolArray
-from torchid.simulation.controller import Controller
-from torchid.simulation.feet import Foot, can_hold, find_feet
+from torchid.config import BoundsConfig, MotionConfig, SimulationConfig
+from torchid.errors import InputError, LogError
+from torchid.logs import Log
+from torchid.logs.log import BoolArray
+from torchid.parameters import Array
+from torchid.simulation.controller import Controller, Stance, find_stance
 from torchid.simulation.motion import Motion
-from torchid.simulation.plant import Plant
-from torchid.simulation.recording import Recording, record
-from torchid.simulation.stability import Stability, stability
-from torchid.simulation.stance import Stance, find_stance
+from torchid.simulation.plant import Foot, Plant, can_hold, find_feet
+
+_REPORT_S = 0.25  # simulated seconds between two looks at how the robot stands
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One motion as it truly was, sampled at the physics rate from time 0 on.
+
+    `log` holds exact states, the simulator's accelerations, torques and wrenches, and a contact as active while
+    the floor acts on the foot at all. `feet`, (N, F, 3) [m], and `rotations`, (N, F, 3, 3), are the poses of the feet's
+    frames.
+    """
+
+    log: Log
+    feet: Array
+    rotations: Array
+
+
+def exact(log: Log, name: str) -> Array:
+    """A field of a truth log.
+
+    Raises:
+        LogError: the log lacks it.
+    """
+    values: Array | None = getattr(log, name)
+    if values is None:
+        raise LogError(log.source, name, "missing", "an exact log that torchid simulate wrote")
+    return values
+
+
+def record(
+    plant: Plant,
+    controller: Controller,
+    stance: Stance,
+    motion: Motion,
+    config: SimulationConfig,
+    source: object,
+    progress: Callable[[float], None] | None = None,
+) -> Recording:
+    """Simulate a motion.
+
+    Args:
+        plant: the robot.
+        controller: what drives it.
+        stance: where it starts.
+        motion: what it does.
+        config: rates, and the height that the base must keep.
+        source: named in errors.
+        progress: called with the seconds simulated since the last call.
+
+    Raises:
+        InputError: the robot falls.
+    """
+    plant.place(stance.position)
+    frames: list[tuple[Array, ...]] = []
+    per_goal = round(config.physics_hz / config.control_hz)
+    report_every = max(1, round(config.control_hz * _REPORT_S))
+    for step, (time, goal) in enumerate(zip(motion.time, motion, strict=True)):
+        for substep in range(per_goal):
+            plant.observe()
+            if substep == 0:
+                torque = controller.torque(goal)
+            before = [x.copy() for x in (plant.position, plant.velocity, plant.feet_positions, plant.feet_rotations)]
+            plant.push(torque)
+            if time >= 0.0:
+                frames.append((*before, plant.acceleration.copy(), torque, plant.wrenches))
+        if step % report_every == 0:
+            if plant.unstable or not abs(plant.position[2] - stance.position[2]) <= config.bounds.height_m:
+                when = f"at {time:.2f} s" if time >= 0.0 else f"{-time:.2f} s before the log begins"
+                found, wanted = f"the robot falls {when}", "a gentler motion, or another posture"
+                raise InputError(source, f"motions.{motion.name}", found, wanted)
+            if progress is not None:
+                progress(report_every / config.control_hz)
+    position, velocity, feet, rotations, *pushed = (np.array(x) for x in zip(*frames, strict=True))
+    log = _exact_log(plant, motion.name, config.physics_hz, position, velocity, *pushed)
+    return Recording(log, feet, rotations)
+
+
+def _exact_log(plant: Plant, name: str, hz: float, position: Array, velocity: Array, *pushed: Array) -> Log:
+    """The log of samples in the plant's coordinates; `pushed`: accelerations, torques, wrenches."""
+    acceleration, torque, wrench = pushed
+    return Log(
+        name,
+        time=np.arange(len(position)) / hz,
+        joint_names=plant.joint_names,
+        joint_position=position[:, 7:],
+        joint_velocity=velocity[:, 6:],
+        joint_acceleration=acceleration[:, 6:],
+        joint_torque=torque,
+        base_position_world=position[:, :3],
+        base_quat_xyzw=position[:, [4, 5, 6, 3]],
+        base_linear_velocity_world=velocity[:, :3],
+        base_angular_velocity_base=velocity[:, 3:6],
+        base_linear_acceleration_world=acceleration[:, :3],
+        base_angular_acceleration_base=acceleration[:, 3:6],
+        contact_names=plant.foot_frames,
+        contact_active=np.any(wrench != 0.0, axis=2),
+        contact_wrench_local=wrench,
+    )
+
+
+@dataclass(frozen=True)
+class Stability:
+    """How a robot stood during a motion.
+
+    Attributes:
+        base_height: least and greatest height of the base's origin [m].
+        height_change: most that it differed from the stance's [m].
+        slip: most that a foot moved along the floor between touching it and leaving it [m].
+        zmp_margin: least distance from the zero-moment point to the border of the support polygon [m].
+        beyond_limits: most that a joint was outside its range [rad or m].
+        effort: greatest torque as a share of what the URDF allows, 0 if it sets no limit.
+        unloaded: share of the time in which each foot did not stand, (F,).
+    """
+
+    base_height: tuple[float, float]
+    height_change: float
+    slip: float
+    zmp_margin: float
+    beyond_limits: float
+    effort: float
+    unloaded: tuple[float, ...]
+
+    def check(self, bounds: BoundsConfig, motion: str, source: object) -> None:
+        """Refuse a motion that the robot did not do standing.
+
+        Raises:
+            InputError: a bound is broken.
+        """
+        for found, allowed in (
+            (f"base height changes by {self.height_change:.3g} m", self.height_change <= bounds.height_m),
+            (f"a foot slips by {1e3 * self.slip:.3g} mm", self.slip <= bounds.slip_m),
+            (f"zero-moment point {1e3 * self.zmp_margin:.3g} mm inside the support", self.zmp_margin >= bounds.zmp_m),
+            (f"a joint passes its limits by {self.beyond_limits:.3g}", self.beyond_limits <= 0.0),
+            (f"a joint needs {100 * self.effort:.0f} % of its effort limit", self.effort <= 1.0),
+        ):
+            if not allowed:
+                wanted = "a gentler motion, another posture or wider bounds"
+                raise InputError(source, f"motions.{motion}", found, wanted)
+
+
+def stability(
+    recording: Recording, plant: Plant, stance: Stance, feet: tuple[Foot, ...], load: float, source: object
+) -> Stability:
+    """Measure how a robot stood.
+
+    Args:
+        recording: what it did.
+        plant: the robot.
+        stance: where it started.
+        feet: what it stood on.
+        load: vertical force [N] from which on a foot counts as standing.
+        source: named in errors.
+
+    Raises:
+        InputError: a foot never bears that much.
+    """
+    log = recording.log
+    wrench = exact(log, "contact_wrench_local")
+    R = recording.rotations
+    force, moment = ((R @ part[..., None])[..., 0] for part in (wrench[..., :3], wrench[..., 3:]))
+    middles = recording.feet + np.einsum("nfij,fj->nfi", R, np.array([foot.middle for foot in feet]))
+    standing = force[..., 2] > load
+    bearing = np.linalg.norm(force, axis=2).max(axis=0)
+    for foot, most in zip(feet, bearing, strict=True):
+        if most <= load:
+            found = f"{load:g} N, but {foot.frame} never bears more than {most:.3g} N"
+            raise InputError(source, "sensors.contact_threshold", found, "a fraction of what a standing foot bears")
+    low, high = plant.limits.T
+    height = exact(log, "base_position_world")[:, 2]
+    return Stability(
+        (float(height.min()), float(height.max())),
+        float(np.abs(height - stance.position[2]).max()),
+        max(_slip(middles[:, i, :2], standing[:, i]) for i in range(len(feet))),
+        _zmp_margin(recording.feet, force, moment, stance, feet),
+        max(float((log.joint_position - high).max()), float((low - log.joint_position).max()), 0.0),
+        float(np.max(np.abs(exact(log, "joint_torque")) / plant.efforts)),
+        tuple(map(float, 1.0 - standing.mean(axis=0))),
+    )
+
+
+def _slip(place: Array, standing: BoolArray) -> float:
+    """Most that a point, (N, 2), moved from where it was when it began to stand."""
+    begins = np.flatnonzero(np.diff(standing.astype(int), prepend=0) == 1)
+    if not len(begins):
+        return 0.0
+    began = begins[np.maximum(np.cumsum(np.isin(np.arange(len(place)), begins)) - 1, 0)]
+    return float(np.linalg.norm(place - place[began], axis=1)[standing].max())
+
+
+def _zmp_margin(place: Array, force: Array, moment: Array, stance: Stance, feet: tuple[Foot, ...]) -> float:
+    """Least distance from the zero-moment point to the border of the support polygon, per set of feet on the floor."""
+    arm = np.cross(place, force) + moment
+    total, turning = force.sum(axis=1), arm.sum(axis=1)
+    aloft = total[:, 2] < 1.0
+    zmp = np.stack([-turning[:, 1], turning[:, 0]], axis=1) / np.where(aloft, np.nan, total[:, 2])[:, None]
+    corners = [
+        target[:2] + (foot.arms @ R.T)[:, :2]
+        for target, R, foot in zip(stance.feet, stance.rotations, feet, strict=True)
+    ]
+    margin = np.inf if not aloft.any() else -np.inf
+    on = force[..., 2] > 0.0
+    for state in np.unique(on[~aloft], axis=0):
+        support = np.concatenate([corner for corner, active in zip(corners, state, strict=True) if active])
+        if len(support) < 3:
+            return -np.inf
+        hull = ConvexHull(support).equations
+        inside = zmp[(on == state).all(axis=1)]
+        margin = min(margin, float(-(inside @ hull[:, :2].T + hull[:, 2]).max()))
+    return margin
 
 
 @dataclass(frozen=True)

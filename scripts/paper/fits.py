@@ -1,0 +1,108 @@
+"""Compress the logs of one condition once per sensor set, fit any nominal parameters, predict unseen forces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchid.estimators import Estimate
+from torchid.fitting.experiment import Experiment
+from torchid.fitting.fit import batch_estimator, stated_conditions, with_frozen
+from torchid.parameters import Array
+from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, linear_problem
+from torchid.problem.chunks import by_state
+from torchid.problem.compression import compress_by_state, merged
+from torchid.problem.contact_state import State, state_name
+from torchid.problem.metrics import BASE_ROWS
+from torchid.problem.predict import force_series, in_null_space
+
+
+@dataclass(frozen=True)
+class StateRank:
+    """A contact state of the training logs: samples in it, and independent combinations that they determine."""
+
+    name: str
+    samples: int
+    rank: int
+
+
+@dataclass(frozen=True)
+class CompressedLogs:
+    """What a sensor set keeps of some groups of logs: a factor per group and contact state."""
+
+    experiment: Experiment
+    builder: RowBuilder
+    factors: Mapping[str, Mapping[State, TriangularFactor]]
+    counts: Mapping[str, Mapping[State, int]]
+
+    def fit(self, groups: Sequence[str], nominals: Sequence[Array], friction: bool) -> list[Estimate]:
+        """Parameters from some groups of logs, near each of some nominal ones (L, 12)."""
+        factor = merged((factor for group in groups for factor in self.factors[group].values()), self.builder)
+        return [self._solve(factor, nominal, friction) for nominal in nominals]
+
+    def ranks(self, groups: Sequence[str], friction: bool) -> list[StateRank]:
+        """What each contact state of some groups determines on its own, and all together, most frequent first."""
+        nominal = self.experiment.robot.nominal
+        (together,) = self.fit(groups, [nominal], friction)
+        out = []
+        for state in {state for group in groups for state in self.factors[group]}:
+            factors = (self.factors[group][state] for group in groups if state in self.factors[group])
+            samples = sum(self.counts[group].get(state, 0) for group in groups)
+            rank = self._solve(merged(factors, self.builder), nominal, friction).rank
+            out.append(StateRank(state_name(self.builder.contacts, state), samples, rank))
+        out.sort(key=lambda found: -found.samples)
+        return [*out, StateRank("together", sum(found.samples for found in out), together.rank)]
+
+    def _solve(self, factor: TriangularFactor, nominal: Array, friction: bool) -> Estimate:
+        robot = replace(self.experiment.robot, nominal=nominal)
+        settings = self.experiment.config.estimator
+        problem = with_frozen(linear_problem(factor, self.builder, robot, friction), settings, robot)
+        return batch_estimator(settings, stated_conditions(settings, robot)).solve(problem)
+
+
+def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
+    """Compress groups of logs with an experiment's sensors."""
+    builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(experiment.config.device)
+    factors = {name: compress_by_state(logs, builder) for name, logs in groups.items()}
+    counts: dict[str, dict[State, int]] = {name: {} for name in groups}
+    for name, logs in groups.items():
+        for samples in logs:
+            for state, index in by_state(samples):
+                counts[name][state] = counts[name].get(state, 0) + len(samples[index])
+    return CompressedLogs(experiment, builder, factors, counts)
+
+
+@dataclass(frozen=True)
+class Series:
+    """Generalized forces of one log: `true` (N, nv) and what every parameter vector predicts.
+
+    `projected_true` and `projected` are the same inside the contacts' null space, V_x V_x^T f. `rows`: names of the nv
+    rows.
+    """
+
+    time: Array
+    rows: tuple[str, ...]
+    true: Array
+    predicted: Mapping[str, Array]
+    projected_true: Array
+    projected: Mapping[str, Array]
+
+    def row(self, name: str) -> int:
+        """Place of a row."""
+        return self.rows.index(name)
+
+
+def series_of(evaluation: Evaluation, samples: Samples, phi: Mapping[str, Array]) -> Series:
+    """Forces of a log and the predictions of named parameter vectors (12 L,)."""
+    true, predicted = force_series(evaluation.builder, samples, np.stack(list(phi.values())))
+    inside = in_null_space(evaluation.builder, samples, np.concatenate([true[None], predicted]))
+    return Series(
+        samples.time.numpy() - float(samples.time[0]),
+        (*BASE_ROWS, *evaluation.robot.joint_names),
+        true,
+        dict(zip(phi, predicted, strict=True)),
+        inside[0],
+        dict(zip(phi, inside[1:], strict=True)),
+    )

@@ -1,0 +1,157 @@
+"""Simulate, corrupt, fit, evaluate: the whole experiment of section V."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from paper.fits import Series, compressed, series_of
+from paper.results import NOMINAL, TRUE, Ranks, Record, Results
+from paper.settings import SHOWN, SQUATS, TRAINING, UNSEEN, Condition, Study, conditions
+from torchid import parameters
+from torchid.commands.simulate import nominal_parameters, simulate
+from torchid.config import load_config
+from torchid.errors import ConfigError
+from torchid.fitting.experiment import Experiment, set_up
+from torchid.logs import Log, read_log
+from torchid.logs.preprocess import preprocess
+from torchid.parameters import Array
+from torchid.problem import Evaluation, Samples, bind
+from torchid.report.tables import progress_bars
+from torchid.simulation import sensor_log
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """One draw of a condition: training samples by group, and the unseen log as measured and as it truly was."""
+
+    condition: Condition
+    number: int
+    groups: Mapping[str, Sequence[Samples]]
+    measured: Samples
+    exact: Samples
+
+
+class Reproduction:
+    """A study under way."""
+
+    def __init__(self, study: Study) -> None:
+        """Read the experiment files.
+
+        Raises:
+            InputError: the settings do not fit together.
+        """
+        self.study = study
+        self._experiments = {name: self._experiment(path) for name, path in study.experiments.items()}
+        first = next(iter(self._experiments.values()))
+        for name, experiment in self._experiments.items():
+            for key in ("preprocessing", "contacts"):
+                found, common = (getattr(e.config, key) for e in (experiment, first))
+                if found != common:
+                    raise ConfigError(study.experiments[name], key, f"{found}", f"{common}, as in the other files")
+        self._robot, self._contacts, self._filter = first.robot, first.contacts, first.config.preprocessing
+        self._evaluation = Evaluation(first.robot, first.contacts, first.config.device)
+        self._records: list[Record] = []
+        self._ranks: list[Ranks] = []
+        self._shown: list[Series] = []
+
+    def run(self, folder: Path) -> tuple[Results, Series]:
+        """Run the study; `folder` holds the simulated logs meanwhile.
+
+        Returns:
+            Errors of every fit, and forces over time of one of them.
+
+        Raises:
+            InputError: the robot falls.
+        """
+        cases = conditions(self.study.simulation)
+        names = [motion.name for motion in self.study.simulation.motions]
+        for friction in (False, True):
+            plant = [case for case in cases if case.friction == friction]
+            exact = self._simulated(friction, folder / "simulation", names)
+            with progress_bars() as bars:
+                steps = sum(map(self._draws, plant)) * (len(self._experiments) + 1)
+                bar = bars.add_task(f"fitting, {'with' if friction else 'no'} joint friction", total=steps)
+                done = partial(bars.advance, bar)
+                for case in plant:
+                    for number in range(self._draws(case)):
+                        self._examine(self._draw(case, number, exact), done)
+                        done()
+        return Results(self._records, self._ranks), self._shown[0]
+
+    def _experiment(self, path: Path) -> Experiment:
+        """An experiment file, for the study's robot and logs."""
+        urdf, logs = json.dumps(str(self.study.simulation.robot.urdf)), "logs={train: [squats], test: []}"
+        return set_up(load_config(path, [f"robot.urdf={urdf}", logs]), path)
+
+    def _draws(self, condition: Condition) -> int:
+        return self.study.noise_draws if condition.random else 1
+
+    def _simulated(self, friction: bool, folder: Path, names: Sequence[str]) -> dict[str, Log]:
+        """What the robot did, with or without friction in its joints."""
+        config = self.study.simulation
+        plant = replace(config.friction, enabled=friction)
+        simulate(replace(config, output=folder, friction=plant), self.study.source)
+        logs = {name: read_log(folder / "exact" / f"{name}.npz") for name in names}
+        shutil.rmtree(folder)
+        return logs
+
+    def _draw(self, condition: Condition, number: int, exact: Mapping[str, Log]) -> _Draw:
+        """Corrupt, filter and bind all logs of a condition."""
+        clean = conditions(self.study.simulation)[0]
+
+        def samples(name: str, of: Condition) -> Samples:
+            log = sensor_log(exact[name], of.sensors, self.study.simulation.seed + number, name)
+            log = preprocess(log, self._filter.cutoff_hz, self._filter.sample_rate_hz)
+            return bind(log, self._robot, self._contacts)
+
+        groups: dict[str, list[Samples]] = {"squats": [], "others": []}
+        for name in exact:
+            if not name.startswith(UNSEEN):
+                groups["squats" if name.startswith(SQUATS) else "others"].append(samples(name, condition))
+        unseen = next(name for name in exact if name.startswith(UNSEEN))
+        return _Draw(condition, number, groups, samples(unseen, condition), samples(unseen, clean))
+
+    def _examine(self, draw: _Draw, done: Callable[[], None]) -> None:
+        """Fit every sensor set on every training set from every nominal draw, and evaluate."""
+        friction, nominals = draw.condition.friction, self._nominals()
+        vectors: dict[str, dict[str, list[Array]]] = {training: {} for training in TRAINING}
+        for sensors, experiment in self._experiments.items():
+            logs = compressed(experiment, draw.groups)
+            for training, groups in TRAINING.items():
+                vectors[training][sensors] = [fit.phi for fit in logs.fit(groups, nominals, friction)]
+                if draw.condition.name == SHOWN[0] and draw.number == 0:
+                    self._ranks.append(Ranks(training, sensors, logs.ranks(groups, friction)))
+            done()
+        true = self._true(friction).flatten()
+        for training, fitted in vectors.items():
+            rows = {NOMINAL: [nominal.flatten() for nominal in nominals], **fitted, TRUE: [true]}
+            self._evaluate(draw, training, rows)
+            if (draw.condition.name, training) == SHOWN and draw.number == 0:
+                first = {name: phi[0] for name, phi in rows.items()}
+                self._shown.append(series_of(self._evaluation, draw.exact, first))
+
+    def _evaluate(self, draw: _Draw, training: str, rows: Mapping[str, Sequence[Array]]) -> None:
+        candidates = np.stack([phi for vectors in rows.values() for phi in vectors])
+        measured, exact = (self._evaluation.metrics([log], candidates) for log in (draw.measured, draw.exact))
+        labels = [(name, number) for name, vectors in rows.items() for number in range(len(vectors))]
+        for (name, number), *metrics in zip(labels, measured, exact, strict=True):
+            self._records.append(Record(draw.condition.name, training, name, draw.number, number, *metrics))
+
+    def _nominals(self) -> list[Array]:
+        """Nominal parameters (L, 12), one per draw."""
+        settings = self.study.simulation.nominal
+        return [nominal_parameters(self._robot, settings, draw) for draw in range(self.study.nominal_draws)]
+
+    def _true(self, friction: bool) -> Array:
+        """Parameters (L, 12) of the simulated robot."""
+        true, levels = self._robot.nominal.copy(), self.study.simulation.friction
+        if friction:
+            true[1:, parameters.COULOMB], true[1:, parameters.VISCOUS] = levels.coulomb, levels.viscous
+        return true

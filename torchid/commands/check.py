@@ -1,0 +1,156 @@
+"""`torchid check`: hygiene of logs before they are fitted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from torchid.commands.folder import check_free_file
+from torchid.commands.reading import gigabytes
+from torchid.config import load_analysis
+from torchid.config.experiment import PreprocessingConfig, load_topics
+from torchid.errors import ConfigError, LogError
+from torchid.fitting.experiment import set_up_scene
+from torchid.log_checks import Checked
+from torchid.log_checks.check import check
+from torchid.logs import Log, Topics, read_log
+from torchid.logs.containers import appearing_whole
+from torchid.report.figures import save_figure
+from torchid.report.log_checks import hygiene_document, hygiene_figure
+from torchid.report.tables import progress_bars
+from torchid.robot import load_robot
+from torchid.sensing import Contact
+
+EXPERIMENTS = (".yaml", ".yml")
+FIGURES = (".png", ".pdf", ".svg")
+_WRENCH = (slice(0, 3), slice(3, 6))
+
+
+def check_files(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    urdf: str | Path | None = None,
+    base_link: str | None = None,
+    fixed_base: bool = False,
+    topics: str | Path | None = None,
+) -> list[Checked]:
+    """Check the logs of an experiment file, or one log; see `check_experiment` and `check_log`.
+
+    Raises:
+        ConfigError: options of the one with the other.
+    """
+    options = {"--urdf": urdf, "--base-link": base_link, "--fixed-base": fixed_base, "--topics": topics}
+    given = [name for name, value in options.items() if value]
+    if Path(path).suffix.lower() in EXPERIMENTS:
+        if given:
+            raise ConfigError("command line", given[0], "given with an experiment file", "overrides, robot.urdf=...")
+        return check_experiment(path, overrides)
+    if overrides:
+        found = f"{overrides[0]}, given with a log"
+        raise ConfigError("command line", "overrides", found, f"an experiment file ({', '.join(EXPERIMENTS)})")
+    if urdf is None and (base_link or fixed_base):
+        raise ConfigError("command line", given[0], "given without a robot", "--urdf too")
+    return [check_log(path, urdf, base_link, fixed_base, topics)]
+
+
+def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Checked]:
+    """Check all logs of an experiment file against its robot and contacts.
+
+    Raises:
+        InputError: whatever in the file does not fit the robot, or a log that cannot be read.
+    """
+    config = load_analysis(path, overrides)
+    if config.logs is None:
+        raise ConfigError(path, "logs", "missing", "logs to check")
+    scene = set_up_scene(config, path)
+    files = [*config.logs.train, *config.logs.validation, *config.logs.test]
+    found = []
+    with progress_bars() as bars:
+        for file in bars.track(files, description="checking"):
+            log = log_to_check(file, config.logs.topics, config.preprocessing)
+            found.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
+    return found
+
+
+def check_log(
+    path: str | Path,
+    urdf: str | Path | None = None,
+    base_link: str | None = None,
+    fixed_base: bool = False,
+    topics: str | Path | None = None,
+) -> Checked:
+    """Check one log, by itself or against a robot.
+
+    Args:
+        path: the log.
+        urdf: the robot; None: what needs it is skipped.
+        base_link: as in an experiment file.
+        fixed_base: likewise.
+        topics: experiment file whose `logs.topics` says what the topics of a bag hold.
+
+    Raises:
+        InputError: the log or the URDF cannot be read, or the log is larger than an experiment's may be by default.
+    """
+    log = log_to_check(Path(path), None if topics is None else load_topics(topics), PreprocessingConfig())
+    if urdf is None:
+        return check(log)
+    robot = load_robot(urdf, base_link, fixed_base, log.ft_names)
+    for name in log.contact_names:
+        robot.link(name, "contact_names", log.source)
+    return check(log, robot, [_contact(log, index) for index in range(len(log.contact_names))])
+
+
+def log_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Log:
+    """A log as it was read.
+
+    Raises:
+        LogError: it cannot be read, or is larger than what may be in memory at once.
+    """
+    size = gigabytes(path, settings.memory_gb)
+    if size > settings.memory_gb:
+        accepted = f"parts of the log, or an experiment file with a preprocessing.memory_gb above {size:.2g}"
+        raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
+    return read_log(path, topics, allow_gaps=True)
+
+
+def _contact(log: Log, index: int) -> Contact:
+    """A contact of a log without an experiment file: a point if forces without any moment were measured."""
+    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    force, moment = (False, True) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
+    return Contact(log.contact_names[index], "point" if force and not moment else "flat")
+
+
+def check_outputs(
+    document: str | None, figure: str | None, overwrite: bool = False, inputs: Sequence[str | None] = ()
+) -> None:
+    """Make sure, before any work, that files can be written there.
+
+    Args:
+        document: name of the .json file.
+        figure: name of the figure.
+        overwrite: whether files there may be replaced.
+        inputs: files that are read.
+
+    Raises:
+        ConfigError: another extension, something in the way, or no folder to write to.
+    """
+    for option, name, accepted in (("--json", document, (".json",)), ("--figure", figure, FIGURES)):
+        if name is None:
+            continue
+        path = Path(name)
+        if path.suffix.lower() not in accepted:
+            raise ConfigError("command line", option, f"'{name}'", f"a file name that ends in {', '.join(accepted)}")
+        check_free_file(path, option, overwrite, [x for x in inputs if x is not None])
+
+
+def write_outputs(checked: Sequence[Checked], document: str | None, figure: str | None) -> None:
+    """Write all findings as JSON and an overview as a figure, each complete or not at all."""
+    if document is not None:
+        with appearing_whole(Path(document)) as new:
+            new.write_text(json.dumps(hygiene_document(checked), indent=1, allow_nan=False) + "\n")
+    if figure is not None:
+        with appearing_whole(Path(figure)) as new:
+            save_figure(hygiene_figure(checked), new, Path(figure).suffix[1:].lower())

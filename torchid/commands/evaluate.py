@@ -1,0 +1,96 @@
+"""`torchid evaluate`: the parameters of a finished run on logs it never saw."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
+from torchid.commands.reading import LogReader
+from torchid.commands.results import forces_of
+from torchid.config import load_config
+from torchid.errors import ConfigError, TorchidWarning, during
+from torchid.fitting.calibration import Calibration
+from torchid.fitting.cross_validation import Judge
+from torchid.fitting.experiment import Experiment, set_up
+from torchid.guards import MAX_YAML, read_bytes
+from torchid.problem import Evaluation, Metrics, RowBuilder
+from torchid.report.figures import error_figure, save_figure
+from torchid.report.parameter_files import read_parameters, read_shared_extras
+from torchid.report.tables import progress_bars
+
+
+def evaluate(
+    run: str | Path, logs: Sequence[str | Path], device: str | None = None
+) -> tuple[dict[str, tuple[Metrics, Metrics]], Path]:
+    """Evaluate nominal and identified parameters.
+
+    Results go to `RUN/evaluation/<name of the first log>` and replace an earlier evaluation of that name.
+
+    Args:
+        run: folder that `identify` wrote.
+        logs: log files, preprocessed as the run's own were.
+        device: where to compute; None: where the run did.
+
+    Returns:
+        Nominal and identified metrics by log name, and the folder they were written to.
+
+    Raises:
+        InputError: the folder is no run, or a log does not fit its robot.
+    """
+    folder = Path(run)
+    if not (folder / "config.yaml").is_file():
+        raise ConfigError(folder, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
+    names = [Path(log).stem for log in logs]
+    again = [name for name in names if names.count(name) > 1]
+    if again:
+        raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
+    output = folder / RUN.within / names[0]
+    refuse_link(output.parent)
+    check_free(output, True, EVALUATION, logs)
+    config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])
+    with progress_bars() as bars:
+        experiment = set_up(config, folder / "config.yaml")
+        robot = experiment.robot
+        both = _calibrations(experiment, folder / "parameters.json")
+        reading = bars.add_task("reading logs", total=len(logs))
+        reader = LogReader(experiment, folder)
+        samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
+        evaluation = Evaluation(robot, experiment.contacts, config.device, experiment.terms)
+        builder = RowBuilder(robot, experiment.contacts, experiment.sensors, experiment.terms).to(config.device)
+        judge = Judge(evaluation, builder)
+        evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
+        metrics = {}
+        for log in samples:
+            pair = judge.errors([log], both, lambda n: bars.advance(evaluating, n))
+            metrics[Path(log.source).stem] = pair
+            if not any(x is not None for x in pair[1].rms.values()):
+                message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
+                warnings.warn(message, TorchidWarning, stacklevel=2)
+        document: dict[str, dict[str, object]] = {
+            name: {"identified": after.as_dict(), "nominal": before.as_dict()}
+            for name, (before, after) in metrics.items()
+        }
+        for path, count in reader.excluded.items():
+            document[Path(path).stem]["excluded_samples"] = count
+        with during("writing", output), new_folder(output, True, EVALUATION) as new:
+            (new / "config.yaml").write_bytes(read_bytes(folder / "config.yaml", MAX_YAML))
+            write_json(new / "metrics.json", document)
+            save_figure(forces_of(evaluation, samples[0], both), new / "forces.png")
+            save_figure(error_figure(metrics), new / "errors.png")
+    return metrics, output
+
+
+def _calibrations(experiment: Experiment, path: Path) -> tuple[Calibration, Calibration]:
+    """Nominal and identified parameters of a `parameters.json`, each with the unknowns of all logs that suit them."""
+    robot, sensors = experiment.robot, experiment.sensors
+    phi = read_parameters(path, robot).flatten()
+    nominal, identified = (
+        {("", label): value for label, value in read_shared_extras(path, column).items()}
+        for column in ("nominal_value", "value")
+    )
+    return (
+        Calibration(experiment, sensors, robot.nominal.flatten(), nominal),
+        Calibration(experiment, sensors, phi, identified),
+    )

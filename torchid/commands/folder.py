@@ -1,0 +1,303 @@
+"""A folder of results that one run at a time claims, that appears complete or not at all, and replaces nothing else."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from torchid.commands.manifest import MANIFEST, Contents, FolderKind, inspect, manifest_of, read_manifest
+from torchid.errors import ConfigError
+from torchid.staging import NEW, OLD, interrupt_held_back, leftovers, note_written, staging
+from torchid.text import listed, shown
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Keep other processes that claim it from a folder that need not be there yet, until the block or this one ends.
+
+    Raises:
+        ConfigError: another process is at work there.
+    """
+    if fcntl is None:
+        yield
+        return
+    lock, handle = folder.with_name(f".{folder.name}.lock"), -1
+    with parents_of(folder):
+        try:
+            with interrupt_held_back():
+                handle = _locked(lock, folder)
+            yield
+        finally:
+            with interrupt_held_back():
+                if handle >= 0:
+                    lock.unlink(missing_ok=True)
+                    os.close(handle)
+
+
+def _locked(lock: Path, folder: Path) -> int:
+    """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
+    while True:
+        with creating(folder):
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(handle)
+            found, accepted = "another run is at work there", "another output, or patience"
+            raise ConfigError(folder, "output", found, accepted) from error
+        except OSError:  # a file system without locks: one run at a time is then the user's affair
+            return handle
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(handle), lock.stat()):
+                return handle
+        os.close(handle)  # who had it has just removed it
+
+
+EVENTS = "events.out.tfevents*"
+EVALUATION = FolderKind("an evaluation")
+RUN = FolderKind("a run", "evaluation", EVALUATION)
+TRAINING = FolderKind("a training", result=False)
+SIMULATION = FolderKind("a simulation")
+ANALYSIS = FolderKind("an analysis")
+STUDY = FolderKind("a study")
+
+_LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer
+_TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # by another run
+_TRIES = 100
+_MOST_NAMES = 50  # in one message
+
+
+def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: Iterable[object] = ()) -> None:
+    """Make sure, before any work, that a folder of a kind may be written; leftovers of killed processes go first.
+
+    Args:
+        output: the folder.
+        overwrite: whether one of its kind may be replaced.
+        kind: what it will be.
+        inputs: files and folders that the command reads.
+
+    Raises:
+        ConfigError: `output` exists and may not be replaced, or is no place for a folder.
+    """
+    try:
+        clear_leftovers(output, kind)
+        names = os.listdir(output) if output.is_dir() else []
+        above = next(path for path in output.absolute().parents if path.exists())
+        taken = output.is_symlink() or (output.exists() and not output.is_dir())
+    except (OSError, ValueError) as error:
+        raise ConfigError(output, "output", f"no name for a folder ({error})", "a path to a new folder") from error
+    if taken:
+        found = "a link" if output.is_symlink() else "a file of this name exists"
+        raise ConfigError(output, "output", found, "a folder that does not exist yet")
+    if output.name in ("", ".."):
+        raise ConfigError(output, "output", "no name for a folder", "a path to a new folder")
+    if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)) or len(os.fsencode(output.name)) > _LONGEST_NAME:
+        raise ConfigError(output, "output", f"no folder can be made there, in {above}", "a place that can be written")
+    if names and not overwrite:
+        raise ConfigError(output, "output", "not empty", "a new folder, or overwrite=true")
+    if names:
+        refuse_inputs(output, inputs)
+        replaceable(output, kind)
+
+
+def check_free_file(path: Path, field: str, overwrite: bool, inputs: Iterable[object]) -> None:
+    """Make sure, before any work, that a file may be written.
+
+    Args:
+        path: of the file.
+        field: of the command line that names it.
+        overwrite: whether a file there may be replaced.
+        inputs: files and folders that the command reads.
+
+    Raises:
+        ConfigError: it exists and may not be replaced, or there is no folder for it.
+    """
+    if os.path.lexists(path) and not (overwrite and os.path.isfile(path) and not os.path.islink(path)):
+        found = "a link" if os.path.islink(path) else "exists"
+        raise ConfigError(path, field, found, "a new file, or --overwrite in place of a file")
+    if not os.path.isdir(path.parent):
+        raise ConfigError(path, field, f"no folder {path.parent}", "a file in an existing folder")
+    for other in inputs:
+        one, of = os.path.realpath(path), os.path.realpath(str(other))
+        if os.path.lexists(path) and (one == of or one.startswith(of + os.sep)):
+            raise ConfigError(path, field, "is or belongs to what is read", "another file")
+
+
+def refuse_link(folder: Path) -> None:
+    """Make sure that a folder in which files are written and removed is none that lies elsewhere.
+
+    Raises:
+        ConfigError: it does.
+    """
+    if folder.is_symlink():
+        raise ConfigError(folder, "output", "a link", "a folder, or none")
+
+
+def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
+    """Make sure that a folder which will be replaced or removed holds nothing that the command reads.
+
+    Raises:
+        ConfigError: it does.
+    """
+    top = os.path.realpath(output)
+    for path in inputs:
+        place = os.path.realpath(str(path))
+        if os.path.lexists(str(path)) and place.startswith(top + os.sep):
+            found = f"holds {shown(os.path.relpath(place, top))}, which is an input"
+            raise ConfigError(output, "output", found, "another output, or inputs that lie elsewhere")
+
+
+def replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> Contents:
+    """What is in a folder that torchid wrote, and nobody else.
+
+    Args:
+        folder: to be replaced or removed.
+        kind: that it should be of.
+        output: its name in messages, if another.
+
+    Raises:
+        ConfigError: something in it is not torchid's, or has changed since.
+    """
+    output = output or folder
+    try:
+        found, names = inspect(folder, kind), [shown(name) for name in sorted(os.listdir(folder))]
+    except OSError as error:
+        raise ConfigError(output, "output", f"cannot be read ({error})", "a new folder") from error
+    if found is None and (other := read_manifest(folder)):
+        accepted = f"a new folder, or {kind.name} to overwrite"
+        raise ConfigError(output, "output", f"holds {shown(other.kind)}", accepted)
+    if found is None:
+        what = f"holds {listed(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
+        accepted = f"a new folder, or {kind.name} to overwrite; one that an older version wrote is for you to remove"
+        raise ConfigError(output, "output", what, accepted)
+    complaints = [f"{listed(found.foreign, _MOST_NAMES)}, which torchid did not write"] if found.foreign else []
+    complaints += [f"{listed(found.changed, _MOST_NAMES)}, changed since torchid wrote it"] if found.changed else []
+    closed = [str(path) for path in found.folders if not os.access(path, os.W_OK | os.X_OK)]
+    complaints += [f"{listed(closed)}, where nothing can be removed"] if closed and not complaints else []
+    if complaints:
+        accepted = f"a new folder, or {kind.name} to overwrite; move elsewhere what is yours"
+        raise ConfigError(output, "output", f"holds {' and '.join(complaints)}", accepted)
+    return found
+
+
+def clear_leftovers(output: Path, kind: FolderKind) -> None:
+    """Remove what killed processes left of folders that were to become `output`; what one had moved aside comes back.
+
+    Raises:
+        OSError: it cannot be moved back.
+    """
+    for folder in leftovers(output):
+        if not os.path.lexists(folder / OLD):
+            continue
+        if not os.path.lexists(output):
+            (folder / OLD).rename(output)
+            continue
+        if found := inspect(folder / OLD, kind):
+            found.remove()
+        for place, _, _ in os.walk(folder / OLD, topdown=False):  # the process was killed after their manifests went
+            with suppress(OSError):
+                os.rmdir(place)
+
+
+def write_json(path: Path, document: object) -> None:
+    """Write strict JSON: a number that is not finite is an error, not a NaN in the file."""
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+@contextmanager
+def new_folder(
+    output: Path, overwrite: bool = False, kind: FolderKind = RUN, growing: Sequence[str] = ()
+) -> Iterator[Path]:
+    """A temporary folder beside `output` that takes its place, with a manifest, when the block ends without an error.
+
+    Of several at a time the first takes the place, or, with `overwrite`, the last.
+
+    Args:
+        output: the folder to be.
+        overwrite: whether one of its kind may be replaced.
+        kind: of the folder.
+        growing: patterns of files in it that are written on later.
+
+    Raises:
+        ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
+    """
+    check_free(output, overwrite, kind)
+    with parents_of(output), ExitStack() as stack:
+        with creating(output):
+            folder = stack.enter_context(staging(output))
+            (folder / NEW).mkdir()
+        yield folder / NEW
+        manifest_of(folder / NEW, kind, output.name, growing).write(folder / NEW)
+        with interrupt_held_back():
+            _put(folder, output, overwrite, kind)
+            if kind.result:
+                note_written(output)
+
+
+@contextmanager
+def parents_of(output: Path) -> Iterator[None]:
+    """The folders above `output`, which go with the block if they came with it and it leaves nothing in them."""
+    made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
+    try:
+        with interrupt_held_back(), creating(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        with interrupt_held_back(), suppress(OSError):  # a run is in it, this one or another
+            for folder in made:
+                folder.rmdir()
+
+
+@contextmanager
+def creating(output: Path) -> Iterator[None]:
+    """Say in one line that something cannot be made beside `output`."""
+    try:
+        yield
+    except OSError as error:
+        found = f"no folder can be made there ({error.strerror})"
+        raise ConfigError(output, "output", found, "a place that can be written") from error
+
+
+def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
+    """Rename the new folder in a staging folder; what stood there, perhaps another run that ended meanwhile, goes."""
+    for _ in range(_TRIES):
+        if _renamed(folder / NEW, output):
+            return
+        check_free(output, overwrite, kind)
+        try:
+            output.rename(folder / OLD)
+        except FileNotFoundError:  # taken away by another that replaces it
+            continue
+        except OSError as error:
+            raise ConfigError(output, "output", f"cannot be replaced ({error.strerror})", "a new folder") from error
+        try:
+            found = replaceable(folder / OLD, kind, output)  # where nobody puts anything any more
+            done = _renamed(folder / NEW, output)
+        except BaseException:
+            with suppress(OSError):
+                (folder / OLD).rename(output)
+            raise
+        found.remove()
+        if done:
+            return
+    raise ConfigError(output, "output", "other runs take the place again and again", "another output")
+
+
+def _renamed(folder: Path, name: Path) -> bool:
+    """Whether the name was free, or that of an empty folder."""
+    try:
+        folder.rename(name)
+    except OSError as error:
+        if error.errno in _TAKEN:
+            return False
+        raise
+    return True

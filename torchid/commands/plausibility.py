@@ -1,0 +1,205 @@
+"""The stop for fits that no robot can have left, and what the checks of the training logs say of the reason."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+
+from torchid import parameters
+from torchid.commands.check import log_to_check
+from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError
+from torchid.fitting.experiment import Scene
+from torchid.fitting.fit import Fit
+from torchid.identifiability.confounding import TotalMass, total_mass
+from torchid.log_checks import Finding
+from torchid.log_checks.check import check
+from torchid.log_checks.findings import SEVERITIES
+from torchid.parameters import PARAMETERS, PER_BODY, Array
+from torchid.problem import LinearProblem
+from torchid.problem.chunks import one_thread
+from torchid.problem.metrics import ADVICE, Worse, verdict
+from torchid.robot import Robot
+
+OFF = 10.0
+"""Factor that no model of a robot is off by: units are by a thousand, a gear by 50 to 160."""
+
+_GRAVITY = 9.81  # m/s^2
+_CLEAR = (
+    0.5  # correlation of the forces of the URDF's bodies with the measured ones, from which on their factor is clear
+)
+
+
+def implausible(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:
+    """In words what a sane person would not print of fitted parameters, None if nothing.
+
+    What the data do not determine is no reason: it is not printed as a result.
+
+    Args:
+        problem: that was solved.
+        phi: (12 L,), its solution.
+        mass: how well the total mass is known.
+        robot: the robot.
+    """
+    gain = force_gain(problem)
+    if mass.determined and absurd(mass.value / mass.nominal):
+        known = f"{mass.value:.4g} ± {mass.standard_error:.2g} kg where the URDF weighs {mass.nominal:.4g} kg"
+        return f"the fit's total mass is {known}{_told(mass.value / mass.nominal)}"
+    if gain is not None and absurd(gain):
+        return f"the measured forces are {gain:.3g} times what the URDF's bodies need{_told(gain)}"
+    return next(_beyond_bounds(phi.reshape(-1, PER_BODY), robot), None)
+
+
+def absurd(ratio: float) -> bool:
+    """Whether what was found cannot be so many times what the URDF says."""
+    return not 1.0 / OFF <= ratio <= OFF
+
+
+def _told(ratio: float) -> str:
+    return ", the opposite sign" if ratio < 0.0 else ""
+
+
+@one_thread()
+def force_gain(problem: LinearProblem) -> float | None:
+    """The factor of the forces that nominal bodies need which fits best, None if it is not clear.
+
+    Friction is whatever fits. Unlike a total mass it is there for arms as well, and does not depend on the estimator.
+    """
+    inertial = np.zeros((len(problem.nominal) // PER_BODY, PER_BODY), dtype=bool)
+    inertial[:, parameters.INERTIAL] = True
+    chosen = inertial.flatten()
+    needed = problem.A[:, chosen] @ problem.nominal[chosen]
+    free, fixed = ~chosen & problem.free, ~chosen & ~problem.free
+    measured = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
+    U, values, _ = np.linalg.svd(problem.A[:, free] * problem.scale[free], full_matrices=False)
+    friction = U[:, values > 1e-10 * values.max(initial=0.0)]
+    needed, measured = (x - friction @ (friction.T @ x) for x in (needed, measured))
+    size = np.linalg.norm(needed) * np.sqrt(measured @ measured + problem.residual)
+    if not size > 0.0 or abs(needed @ measured) < _CLEAR * size:
+        return None
+    return float(needed @ measured / (needed @ needed))
+
+
+def _beyond_bounds(phi: Array, robot: Robot) -> Iterator[str]:
+    """Parameters, (L, 12), that are beyond what `OFF` whole robots at full reach could make of one body."""
+    total = float(robot.nominal[:, parameters.MASS].sum())
+    reach = _reach(robot)
+    bound = np.empty(PER_BODY)
+    bound[parameters.MASS], bound[parameters.FIRST_MOMENT] = total, total * reach
+    bound[parameters.INERTIA], bound[parameters.FRICTION] = total * reach**2, total * _GRAVITY * max(reach, 1.0)
+    beyond = ~(np.abs(phi) <= OFF * np.maximum(bound, np.abs(robot.nominal)))
+    for body, parameter in np.argwhere(beyond):
+        found = f"{robot.body_names[body]} has {PARAMETERS[parameter]} = {phi[body, parameter]:.3g}"
+        yield f"the fit's {found}, beyond {OFF:g} times the whole URDF's {bound[parameter]:.3g}"
+
+
+def _reach(robot: Robot) -> float:
+    """Length of the longest chain of bodies [m], with the size of its last."""
+    mass = np.maximum(robot.nominal[:, parameters.MASS], np.finfo(float).tiny)
+    radius = np.sqrt(np.maximum(np.trace(parameters.inertia_matrix(robot.nominal), axis1=1, axis2=2) / 2.0 / mass, 0.0))
+    radius[robot.nominal[:, parameters.MASS] <= 0.0] = 0.0
+    away = np.zeros(len(robot.bodies))
+    for number, body in enumerate(robot.bodies):
+        if body.joint is not None:
+            away[number] = away[body.parent] + np.linalg.norm(body.joint.T_parent_joint[:3, 3])
+    return float((away + radius).max())
+
+
+_UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
+_SHARE = 0.5  # and of the weighted forces, where the noise was estimated to be as large; recorded logs stay below 0.35
+_GENERAL = ("forces", "weight")  # findings that say that something is off rather than what
+_PART = 0.05  # share of a log's samples from which on a finding may be the reason
+_USUAL = (
+    "torques or wrenches of the opposite sign, a world whose z axis points down, flags of other contacts, a quaternion "
+    "in another order, another unit, or masses in the URDF that are no masses"
+)
+
+
+def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
+    """Stop at a fit that no robot can have left, and warn of one that leaves much more than the stated noise.
+
+    Returns:
+        How well the total mass is known.
+
+    Raises:
+        SensorError: no parameter is in reach of the sensors.
+        ImplausibleFitError: parameters that nobody would print, or forces that no parameters explain in a log that
+            the checks condemn.
+
+    Warns:
+        NumericalWarning: forces that no parameters explain, for whatever reason.
+    """
+    estimate = fit.estimate
+    if not estimate.rank:
+        raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
+    mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance)
+    absurd = implausible(fit.assembly.problem, estimate.phi, mass, scene.robot)
+    unexplained = _unexplained(fit)
+    if absurd is None and unexplained is None:
+        return mass
+    log, finding = next(_findings(scene), (None, None))
+    if finding is not None and (absurd is not None or finding.condemns_all):
+        told = f"{log}: {finding.field}: {finding.found}"
+        raise ImplausibleFitError(
+            source, "logs", f"{absurd or unexplained}; torchid check finds in {told}", finding.advice
+        )
+    if absurd is not None:
+        raise ImplausibleFitError(source, "logs", absurd, f"data and URDF that fit each other; usual reasons: {_USUAL}")
+    named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
+    advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
+    warnings.warn(f"{source}: {unexplained}{named}; {advice}", NumericalWarning, stacklevel=3)
+    return mass
+
+
+def check_not_worse(found: list[Worse], scene: Scene, source: object) -> None:
+    """Stop where the URDF's parameters predict better and the checks condemn a training log; else say so.
+
+    Raises:
+        ImplausibleFitError: the parameters of a log that is not usable.
+
+    Warns:
+        NumericalWarning: the URDF's parameters predict better, for whatever reason.
+    """
+    if not found:
+        return
+    told, advice = verdict(found), ADVICE
+    log, finding = next(_findings(scene), (None, None))
+    if finding is not None:
+        told, advice = f"{told}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
+        if finding.condemns_all:
+            raise ImplausibleFitError(source, "logs", told, advice)
+    warnings.warn(f"{source}: {told}; {advice}", NumericalWarning, stacklevel=3)
+
+
+def _unexplained(fit: Fit) -> str | None:
+    """In words how much more than noise the best parameters leave, None if they do not."""
+    estimate, problem = fit.estimate, fit.assembly.problem
+    left = np.sqrt(estimate.cost / max(estimate.rows, 1))  # not corrected for the fit, which may be far from the best
+    if left > _UNEXPLAINED:
+        return f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
+    share = np.sqrt(estimate.cost / max(problem.cost(np.zeros_like(estimate.phi)), np.finfo(float).tiny))
+    if share > _SHARE:
+        return f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
+    return None
+
+
+def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
+    """What training logs suffer from as a whole or in a good part, the most telling first."""
+    files = scene.config.logs
+    if files is None:
+        return
+    found = []
+    for path in files.train:
+        try:
+            log = log_to_check(path, files.topics, scene.config.preprocessing)
+            checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
+        except InputError:  # larger than memory: nothing is known of it
+            continue
+        grave = (one for one in checked.findings if one.severity in SEVERITIES[:2])
+        found += [(path.name, one) for one in grave if one.mask(len(checked.log)).mean() > _PART]
+    yield from sorted(found, key=lambda pair: _order(pair[1]))
+
+
+def _order(finding: Finding) -> tuple[bool, int, bool]:
+    return not finding.whole, SEVERITIES.index(finding.severity), finding.name in _GENERAL

@@ -1,0 +1,281 @@
+"""Logs on their way from files to a robot's samples, block by block where they are larger than memory."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid.config.experiment import PreprocessingConfig
+from torchid.errors import LogError
+from torchid.fitting.experiment import Scene
+from torchid.log_checks import Checked, without_condemned
+from torchid.log_checks.check import check
+from torchid.logs import Log, read_log
+from torchid.logs.blocks import GIGABYTE, Blocks, counted_from, open_blocks, size_of
+from torchid.logs.containers import Kind, kind_to_read
+from torchid.logs.log import WRENCHES, BoolArray, FloatArray
+from torchid.logs.preprocess import (
+    Coverage,
+    away_from_changes,
+    check_coverage,
+    differentiates,
+    gapless_fields,
+    on_timeline,
+    preprocess,
+    timeline_of,
+    unloaded,
+    unloaded_readings,
+)
+from torchid.logs.spill import Spill
+from torchid.logs.timeline import BLOCK, Timeline
+from torchid.problem import Samples, bind
+from torchid.problem.base_motion import BaseMotion
+from torchid.problem.samples import check_forces, oversampling
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorSet
+
+_COPIES = 16  # a block takes so many times the memory of its recorded arrays: derivatives, splines, bound tensors
+
+
+@dataclass(frozen=True)
+class LargeLog:
+    """A log whose samples go to a disk on their way to a robot.
+
+    Attributes:
+        path: its file.
+        settings: of preprocessing.
+        robot: whose log it is.
+        contacts: in use.
+        required: sensors whose every value must be there, None if gaps are allowed.
+        folder: where there is room.
+    """
+
+    path: Path
+    settings: PreprocessingConfig
+    robot: Robot
+    contacts: Sequence[Contact]
+    required: SensorSet | None
+    folder: Path
+
+    def samples(self) -> Samples:
+        """What reading, preprocessing and binding the log as a whole would give, on the disk.
+
+        Raises:
+            InputError: as `read_log`, `preprocess` and `bind` would, or the disk is full.
+
+        Warns:
+            TorchidWarning: as `preprocess` would.
+        """
+        with open_blocks(self.path, self.folder) as blocks:
+            first, settings = blocks.read(slice(0, min(len(blocks), 2))), self.settings
+            derived = differentiates(first)
+            timeline = timeline_of(blocks.source, blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
+            coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
+            time = blocks.time if timeline is None else blocks.time[0] + timeline.at
+            contacts = self._contacts(blocks, first)
+            kept = None if contacts is None else self._away_from_changes(contacts, time)
+            in_the_air = None if contacts is None else _in_the_air(contacts)
+            stored = _Stored(blocks.source, self.folder)
+            for piece in self._pieces(blocks, len(time)):
+                samples = self._bound(_preprocessed(blocks, piece, timeline, coverage, in_the_air), piece)
+                if in_the_air is None:
+                    samples = replace(samples, unloaded=None)
+                stored.add(samples, None if kept is None else np.flatnonzero(kept[piece]))
+            bandwidth = None if timeline is None else timeline.bandwidth_hz
+            return stored.samples(samples, oversampling(time, bandwidth))
+
+    def _pieces(self, blocks: Blocks, count: int) -> Iterator[slice]:
+        """The samples of a log, or of what becomes of them, in parts that fit into memory."""
+        rows = self.settings.memory_gb * GIGABYTE / (_COPIES * blocks.row_bytes) * count / len(blocks)
+        step = max(BLOCK, int(rows))
+        for start in range(0, count, step):
+            yield slice(start, min(start + step, count))
+
+    def _coverage(self, blocks: Blocks, first: Log, timeline: Timeline) -> dict[str, Coverage]:
+        """Which channels were measured throughout, which takes a pass over the log."""
+        found = {name: Coverage.of(getattr(first, name).shape[1:]) for name in gapless_fields(first, timeline)}
+        for piece in self._pieces(blocks, len(blocks)) if found else ():
+            log = blocks.read(piece, only=(*found, "contact_active"))
+            for name, coverage in found.items():
+                coverage.add(getattr(log, name), log.contact_active if name in WRENCHES else None)
+        for name, coverage in found.items():
+            check_coverage(first, name, coverage)
+        return found
+
+    def _contacts(self, blocks: Blocks, first: Log) -> Log | None:
+        """The log with nothing but the contacts' flags, which takes a pass over it; None if there are none."""
+        if first.contact_active is None:
+            return None
+        flags = [
+            blocks.read(piece, only=("contact_active",)).contact_active for piece in self._pieces(blocks, len(blocks))
+        ]
+        nothing = np.empty((len(blocks), 0))
+        active = np.concatenate([x for x in flags if x is not None])
+        return Log(blocks.source, blocks.time, (), nothing, contact_names=first.contact_names, contact_active=active)
+
+    def _away_from_changes(self, contacts: Log, time: FloatArray) -> BoolArray | None:
+        """Which samples are further than the margin from changes of contact, None for all."""
+        margin = self.settings.contact_margin_s
+        return None if margin is None else away_from_changes(contacts, time, margin)
+
+    def _bound(self, log: Log, piece: slice) -> Samples:
+        """The samples of a part; errors count from the beginning."""
+        samples = bind(log, self.robot, self.contacts)
+        if self.required is not None:
+            try:
+                check_forces(samples, self.robot, self.contacts, self.required)
+            except LogError as error:
+                raise counted_from(piece.start, error) from error
+        return samples
+
+
+def _in_the_air(contacts: Log) -> BoolArray | None:
+    """Which contacts are in the air for sure in which samples of the log, None if none ever is."""
+    if contacts.contact_active is None:
+        return None
+    found = unloaded(contacts.time, contacts.contact_active)
+    return found if found.any() else None
+
+
+def _preprocessed(
+    blocks: Blocks,
+    piece: slice,
+    timeline: Timeline | None,
+    coverage: Mapping[str, Coverage],
+    in_the_air: BoolArray | None,
+) -> Log:
+    """A part of the preprocessed log."""
+    samples, part = (piece, None) if timeline is None else timeline.part(piece.start, piece.stop)
+    log = blocks.read(samples)
+    if in_the_air is not None:
+        log = replace(log, contact_unloaded=unloaded_readings(log, in_the_air[samples]))
+    return log if part is None else on_timeline(log, part, coverage)
+
+
+class _Stored:
+    """Tensors of the samples of one log, by name and whether they are the base's, that grow part by part."""
+
+    def __init__(self, source: str, folder: Path) -> None:
+        self._folder = folder
+        self._spills: defaultdict[tuple[str, bool], Spill] = defaultdict(partial(Spill, source, folder))
+
+    def add(self, samples: Samples, kept: np.ndarray | None) -> None:
+        """Add samples, or those of some numbers."""
+        for part, of_base in ((samples, False), (samples.base, True)):
+            for name, x in vars(part).items():
+                if isinstance(x, Tensor):
+                    values = x.numpy()
+                    self._spills[name, of_base].append(values if kept is None else values[kept])
+
+    def samples(self, like: Samples, oversampling: float) -> Samples:
+        """All of them, with whatever else belongs to samples `like` the last ones."""
+        own: dict[str, Any] = {}
+        base: dict[str, Tensor] = {}
+        for (name, of_base), spill in self._spills.items():
+            (base if of_base else own)[name] = torch.from_numpy(spill.array())
+        return replace(like, base=BaseMotion(**base), oversampling=oversampling, folder=self._folder, **own)
+
+
+def gigabytes(path: Path, memory_gb: float, held: float = 0.0) -> float:
+    """What the arrays of a log take together with those that are held [GB]; at most that, where that is in `memory_gb`.
+
+    A bag counts as nothing: its size is known when it has been read.
+
+    Raises:
+        LogError: the file cannot be read.
+    """
+    return held + size_of(path, GIGABYTE * (memory_gb - held)) / GIGABYTE
+
+
+def _folder_beside(output: Path) -> Path:
+    """The folder that a run goes to, or the nearest above it that exists already."""
+    return next((folder for folder in output.absolute().parents if folder.is_dir()), Path.cwd())
+
+
+class LogReader:
+    """Reads, preprocesses and binds logs; each on its own, so that nothing is differentiated across a seam.
+
+    Logs whose arrays together take more than the memory they may take are kept on the disk from then on, all but bags.
+
+    Attributes:
+        scene: robot, contacts and settings.
+        folder: on whose disk logs are kept.
+        excluded: how many samples of each log were left out because they are condemned, by path.
+    """
+
+    def __init__(self, scene: Scene, folder: Path | None = None) -> None:
+        """Nothing is read yet; without a `folder` it is the one that the output of the scene goes to."""
+        self.scene = scene
+        self.folder = _folder_beside(scene.config.output) if folder is None else folder
+        self.excluded: dict[str, int] = {}
+        self._held = 0.0  # arrays of logs in memory [GB]
+
+    def read(
+        self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
+    ) -> list[Samples]:
+        """The samples of log files.
+
+        Args:
+            paths: log files.
+            required: sensors that must have been recorded.
+            on_read: called after each file.
+
+        Raises:
+            LogError: a file that cannot be read, or does not fit the robot.
+        """
+        limit, logs = self.scene.config.preprocessing.memory_gb, []
+        for path in paths:
+            together = gigabytes(path, limit, self._held)
+            if kind_to_read(path) is Kind.BAG:
+                logs.append(self._small(path, required))
+                self._held += logs[-1].nbytes / GIGABYTE
+            elif together <= limit:
+                logs.append(self._small(path, required))
+                self._held = together
+            else:
+                logs.append(self._large(path, required, together))
+            if on_read is not None:
+                on_read(path)
+        return logs
+
+    def _small(self, path: Path, required: SensorSet | None) -> Samples:
+        """A log that fits into memory."""
+        settings, files = self.scene.config.preprocessing, self.scene.config.logs
+        topics = None if files is None else files.topics
+        recorded = read_log(path, topics, allow_gaps=settings.exclude_condemned)
+        checked = self._checked(recorded)
+        clean = recorded if checked is None else checked.repaired
+        log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
+        samples = bind(log, self.scene.robot, self.scene.contacts, required)
+        if checked is not None:
+            count = len(samples)
+            samples = without_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
+            self.excluded[str(path)] = count - len(samples)
+        if settings.contact_margin_s is None:
+            return samples
+        kept = away_from_changes(recorded, samples.time.numpy(), settings.contact_margin_s)
+        return samples if kept is None else samples[torch.from_numpy(np.flatnonzero(kept))]
+
+    def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
+        """A log that does not, with those before it [GB]."""
+        settings = self.scene.config.preprocessing
+        if settings.exclude_condemned:
+            found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
+            accepted = f"a preprocessing.memory_gb above {together:.2g}, or parts of the logs that torchid check passes"
+            raise LogError(path, "preprocessing.exclude_condemned", found, accepted)
+        return LargeLog(path, settings, self.scene.robot, self.scene.contacts, required, self.folder).samples()
+
+    def _checked(self, log: Log) -> Checked | None:
+        """What the checks of a log say, if condemned samples are to be left out."""
+        settings = self.scene.config.preprocessing
+        if not settings.exclude_condemned:
+            return None
+        return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz)

@@ -1,0 +1,286 @@
+"""What a finished identification holds, and the folder it is written to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from torchid.commands.folder import new_folder, write_json
+from torchid.commands.training import Training, body_eigenvalues
+from torchid.config import ExperimentConfig, dump_config
+from torchid.errors import during
+from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
+from torchid.fitting.calibration import Calibration
+from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
+from torchid.fitting.experiment import Experiment
+from torchid.fitting.noise import NoiseSummary
+from torchid.fitting.robust import RobustSummary
+from torchid.identifiability.confounding import ExtraEstimate, TotalMass
+from torchid.identifiability.contributions import Contributions
+from torchid.identifiability.rank import StateReport
+from torchid.parameters import PER_BODY, Array
+from torchid.problem import Evaluation, Metrics, Samples
+from torchid.problem.metrics import SETS, WHITENED, Worse, verdict, worse_than_nominal
+from torchid.problem.predict import force_series
+from torchid.report import identified_urdf, parameters_document
+from torchid.report.figures import (
+    ForceSeries,
+    contribution_figure,
+    error_figure,
+    extra_figure,
+    force_figure,
+    identifiability_figure,
+    parameter_figure,
+    save_figure,
+)
+from torchid.report.tables import table_text, verdict_counts_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+from torchid.report.tensorboard import RunEvents
+
+_PLOTTED_SAMPLES = 3000
+LEFT_OUT = "blocks left out of the fit"
+"""How tables call the training samples that cross-validation predicts."""
+
+
+@dataclass(frozen=True)
+class Identification:
+    """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
+
+    `extras`: unknowns beside the bodies' parameters. `noise`: what rows were weighed with. `robust`: how outliers were
+    weighed down, if so. `mass`: how well the total mass is known. `excluded`: condemned samples left out, by log.
+    `adds`: what each training log, contact state and sensor adds. `validation`: None where the samples are too few to
+    leave some out. `ridge`: how it was chosen, if it was.
+    """
+
+    experiment: Experiment
+    estimate: Estimate
+    extras: list[ExtraEstimate]
+    noise: NoiseSummary
+    robust: RobustSummary | None
+    states: list[StateReport]
+    by_state: dict[str, Estimate]
+    adds: Contributions
+    metrics: dict[str, tuple[Metrics, Metrics]]
+    violations: list[Violation]
+    seconds: dict[str, float]
+    samples: int
+    excluded: Mapping[str, int]
+    mass: TotalMass
+    validation: CrossValidation | None
+    ridge: RidgeChoice | None
+
+    def violations_by_name(self) -> list[dict[str, object]]:
+        """Conditions that the identified parameters break, the body by its name."""
+        names = self.experiment.robot.body_names
+        return [asdict(x) | {"body": None if x.body is None else names[x.body]} for x in self.violations]
+
+    @cached_property
+    def worse(self) -> list[Worse]:
+        """Groups of rows where the URDF predicts better, on blocks left out of the fit or on the test logs."""
+        sets = {} if self.validation is None else {LEFT_OUT: (self.validation.nominal, self.validation.identified)}
+        return worse_than_nominal(sets | ({"test logs": self.metrics["test"]} if "test" in self.metrics else {}))
+
+    def state_entries(self) -> list[dict[str, object]]:
+        """Contact states, with what each of them adds."""
+        adds = {state.name: asdict(state) for state in self.adds.states}
+        return [asdict(state) | adds[state.name] for state in self.states]
+
+    @property
+    def phi(self) -> Array:
+        """Identified parameters, (L, 12)."""
+        return self.estimate.phi.reshape(-1, PER_BODY)
+
+
+def write_run(
+    run: Identification,
+    evaluation: Evaluation,
+    shown: Samples,
+    both: tuple[Calibration, Calibration],
+    training: Training | None,
+) -> None:
+    """Write the run folder.
+
+    Args:
+        run: what to write.
+        evaluation: for the predicted forces.
+        shown: log of the figure of forces, as recorded.
+        both: nominal and identified parameters, with the unknowns that suit them.
+        training: whose curves go into the folder, and whose checkpoint is then no longer needed.
+    """
+    config, robot = run.experiment.config, run.experiment.robot
+    figures = {
+        "forces": forces_of(evaluation, shown, both),
+        "errors": error_figure(run.metrics),
+        "parameters": parameter_figure(
+            robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
+        ),
+        "identifiability": identifiability_figure(robot.body_names, run.estimate),
+        "contributions": contribution_figure(_bits(run.adds)),
+    }
+    if run.extras:
+        figures["extras"] = extra_figure(run.extras)
+    with during("writing", config.output), new_folder(config.output, config.overwrite) as folder:
+        (folder / "config.yaml").write_text(dump_config(config))
+        write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
+        write_json(folder / "metrics.json", metrics_document(run))
+        (folder / "identified.urdf").write_bytes(identified_urdf(robot, run.phi))
+        for name, figure in figures.items():
+            save_figure(figure, folder / f"{name}.png")
+        if training is not None:
+            training.copy_curves(folder)
+        _write_curves(run, folder, {name: folder / f"{name}.png" for name in figures})
+    if training is not None:
+        training.forget()
+
+
+def forces_of(evaluation: Evaluation, samples: Samples, both: tuple[Calibration, Calibration]) -> Figure:
+    """The figure of forces of a log's first samples: nominal, identified, and measured as the latter calibrates it.
+
+    Each prediction is as far from what was measured as from readings that are calibrated for it.
+    """
+    measured, predicted = [], []
+    for one in both:
+        (read,) = one.logs([samples])
+        part = read[:_PLOTTED_SAMPLES]
+        readings, (forces,) = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
+        measured.append(readings)
+        predicted.append(forces)
+    robot, nominal = evaluation.robot, predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured
+    series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured[1], nominal, predicted[1])
+    return force_figure(series, robot.dof_names, robot.base_rows)
+
+
+def metrics_document(run: Identification) -> dict[str, object]:
+    """What `metrics.json` holds: errors of the identified parameters, and of the nominal ones beside them."""
+    estimate, robot = run.estimate, run.experiment.robot
+    document: dict[str, object] = {}
+    for name in SETS:
+        pair = run.metrics.get(name)
+        document[name] = None if pair is None else pair[1].as_dict()
+        document[f"{name}_nominal"] = None if pair is None else pair[0].as_dict()
+    variation = {name: pair[1].base_force_of_variation for name, pair in run.metrics.items()}
+    return document | {
+        "base_force_rms_of_variation": variation,
+        "rank": estimate.rank,
+        "parameters": int(estimate.phi.size),
+        "condition_number": estimate.condition_number if estimate.rank else None,
+        "samples": run.samples,
+        "excluded_samples": run.excluded,
+        "rows": estimate.rows,
+        "residual_std": estimate.residual_std,
+        "total_mass": run.mass.value if run.mass.determined else None,
+        "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
+        "total_mass_told_from_offsets": run.mass.told_apart,
+        "total_mass_nominal": float(robot.nominal[:, 0].sum()),
+        "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
+        "noise": {"groups": [asdict(one) for one in run.noise.groups], "suggested": run.noise.suggested},
+        "robust": None if run.robust is None else asdict(run.robust),
+        "violations": run.violations_by_name(),
+        "solution": _solution_document(estimate),
+        "cross_validation": _validation_document(run),
+        "ridge_selection": None if run.ridge is None else asdict(run.ridge),
+        "worse_than_nominal": [asdict(one) for one in run.worse],
+        "verdict": verdict(run.worse),
+        "contact_states": run.state_entries(),
+        "identifiability": _identifiability_document(run),
+        "seconds": run.seconds,
+    }
+
+
+def _validation_document(run: Identification) -> dict[str, object] | None:
+    """Errors on blocks of the training logs of what was fitted without them."""
+    found = run.validation
+    if found is None:
+        return None
+    return {"folds": found.folds, "nominal": found.nominal.as_dict(), "identified": found.identified.as_dict()}
+
+
+def _identifiability_document(run: Identification) -> dict[str, object]:
+    """What the data determine, and what each log and sensor adds; contact states have a list of their own."""
+    estimate, adds = run.estimate, run.adds
+    return {
+        "singular_values": estimate.singular_values.tolist(),
+        "condition_number": estimate.condition_number if estimate.rank else None,
+        "oversampling": estimate.oversampling,
+        **asdict(adds.known),
+        "verdicts": estimate.verdict_counts(),
+        "logs": [asdict(log) for log in adds.logs],
+        "sensors": [asdict(sensor) for sensor in adds.sensors],
+    }
+
+
+def _bits(adds: Contributions) -> dict[str, list[tuple[str, float]]]:
+    """Names and bits, by kind."""
+    return {
+        "logs": [(Path(log.name).name, log.bits) for log in adds.logs],
+        "contact states": [(state.name, state.bits) for state in adds.states],
+        "sensors": [(sensor.name, sensor.bits) for sensor in adds.sensors],
+    }
+
+
+def _solution_document(estimate: Estimate) -> dict[str, object] | None:
+    """What is known of the optimum, or of the descent."""
+    if not isinstance(estimate, BoundEstimate):
+        return None
+    names = ("objective", "unconstrained", "distance", "gap", "certified_gap", "steps", "epochs", "best_epoch")
+    return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}
+
+
+def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]) -> None:
+    estimate, robot, config = run.estimate, run.experiment.robot, run.experiment.config
+    epochs = estimate.epochs if isinstance(estimate, SgdEstimate) else None
+    last = 1 if epochs is None else epochs
+    with RunEvents(folder, robot.body_names, epochs is not None) as events:
+        if epochs is None:
+            for step, phi in enumerate((robot.nominal.flatten(), estimate.phi)):
+                events.errors(step, {name: pair[step] for name, pair in run.metrics.items()})
+                events.eigenvalues(step, body_eigenvalues(robot, phi))
+            events.solution(estimate, run.samples / run.seconds["compress"])
+        else:  # what was not worked out by epoch
+            for step, which in ((0, 0), (epochs, 1)):
+                events.errors(step, {name: pair[which] for name, pair in run.metrics.items()}, (WHITENED,))
+        if run.validation is not None:
+            events.errors(0, {"left_out": run.validation.nominal})
+            events.errors(last, {"left_out": run.validation.identified})
+        events.verdict(last, verdict(run.worse) or "nowhere worse than the URDF's parameters")
+        events.fit(last, estimate)
+        events.identifiability(last, estimate, run.adds.known, table_text(verdict_counts_table(run.by_state, estimate)))
+        final = {
+            f"{name}_{group}": value
+            for name in reversed(SETS)  # unseen logs first: TensorBoard shows the first few
+            if name in run.metrics
+            for group, value in run.metrics[name][1].relative.items()
+            if value is not None
+        }
+        price = estimate.relative_price if isinstance(estimate, BoundEstimate) else 0.0
+        final |= {"rank": float(estimate.rank)} | ({} if price is None else {"objective_above_least": price})
+        events.close_with(dump_config(config), _hyperparameters(config), final, figures, last)
+
+
+def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
+    """The same keys for every estimator: TensorBoard compares runs by the keys of the first that it finds."""
+    estimator, training = config.estimator, config.estimator.training
+    descent = estimator.name == "sgd"
+    return {
+        "sensors": config.sensors.set or "by name",
+        "estimator": estimator.name,
+        "ridge": estimator.pull,
+        "friction": estimator.friction,
+        "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
+        "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,
+        "prior": estimator.prior,
+        "consistency": estimator.consistency if descent else estimator.name,
+        "optimizer": training.optimizer["name"] if descent else "none",
+        "lr": float(training.optimizer.get("lr", 0.0)) if descent else 0.0,
+        "schedule": (training.schedule or {}).get("name", "none") if descent else "none",
+        "batch_size": training.batch_size if descent else 0,
+        "epochs": training.epochs if descent else 0,
+        "seed": training.seed if descent else 0,
+    }

@@ -1,0 +1,120 @@
+"""`torchid simulate`: from a simulation file to logs, in one process per core."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import asdict
+from multiprocessing.sharedctypes import Synchronized
+from pathlib import Path
+
+import numpy as np
+
+from torchid import parameters
+from torchid.commands.folder import SIMULATION, check_free, new_folder, write_json
+from torchid.config import MotionConfig, NominalConfig, SimulationConfig
+from torchid.config.reading import dump
+from torchid.logs import write_log
+from torchid.parameters import Array
+from torchid.report import identified_urdf
+from torchid.report.tables import progress_bars
+from torchid.robot import Robot, load_robot
+from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
+
+_POLL_S = 0.2
+
+
+def simulate(config: SimulationConfig, source: object = "simulation") -> dict[str, Stability]:
+    """Simulate all motions and write a folder: `logs/`, `exact/`, `nominal.urdf`, `stability.json`, `simulation.yaml`.
+
+    Args:
+        config: robot, feet, motions and imperfections.
+        source: named in errors.
+
+    Returns:
+        How the robot stood, by motion.
+
+    Raises:
+        InputError: whatever does not fit, or a robot that does not keep standing; nothing has been written then.
+    """
+    check_free(config.output, config.overwrite, SIMULATION, (source, config.robot.urdf))
+    robot = load_robot(config.robot.urdf)
+    simulation = set_up_simulation(config, source)
+    for motion in config.motions:
+        simulation.motion(motion)
+    with new_folder(config.output, config.overwrite, SIMULATION) as folder, progress_bars() as bars:
+        (folder / "logs").mkdir()
+        (folder / "exact").mkdir()
+        bar = bars.add_task("simulating [s]", total=sum(LEAD_S + motion.duration_s for motion in config.motions))
+        found = _in_processes(config, source, folder, lambda seconds: bars.update(bar, completed=seconds))
+        (folder / "simulation.yaml").write_text(dump(config))
+        write_json(folder / "stability.json", {name: asdict(stability) for name, stability in found.items()})
+        (folder / "nominal.urdf").write_bytes(identified_urdf(robot, nominal_parameters(robot, config.nominal)))
+    return found
+
+
+def nominal_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -> Array:
+    """Parameters (L, 12) that an identification starts from, off from those of the simulated robot."""
+    return parameters.perturbed(robot.nominal, settings.error, np.random.default_rng([settings.seed, draw]))
+
+
+def _in_processes(
+    config: SimulationConfig, source: object, folder: Path, progress: Callable[[float], None]
+) -> dict[str, Stability]:
+    """Simulate every motion, the longest first; `progress` gets the seconds simulated so far."""
+    context = multiprocessing.get_context("spawn")
+    done = context.Value("d", 0.0)
+    workers = min(os.cpu_count() or 1, len(config.motions))
+    pool = ProcessPoolExecutor(workers, context, _start_worker, (done,))
+    try:
+        ordered = sorted(config.motions, key=lambda motion: -motion.duration_s)
+        tasks = {motion.name: pool.submit(_simulate_motion, config, motion, source, folder) for motion in ordered}
+        waiting = set(tasks.values())
+        while waiting:
+            finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
+            for task in finished:
+                task.result()  # raises what went wrong, at once
+            progress(done.value)
+        return {motion.name: tasks[motion.name].result() for motion in config.motions}
+    finally:
+        for process in list((pool._processes or {}).values()):
+            process.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+_done: Synchronized[float]
+
+
+def _start_worker(done: Synchronized[float]) -> None:
+    global _done
+    _done = done
+    for name in ("SIGINT", "SIGHUP"):  # they are for the parent, which ends its workers
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End a worker whose parent was killed: it would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _simulate_motion(config: SimulationConfig, motion: MotionConfig, source: object, folder: Path) -> Stability:
+    """Simulate one motion in a worker and write its two logs."""
+
+    def progress(seconds: float) -> None:
+        with _done.get_lock():
+            _done.value += seconds
+
+    recording, stability = set_up_simulation(config, source).run(motion, progress)
+    write_log(recording.log, folder / "exact" / f"{motion.name}.npz")
+    log = sensor_log(recording.log, config.sensors, config.seed)
+    write_log(log, folder / "logs" / f"{motion.name}.npz")
+    return stability

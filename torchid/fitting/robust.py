@@ -1,0 +1,249 @@
+"""Robust fits: passes over the logs in which rows that fit badly count less."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid.estimators import BoundEstimate
+from torchid.fitting.fit import Fit
+from torchid.parameters import Array
+from torchid.problem import RowBuilder, Samples, compress_parts
+from torchid.problem.compression import Part, merged
+
+TUNING = {"huber": 1.345, "tukey": 4.685}
+"""Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
+
+_DECADES, _BINS = (-12.0, 12.0), 4800  # of the histogram that the median of |residual| is read from: 1.2 % a bin
+_LEAST_SLOPE = 0.05  # mean of rho'' below which the loss is flat where the rows are: their spread says nothing
+_NORMAL = 0.6745  # median of |x| of standard normal x
+
+
+@dataclass(frozen=True)
+class RobustLoss:
+    """A loss rho(u) of residuals u in units of their scale, by `kind`: "huber" or "tukey" (its biweight)."""
+
+    kind: str
+    tuning: float
+
+    def weight(self, u: Tensor) -> Tensor:
+        """rho'(u) / u."""
+        if self.kind == "huber":
+            return torch.where(u.abs() <= self.tuning, 1.0, self.tuning / u.abs())
+        return (1.0 - (u / self.tuning).square()).clamp_min(0.0).square()
+
+    def slope(self, u: Tensor) -> Tensor:
+        """rho''(u)."""
+        if self.kind == "huber":
+            return (u.abs() <= self.tuning).to(u)
+        x = (u / self.tuning).square()
+        return torch.where(x < 1.0, (1.0 - x) * (1.0 - 5.0 * x), 0.0)
+
+
+class Reweighting:
+    """One pass over the rows: weighs them by their residuals at earlier parameters, and gathers statistics of these."""
+
+    def __init__(self, loss: RobustLoss, parameters: Mapping[str, Tensor], scale: float) -> None:
+        """Start a pass.
+
+        Args:
+            loss: what residuals cost.
+            parameters: by the source of a log, (width,) in the builder's columns.
+            scale: of the whitened residuals of good rows.
+        """
+        self.loss, self.scale = loss, scale
+        self._parameters = parameters
+        self._lock = threading.Lock()
+        self._histogram = np.zeros(_BINS)
+        self._sums = np.zeros(5)  # rows, weights, rho'^2, rho'', rho''^2
+
+    @torch.no_grad()
+    def __call__(self, samples: Samples, support: tuple[int, ...], rows: Tensor) -> Tensor:
+        """The rows (M, len(support) + 1) times the square root of their weights."""
+        theta = self._parameters[samples.source][list(support)].to(rows)
+        u = (rows[:, :-1] @ theta - rows[:, -1]) / self.scale
+        weight, slope = self.loss.weight(u), self.loss.slope(u)
+        digits = u.abs().log10().clamp(*_DECADES)
+        counts = torch.histc(digits, _BINS, *_DECADES).cpu().numpy()
+        sums = [len(u), *(float(x.sum()) for x in (weight, (weight * u).square(), slope, slope.square()))]
+        with self._lock:
+            self._histogram += counts
+            self._sums += sums
+        return rows * weight.sqrt()[:, None]
+
+    @property
+    def median_scale(self) -> float:
+        """Scale of the residuals of this pass, from the median of their size; within a bin of it they count as even."""
+        counts = np.cumsum(self._histogram)
+        half = 0.5 * counts[-1]
+        place = int(np.searchsorted(counts, half))
+        inside = (half - (counts[place - 1] if place else 0.0)) / max(self._histogram[place], 1.0)
+        low, high = _DECADES
+        return float(self.scale * 10.0 ** (low + (high - low) * (place + inside) / _BINS) / _NORMAL)
+
+    @property
+    def mean_weight(self) -> float:
+        """Of all rows."""
+        return float(self._sums[1] / max(self._sums[0], 1.0))
+
+    def deviation(self, unknowns: float) -> float:
+        """Standard deviation of independent rows with the same standard errors, in least squares with these weights.
+
+        Source: Huber 1981, section 7.6: var = K^2 scale^2 sum(rho'^2) / (rows - unknowns) / mean(rho'')^2 (X^T X)^-1
+        with K = 1 + unknowns / rows var(rho'') / mean(rho'')^2; the weighted X^T X is about the mean weight times that
+        without. All rows are taken to be spoilt alike: where one sensor alone is, its own errors come out too small.
+
+        Args:
+            unknowns: fitted, times the rows that make one independent row.
+
+        Returns:
+            NaN where that cannot be said.
+        """
+        rows = self._sums[0]
+        weight, square, slope, steep = self._sums[1:] / max(rows, 1.0)
+        if rows <= unknowns or slope < _LEAST_SLOPE:
+            return math.nan
+        correction = 1.0 + unknowns / rows * (steep - slope**2) / slope**2
+        return float(correction * self.scale * np.sqrt(weight * square * rows / (rows - unknowns)) / slope)
+
+
+_CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
+_STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
+_EXACT = 1e-11  # of the predicted rows: what is left below is rounding
+_TINY = float(np.finfo(float).tiny)
+_START = 3  # passes with Huber's loss before Tukey's
+_SAME = 1e-3  # change of the unknowns of one log
+
+
+@dataclass(frozen=True)
+class RobustSummary:
+    """How a robust fit went: `scale` of good residuals in stated noise, `mean_weight` of rows, whether it settled."""
+
+    loss: str
+    tuning: float
+    scale: float
+    mean_weight: float
+    passes: int
+    converged: bool
+
+
+def robust_fit(
+    first: Fit,
+    loss: RobustLoss,
+    passes: int,
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    solve: Callable[[list[Part]], Fit],
+    progress: Callable[[int], None] | None = None,
+) -> tuple[Fit, RobustSummary]:
+    """Iteratively re-weighted least squares, a pass over the logs each time, memory flat in their length.
+
+    Standard errors are those of the loss, not of the last weighted least squares.
+
+    Args:
+        first: the fit of all rows alike.
+        loss: what residuals cost.
+        passes: at most.
+        logs: bound logs.
+        builder: of their rows.
+        solve: fits compressed logs.
+        progress: called with the number of samples done.
+    """
+    fit, scale, converged, done = first, first.estimate.residual_std, False, 0
+    sources = {samples.source for samples in logs}
+    while done < passes and not converged:
+        current = _loss_of_pass(loss, done)
+        by_log = {source: fit.columns(builder, source) for source in sources}
+        reweighting = Reweighting(current, by_log, max(scale, _TINY))
+        before, done = fit, done + 1
+        fit = solve(compress_parts(logs, builder, progress=progress, weigh=reweighting))
+        converged = current == loss and _settled(fit, before, scale, reweighting.median_scale)
+        scale = reweighting.median_scale
+    found = RobustSummary(loss.kind, loss.tuning, scale, reweighting.mean_weight, done, converged)
+    return _with_errors(fit, reweighting), found
+
+
+def robust_unknowns(
+    log: Samples,
+    builder: RowBuilder,
+    solve: Callable[[list[Part]], Array],
+    columns: Callable[[Array], Tensor],
+    loss: RobustLoss,
+    passes: int,
+) -> Array:
+    """Unknowns of a log, (M,), with outliers weighed down and everything else known, as in `robust_fit`.
+
+    Args:
+        log: a bound log.
+        builder: of its rows.
+        solve: the unknowns that suit compressed parts of the log best.
+        columns: all parameters in the builder's columns for given unknowns, (width,).
+        loss: what residuals cost.
+        passes: at most.
+    """
+    parts = compress_parts([log], builder)
+    values = solve(parts)
+    factor = merged((part.factor for part in parts), builder)
+    left = factor.triangle() @ torch.cat([columns(values), torch.tensor([-1.0], dtype=torch.float64)])
+    scale = float(left.norm()) / np.sqrt(max(factor.rows, 1))
+    for done in range(passes):
+        current = _loss_of_pass(loss, done)
+        reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
+        before, values = values, solve(compress_parts([log], builder, weigh=reweighting))
+        steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
+        scale = reweighting.median_scale
+        if current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME):
+            break
+    return values
+
+
+def _loss_of_pass(loss: RobustLoss, done: int) -> RobustLoss:
+    """Huber's, which is convex, at first."""
+    return loss if loss.kind == "huber" or done >= _START else RobustLoss("huber", TUNING["huber"])
+
+
+def _settled(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:
+    """Whether a pass has moved predicted rows, unknowns beside the parameters and the scale far less than their errors.
+
+    So it has where nothing but rounding is left to be fitted.
+    """
+    problem, estimate = fit.assembly.problem, fit.estimate
+    moved = problem.distance(estimate.phi, before.estimate.phi)
+    if max(moved, new_scale) <= _EXACT * problem.distance(estimate.phi, np.zeros_like(estimate.phi)):
+        return True
+    rows = problem.rows / problem.oversampling
+    if moved > _CONVERGED * scale * np.sqrt(estimate.rank / rows) or abs(new_scale - scale) > _STEADY * scale:
+        return False
+    earlier = {(x.log, x.extra.label): x.value for x in before.extras}
+    return all(
+        abs(x.value - earlier.get((x.log, x.extra.label), np.inf)) <= _CONVERGED * x.standard_error for x in fit.extras
+    )
+
+
+def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
+    """The fit with standard errors of the loss: rows count as independent ones of the same errors."""
+    estimate, problem = fit.estimate, fit.assembly.problem
+    factor = reweighting.deviation(problem.oversampling * estimate.rank) / max(estimate.residual_std, _TINY)
+    if not (np.isfinite(factor) and factor > 0.0):
+        return fit
+    added = (factor**2 - 1.0) * estimate.cost
+    changed: dict[str, Any] = {name: getattr(estimate, name) + added for name in ("cost", "nominal_cost")}
+    if isinstance(estimate, BoundEstimate):
+        objectives = {name: getattr(estimate, name) for name in ("objective", "unconstrained")}
+        changed |= {name: x + added / problem.rows for name, x in objectives.items() if x is not None}
+    estimate = replace(estimate, standard_error=factor * estimate.standard_error, **changed)
+    assembly = replace(fit.assembly, problem=replace(problem, residual=problem.residual + added))
+    extras = [replace(x, standard_error=factor * x.standard_error) for x in fit.extras]
+    return replace(fit, assembly=assembly, estimate=estimate, extras=extras)
+
+
+def loss_of(kind: str, tuning: float | None) -> RobustLoss:
+    """The loss of a name, with its usual tuning if none is given."""
+    return RobustLoss(kind, TUNING[kind] if tuning is None else tuning)

@@ -1,0 +1,1 @@
+"""What a robot, its contacts, its sensors and its motion determine of the parameters, and how well."""

@@ -1,0 +1,226 @@
+"""How much is known of the parameters, in bits and combinations, and what of it hangs on each sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+import torch
+from torch import Tensor
+
+from torchid.parameters import Array
+from torchid.problem import RowBuilder, Samples
+from torchid.problem.chunks import by_state, one_thread, spread_by_state
+from torchid.problem.compression import unloaded_channels
+from torchid.problem.contact_state import State
+from torchid.problem.extras import measured_components
+
+DEPENDENT = 1e-9
+"""What moves the whitened rows by less than this share of its size is rounding."""
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What data tell beyond "each free parameter is within one scale of its nominal value".
+
+    With H the information of the whitened rows in units of the scales, `bits` = log2 det(I + H) / 2, by how many
+    halvings the standard deviations shrink in all, and `determined` = tr((I + H)^-1 H), the number of independent
+    combinations that the data know better than the prior, counted by their share.
+    """
+
+    bits: float
+    determined: float
+
+    @classmethod
+    def of(cls, information: Array) -> Knowledge:
+        """From the eigenvalues of H, (M,), at least 0 but for rounding."""
+        values = np.maximum(information, 0.0)
+        return cls(float(np.log1p(values).sum() / np.log(4.0)), float((values / (1.0 + values)).sum()))
+
+    def __sub__(self, other: Knowledge) -> Knowledge:
+        return Knowledge(self.bits - other.bits, self.determined - other.determined)
+
+
+def prior_directions(builder: RowBuilder, prior: Array) -> Array:
+    """N, (columns, M), so that rows X in the builder's columns have the information `N^T X^T X N`.
+
+    `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
+    `prior`, (12 L,), 0 where they are known, and extras with that of their size.
+    """
+    rigid = triangle((builder.columns.from_parameters() * prior).T).T
+    return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
+
+
+def triangle(X: Array) -> Array:
+    """Triangular R, (min(M, N), N), with `R^T R = X^T X`."""
+    return np.asarray(np.linalg.qr(X, mode="r"))
+
+
+def information_without(H: Array, unknown: Sequence[int], size: Array) -> Array:
+    """As `elimination.without`, of H = X^T X.
+
+    Args:
+        H: (N, N).
+        unknown: places of M columns.
+        size: (M,), squared norms of these; what is below the share `DEPENDENT` of them is rounding.
+    """
+    if not unknown:
+        return H
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
+    crossed = np.delete(H[list(unknown)], unknown, axis=1) * scale[:, None]
+    values, V = np.linalg.eigh(H[np.ix_(unknown, unknown)] * scale * scale[:, None])
+    along = V[:, values > DEPENDENT].T @ crossed
+    rest = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
+    return np.asarray(rest - along.T @ (along / values[values > DEPENDENT, None]))
+
+
+def information_in(rows: Tensor, weight: float) -> Tensor:
+    """`weight X^T X`, (c, c), of the rows X of all samples together, (B, r, c)."""
+    X = rows.flatten(0, 1)
+    return weight * (X.T @ X)
+
+
+def unit_readings(ways: Tensor, W: Tensor) -> Tensor:
+    """Rows `ways W`, (B, c, nv), of norm 1, or zero where they are rounding.
+
+    A sensor that enters the generalized force of a sample by `way^T` times its reading tells what the whitened rows
+    `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
+
+    Args:
+        ways: (B, c, nv) or (c, nv).
+        W: (B, nv, nv), from `RowBuilder.rows_by_sample`.
+    """
+    readings = ways @ W
+    size = torch.linalg.vector_norm(readings, dim=-1, keepdim=True)
+    least = DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
+    return torch.where(size > least, readings / size, 0.0)
+
+
+SAMPLES = 2000
+"""Whose rows stand for those of all, about."""
+
+_CHUNK = 256  # samples whose rows are computed together
+
+
+@dataclass(frozen=True)
+class SensorInformation:
+    """Information (columns, columns) of all sensors together, and what of it is lost without each.
+
+    `torques`: by place among the robot's joints; `limbs`: by place among its force/torque sensors in limbs, and
+    `wrenches`: by contact, each with all its measured components.
+    """
+
+    total: Array
+    torques: Mapping[int, Array]
+    limbs: Mapping[int, Array]
+    wrenches: Mapping[int, Array]
+
+    def changed(self, change: Callable[[Array], Array]) -> SensorInformation:
+        """With every matrix changed by a linear map."""
+        return SensorInformation(
+            change(self.total),
+            *({place: change(H) for place, H in of.items()} for of in (self.torques, self.limbs, self.wrenches)),
+        )
+
+    def without(self, unknown: Sequence[int]) -> SensorInformation:
+        """What is told of the other columns, where some are unknown."""
+        size = np.diag(self.total)[list(unknown)]
+        total = information_without(self.total, unknown, size)
+        found = self.changed(lambda H: total - information_without(self.total - H, unknown, size))
+        return replace(found, total=total)
+
+
+def sum_of(found: Sequence[SensorInformation]) -> SensorInformation:
+    """Of logs together that have nothing unknown in common but the columns."""
+
+    def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
+        return {place: np.asarray(sum(one[place] for one in matrices)) for place in matrices[0]}
+
+    return SensorInformation(
+        np.asarray(sum(one.total for one in found)),
+        added([one.torques for one in found]),
+        added([one.limbs for one in found]),
+        added([one.wrenches for one in found]),
+    )
+
+
+@one_thread()
+@torch.no_grad()
+def sensor_information(
+    logs: Sequence[Samples], builder: RowBuilder, most: int = SAMPLES, done: Callable[[int], None] | None = None
+) -> SensorInformation:
+    """Information of some logs in the builder's columns, and what of it hangs on each sensor.
+
+    A sensor tells of a sample what its `unit_readings` take from the whitened rows.
+
+    Args:
+        logs: bound logs.
+        builder: of their rows.
+        most: samples, about, that stand for all.
+        done: called with the number of samples worked through.
+    """
+    n, base = builder.tree.n, builder.tree.base_rows
+    joints = np.flatnonzero(builder.sensors.torque[:n]).tolist()
+    in_limbs = builder.sensors.torque[n:].reshape(-1, 6)
+    limbs = np.flatnonzero(in_limbs.any(axis=1)).tolist()
+    components = measured_components(builder.contacts, builder.sensors)
+    contacts = np.flatnonzero(components.any(axis=1)).tolist()
+    count, first = builder.width, 1 + len(joints) + len(limbs)
+    units = torch.eye(base + len(builder.columns.joint_rows), dtype=torch.float64, device=builder.device)
+    torques = units[[base + joint for joint in joints]]
+    total = torch.zeros(first + len(contacts), count, count, dtype=torch.float64, device=builder.device)
+    for samples, state, stands_for in _spread(logs, most):
+        weight = stands_for / samples.oversampling
+        rows, W = builder.rows_by_sample(samples.to(builder.device), state)
+        K = rows[..., :-1]
+        total[0] += information_in(K, weight)
+        lost = (unit_readings(torques, W) @ K).transpose(0, 1)  # (joints, B, columns)
+        total[1 : 1 + len(joints)].baddbmm_(lost.mT, lost, alpha=weight)
+        for place, limb in enumerate(limbs, start=1 + len(joints)):
+            C = units[(base + n + 6 * limb + np.flatnonzero(in_limbs[limb])).tolist()]
+            total[place] += information_in(_span(C.expand(len(samples), *C.shape), W) @ K, weight)
+        for contact, H in _in_the_air(builder, samples, count):
+            total[0] += weight * H
+            total[first + contacts.index(contact)] += weight * H
+        if any(state[contact] for contact in contacts):
+            J = builder.contact_jacobian(samples.to(builder.device))
+            for place, contact in enumerate(contacts, start=first):
+                if state[contact]:
+                    C = J[:, contact, np.flatnonzero(components[contact]).tolist()]
+                    total[place] += information_in(_span(C, W) @ K, weight)
+        if done is not None:
+            done(len(samples))
+    found = total.cpu().numpy()
+    return SensorInformation(
+        found[0],
+        dict(zip(joints, found[1:], strict=False)),
+        dict(zip(limbs, found[1 + len(joints) :], strict=False)),
+        dict(zip(contacts, found[first:], strict=True)),
+    )
+
+
+def _in_the_air(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
+    """Contacts, and the information (count, count) that their readings in the air hold on offsets."""
+    for channel in unloaded_channels(builder, samples):
+        if not channel.gated and (place := builder.extras[channel.offset].contact):
+            columns, row = channel.row(builder)
+            wide = row.new_zeros(count)
+            wide[list(columns)] = row[0, :-1]
+            yield place[0], torch.outer(wide, wide)
+
+
+def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State, float]]:
+    """Chunks of about `most` samples, evenly spread over contact states and logs, and how many each stands for."""
+    states = {state for samples in logs for state, _ in by_state(samples)}
+    for samples, state, stands_for in spread_by_state(logs, max(most // max(len(states), 1), 1)):
+        for start in range(0, len(samples), _CHUNK):
+            yield samples[start : start + _CHUNK], state, stands_for
+
+
+def _span(C: Tensor, W: Tensor) -> Tensor:
+    """Orthonormal rows, (B, c, nv), that span those of `C W`, zeros for dependent ones."""
+    _, values, Vh = torch.linalg.svd(C @ W, full_matrices=False)
+    least = DEPENDENT * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
+    return Vh * (values > least[:, None])[..., None]

@@ -1,0 +1,195 @@
+"""The linear problem of all motions that contact states allow: what sensors could determine at best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from torchid.parameters import Array
+from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
+from torchid.problem.base_motion import BaseMotion
+from torchid.problem.chunks import one_thread
+from torchid.problem.contact_state import State
+from torchid.regressor import FrameJacobian, motion_from_state
+from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross, joint_states
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorSet
+from torchid.sensing.projection import RANK_TOLERANCE
+
+_ANGLE, _STROKE = 1.5, 0.3  # [rad], [m] either way
+
+
+def random_postures(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+    """Joint positions (count, n), uniform, up to 1.5 rad or 0.3 m either way."""
+    slides = (robot.joint_map[0] != 0.0).T @ robot.geometry.prismatic[1:]
+    return np.where(slides, _STROKE, _ANGLE) * rng.uniform(-1.0, 1.0, (count, robot.n))
+
+
+def at_rest(joint_position: Array, state: State) -> Samples:
+    """Samples of an upright robot at rest, at joint positions (N, n) [rad or m] in a contact state, without forces."""
+    q = torch.from_numpy(np.ascontiguousarray(joint_position, dtype=float))
+    still, base = torch.zeros_like(q), q.new_zeros(len(q), 3)
+    upright, gravity = (q.new_tensor(x).expand(len(q), -1) for x in ((0.0, 0.0, 0.0, 1.0), GRAVITY_WORLD))
+    return Samples(
+        source="postures",
+        time=q.new_zeros(len(q)),
+        joint_position=q,
+        joint_velocity=still,
+        joint_acceleration=still,
+        base=BaseMotion(upright, -gravity, base, base),
+        torque=None,
+        wrench=None,
+        wrench_in_world=False,
+        active=torch.tensor(state, dtype=torch.bool).expand(len(q), len(state)),
+    )
+
+
+_WEIGHTLESS = (0.0, 0.0, 0.0)
+_AT_REST = 1e-10  # a projected velocity below this share of what was drawn is rounding, and has no sign
+
+
+def standing_samples(
+    robot: Robot, contacts: Sequence[Contact], state: State, count: int, rng: np.random.Generator
+) -> Samples:
+    """Random samples that honour a contact state; forces are zeros.
+
+    Positions are free: each sample stands on a ground of its own, every foot on any slope. What such samples determine
+    bounds from above what one footing does.
+
+    Args:
+        robot: the robot.
+        contacts: the contacts in use.
+        state: which of them touch the ground.
+        count: number N of samples.
+        rng: draws them.
+    """
+    q, v, a = standing_states(robot, contacts, state, count, rng)
+    rows = robot.base_rows
+    return Samples(
+        source="standing samples",
+        time=torch.arange(count, dtype=torch.float64),
+        joint_position=q[:, q.shape[1] - robot.n :],
+        joint_velocity=v[:, rows:],
+        joint_acceleration=a[:, rows:],
+        base=BaseMotion.of(q, v, a, robot.fixed_base),
+        torque=q.new_zeros(count, robot.dofs),
+        wrench=q.new_zeros(count, len(contacts), 6),
+        wrench_in_world=False,
+        active=torch.tensor(state, dtype=torch.bool).expand(count, len(contacts)),
+    )
+
+
+@one_thread()
+@torch.no_grad()
+def standing_states(
+    robot: Robot, contacts: Sequence[Contact], state: State, count: int, rng: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Coordinates q, v, a, as `Regressor` takes them, with `J_C v = 0` and `J_C a + dJ_C/dt v = 0`.
+
+    J_C has the rows of the components that active contacts can exert: a point contact holds its frame's origin, a flat
+    one the whole frame, a line all but the rotation about itself. Twice as many states are drawn, and those nearest to
+    a singular J_C left out: there, accelerations grow without bound.
+    """
+    q, v, a = _drawn(robot, 2 * count, rng)
+    held = [contact for contact, active in zip(contacts, state, strict=True) if active]
+    rows = [FrameJacobian(robot, contact.frame)(q)[:, list(contact.components), : robot.nv] for contact in held]
+    J = torch.cat([q.new_zeros(len(q), 0, robot.nv), *rows], dim=1)
+    if not held:
+        return q[:count], v[:count], a[:count]
+    values = torch.linalg.svdvals(J)
+    regular = values > RANK_TOLERANCE * values[:, :1]
+    smallest = torch.where(regular, values, torch.inf).amin(1) / values[:, 0]
+    best = torch.argsort(smallest, descending=True)[:count]
+    q, v, a, J = q[best], v[best], a[best], J[best]
+    inverse = torch.linalg.pinv(J, rtol=RANK_TOLERANCE)
+    v = _without(v, inverse, J)
+    v = torch.where(v.abs() < _AT_REST, 0.0, v)
+    drift = _drift(robot, held, q, v)
+    return q, v, _without(a, inverse, J) - (inverse @ drift[..., None])[..., 0]
+
+
+def _without(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
+    """The part of x, (B, nv), that J does not see; the second pass takes the rounding of the first."""
+    for _ in range(2):
+        x = x - (inverse @ (J @ x[..., None]))[..., 0]
+    return x
+
+
+def _drawn(robot: Robot, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    q = random_postures(robot, count, rng)
+    v, a = rng.normal(size=(count, robot.nv)), 3.0 * rng.normal(size=(count, robot.nv))
+    if not robot.fixed_base:
+        q = np.hstack([np.zeros((count, 3)), Rotation.random(count, random_state=rng).as_quat(), q])
+    return torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(a)
+
+
+def _drift(robot: Robot, held: Sequence[Contact], q: Tensor, v: Tensor) -> Tensor:
+    """dJ_C/dt v, (B, k): what the held components would accelerate by with a = 0, in the contacts' own axes."""
+    tree = KinematicTree(robot)
+    motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
+    states = body_states(tree, motion, joint_states(tree, motion))
+    rows = []
+    for contact in held:
+        node, T_joint_frame = tree.frame(robot, contact.frame)
+        rows.append(_acceleration(states, node, v.new_tensor(T_joint_frame))[list(contact.components)])
+    return torch.cat(rows).T
+
+
+def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor) -> Tensor:
+    """Acceleration of a frame's origin, then angular acceleration, in the frame's axes, (6, B), without gravity."""
+    rotation = states.rotation[:, :, body]
+    arm = (rotation * T_joint_frame[:3, 3, None]).sum(1)
+    omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
+    linear = states.specific_force[:, body] + cross(alpha, arm) + cross(omega, cross(omega, arm))
+    in_joint_frame = (rotation[:, :, None] * torch.stack([linear, alpha], dim=1)[:, None]).sum(0)
+    return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))
+
+
+_SAMPLES_PER_COLUMN = 2  # in every state: a sample gives one row or more, and some directions are rarely excited
+
+
+def structural_samples(
+    robot: Robot, contacts: Sequence[Contact], states: Sequence[State], count: int | None = None, seed: int = 0
+) -> list[Samples]:
+    """Random samples, see `standing_samples`, of every contact state; they serve any sensor set.
+
+    Args:
+        robot: the robot.
+        contacts: the contacts in use.
+        states: contact states the robot may be in.
+        count: samples per state; by default twice the robot's base parameters, friction included.
+        seed: of the random numbers.
+    """
+    count = count or _SAMPLES_PER_COLUMN * (10 + 9 * (len(robot.bodies) - 1))
+    rng = np.random.default_rng(seed)
+    return [standing_samples(robot, contacts, state, count, rng) for state in states]
+
+
+def structural_problem(
+    robot: Robot,
+    contacts: Sequence[Contact],
+    sensors: SensorSet,
+    states: Sequence[State],
+    friction: bool = True,
+    samples: Sequence[Samples] | None = None,
+) -> LinearProblem:
+    """What a sensor set sees of the parameters if the robot may move as it likes in some contact states.
+
+    Its rank bounds that of any log from above. The right-hand side is 0: nothing is to be fitted.
+
+    Args:
+        robot: the robot.
+        contacts: the contacts in use.
+        sensors: which forces are measured.
+        states: contact states the robot may be in.
+        friction: whether friction is free.
+        samples: of these states, if they have been drawn already.
+    """
+    builder = RowBuilder(robot, contacts, sensors)
+    drawn = structural_samples(robot, contacts, states) if samples is None else samples
+    return linear_problem(compress(drawn, builder), builder, robot, friction)

@@ -1,0 +1,322 @@
+"""The files of a bag, ROS 1, SQLite and MCAP: channels, and records on them, unpacked within limits."""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+import functools
+import io
+import sqlite3
+import struct
+import zlib
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import Channel as McapChannel
+from mcap.records import Chunk, Message, Schema
+from rosbags import rosbag1
+
+from torchid.errors import LogError, install
+from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget, plain
+from torchid.logs.containers import translated
+from torchid.text import shown
+
+
+def expanded(data: bytes, compression: str, budget: Budget) -> bytes:
+    """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
+
+    Raises:
+        ValueError: another compression, or more bytes than the budget of the file has left.
+    """
+    limit = budget.most()
+    if compression in ("", "none"):
+        out = data
+    elif compression == "bz2":
+        out = bz2.BZ2Decompressor().decompress(data, limit + 1)
+    elif compression == "lz4":
+        out = lz4.frame.LZ4FrameDecompressor().decompress(data, limit + 1)
+    elif compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
+            out = stream.read(limit + 1)
+    else:
+        raise ValueError(f"chunks compressed by '{shown(compression)}'")
+    if len(out) > limit:
+        raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
+    budget.expand(len(out))
+    return out
+
+
+#: What bags of any kind are read with.
+_PACKAGES = ("rosbags", "mcap", "zstandard")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What a topic carries: a message type such as `sensor_msgs/msg/Imu`, and how it is serialized (cdr, ros1)."""
+
+    topic: str
+    type: str
+    encoding: str
+
+    def __post_init__(self) -> None:
+        """Refuse what no message can show."""
+        for text in (self.topic, self.type, self.encoding):
+            plain(text)
+
+
+@dataclass(frozen=True)
+class Record:
+    """One message as it lies in the file: when it was received [ns], and the share of the file read up to it."""
+
+    topic: str
+    received: int
+    data: bytes
+    share: float
+
+
+class BagFile(Protocol):
+    """An open file of a bag."""
+
+    def close(self) -> None:
+        """Close the file."""
+
+    def channels(self) -> list[Channel]:
+        """All topics, some of them perhaps several times."""
+
+    def records(self, topics: Collection[str]) -> Iterator[Record]:
+        """The messages of some topics, in any order."""
+
+
+@contextlib.contextmanager
+def open_bag_file(path: Path) -> Iterator[BagFile]:
+    """Open a .bag, .mcap or .db3 file.
+
+    Raises:
+        LogError: it is damaged, and so does what is read later; or its reader is not installed.
+    """
+    suffix = path.suffix.lower()
+    try:
+        import mcap  # noqa: F401
+        import rosbags.rosbag1  # noqa: F401
+        import zstandard  # noqa: F401
+    except ImportError as error:
+        absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
+        found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
+        raise LogError(path, "file", found, install("ros")) from error
+
+    readers: dict[str, Callable[[Path], BagFile]] = {".bag": Ros1File, ".mcap": McapFile, ".db3": SqliteFile}
+    accepted = f"a complete {suffix} file of ROS messages"
+    with translated(str(path), "file", accepted), contextlib.closing(readers[suffix](path)) as file:
+        yield file
+
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")  # kind of record, bytes that follow
+_KNOWN: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: McapChannel, Opcode.CHUNK: Chunk}
+
+
+class McapFile:
+    """An MCAP file, read from front to back: it needs no index, and its chunks are never expanded unchecked."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file."""
+        self._stream = path.open("rb")
+        self._size = max(path.stat().st_size, 1)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+    def channels(self) -> list[Channel]:
+        """All topics."""
+        types: dict[int, str] = {}
+        found: dict[int, McapChannel] = {}
+        for record in self._scan(False, Budget(self._size)):
+            if isinstance(record, Schema):
+                types[record.id] = _full_name(record.name)
+            elif isinstance(record, McapChannel):
+                found[record.id] = record
+            if len(types) + len(found) > 2 * MAX_TOPICS:
+                raise ValueError(f"more than {MAX_TOPICS} topics")
+        return [Channel(x.topic, types.get(x.schema_id, "unknown"), x.message_encoding) for x in found.values()]
+
+    def records(self, topics: Collection[str]) -> Iterator[Record]:
+        """The messages of some topics."""
+        wanted: dict[int, str] = {}
+        budget = Budget(self._size)
+        for record in self._scan(True, budget):
+            if isinstance(record, McapChannel) and record.topic in topics:
+                wanted[record.id] = record.topic
+            elif isinstance(record, Message) and record.channel_id in wanted:
+                budget.message()
+                share = self._stream.tell() / self._size
+                yield Record(wanted[record.channel_id], record.log_time, record.data, share)
+
+    def _scan(self, messages: bool, budget: Budget) -> Iterator[Schema | McapChannel | Message]:
+        """The records of the file and of its chunks."""
+        self._stream.seek(0)
+        if self._stream.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
+            raise ValueError("no MCAP file")
+        for record in _records(self._stream, True, messages, budget):
+            if isinstance(record, Chunk):
+                data = expanded(record.data, record.compression, budget)
+                if record.uncompressed_crc and zlib.crc32(data) != record.uncompressed_crc:
+                    raise ValueError("a chunk that does not match its checksum")
+                yield from _records(BytesIO(data), False, messages, budget)
+            else:
+                yield record
+
+
+def _records(stream: BinaryIO, whole: bool, messages: bool, budget: Budget) -> Iterator[Any]:
+    """Schemas, channels, chunks and, if asked for, messages, but not what else there is; of a file, up to the footer.
+
+    mcap's own loop also reads attachments, and takes minutes for the zeros that a crash may leave in a file.
+    """
+    while head := stream.read(_HEAD.size):
+        budget.record()
+        kind, size = _HEAD.unpack(head)
+        if not kind:
+            raise ValueError("zeros in place of a record")
+        if kind == Opcode.FOOTER:
+            return
+        if kind not in _KNOWN and not (messages and kind == Opcode.MESSAGE):
+            stream.seek(size, 1)
+            continue
+        if size > MAX_RECORD:
+            raise ValueError(f"a record of {size} bytes")
+        body = stream.read(size)
+        if len(body) < size:
+            raise EndOfFile
+        content = ReadDataStream(BytesIO(body))
+        yield Message.read(content, size) if kind == Opcode.MESSAGE else _KNOWN[kind].read(content)
+    if whole:
+        raise EndOfFile("no footer: cut off before its end")
+
+
+def _full_name(name: str) -> str:
+    """A message type as ROS 2 spells it; ROS 1 leaves the `msg` out."""
+    package, _, message = name.partition("/")
+    return f"{package}/msg/{message}" if message and "/" not in message else name
+
+
+_ROS1_MAGIC = b"#ROSBAG V2.0\n"
+
+
+class _Reader(rosbag1.Reader):
+    """The reader of rosbags, which trusts its files, with bounds on what a chunk and the index grow to."""
+
+    _index_bytes = 0
+
+    def __init__(self, path: Path) -> None:
+        """Start with nothing unpacked."""
+        super().__init__(path)
+        self.budget = Budget(path.stat().st_size)
+
+    def read_chunk(self) -> Any:
+        """As before, with a decompressor that stops."""
+        stream: Any = self.bio
+        start = stream.tell()
+        chunk = super().read_chunk()
+        end = stream.tell()
+        stream.seek(start)
+        compression = rosbag1.reader.Header.read(stream).get_string("compression")
+        stream.seek(end)
+        return chunk._replace(decompressor=functools.partial(expanded, compression=compression, budget=self.budget))
+
+    def read_index_data(self, pos: int, indexes: Any) -> None:
+        """As before, but every part of the index once."""
+        stream: Any = self.bio
+        start = stream.tell()
+        super().read_index_data(pos, indexes)
+        self._index_bytes += stream.tell() - start
+        if self._index_bytes > self.path.stat().st_size:
+            raise rosbag1.ReaderError("The index is larger than the file.")
+
+
+class Ros1File:
+    """A .bag file."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file and read its index."""
+        with path.open("rb") as stream:  # of which the reader would read a whole line, however long
+            if stream.read(len(_ROS1_MAGIC)) != _ROS1_MAGIC:
+                raise ValueError("no bag of ROS 1 in version 2.0")
+        self._reader = _Reader(path)
+        self._reader.open()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._reader.close()
+
+    def channels(self) -> list[Channel]:
+        """All topics."""
+        if len(self._reader.connections) > MAX_TOPICS:
+            raise ValueError(f"more than {MAX_TOPICS} topics")
+        return [Channel(x.topic, x.msgtype, "ros1") for x in self._reader.connections]
+
+    def records(self, topics: Collection[str]) -> Iterator[Record]:
+        """The messages of some topics."""
+        connections = [x for x in self._reader.connections if x.topic in topics]
+        total = max(sum(x.msgcount for x in connections), 1)
+        if connections:  # none would stand for all
+            for i, (connection, received, data) in enumerate(self._reader.messages(connections)):
+                self._reader.budget.message()
+                yield Record(connection.topic, received, data, i / total)
+
+
+class SqliteFile:
+    """A .db3 file: tables of topics and messages, read without trusting what else a database can hold."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file, which may be on a read-only disk."""
+        self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+        self._connection.execute("PRAGMA trusted_schema = OFF")
+        self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD)
+        self._size = path.stat().st_size
+        for table in ("topics", "messages"):
+            self._check_plain(table)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    def _check_plain(self, table: str) -> None:
+        """Refuse what only looks like a table: a view or a computed column could go on forever."""
+        query = "SELECT type, sql FROM sqlite_master WHERE name = ?"
+        found = self._connection.execute(query, (table,)).fetchone()
+        if found is None or found[0] != "table" or not str(found[1]).upper().startswith("CREATE TABLE"):
+            raise ValueError(f"no table '{table}'")
+        columns = self._connection.execute(f"PRAGMA table_xinfo({table})").fetchall()
+        if any(hidden for *_, hidden in columns):
+            raise ValueError(f"table '{table}' has computed columns")
+
+    def channels(self) -> list[Channel]:
+        """All topics."""
+        rows = self._connection.execute("SELECT name, type, serialization_format FROM topics").fetchmany(MAX_TOPICS + 1)
+        if len(rows) > MAX_TOPICS:
+            raise ValueError(f"more than {MAX_TOPICS} topics")
+        return [Channel(str(name), str(kind), str(encoding)) for name, kind, encoding in rows]
+
+    def records(self, topics: Collection[str]) -> Iterator[Record]:
+        """The messages of some topics."""
+        names = dict(self._connection.execute("SELECT id, name FROM topics").fetchmany(MAX_TOPICS))
+        budget = Budget(self._size)
+        (total,) = self._connection.execute("SELECT count(*) FROM messages").fetchone()
+        rows = self._connection.execute("SELECT topic_id, timestamp, data FROM messages")
+        for i, (topic, received, data) in enumerate(rows):
+            budget.record()
+            if names.get(topic) not in topics:
+                continue
+            budget.message()
+            if not (isinstance(received, int) and isinstance(data, bytes) and len(data) <= MAX_RECORD):
+                raise ValueError(f"message {i} has no time or no data")
+            yield Record(names[topic], received, data, i / total)

@@ -1,0 +1,284 @@
+"""Logs as tables, CSV and Parquet: the only module that imports pyarrow."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.errors import LogError, install
+from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_growth, check_names
+from torchid.logs.columns import TEXT, Layout, columns_of, layout_of
+from torchid.logs.containers import appearing_whole, translated
+from torchid.logs.log import NAMES
+from torchid.text import shown
+
+#: Bytes of a CSV file that are parsed at a time; no row may be longer.
+_BLOCK = 2**22
+#: Rows that are converted at a time.
+_ROWS = 2**16
+#: What one Parquet file may declare of itself (bytes of names and statistics, entries of its lists), and that damage
+#: shows where the file has checksums.
+_PARQUET = {
+    "thrift_string_size_limit": 2**26,
+    "thrift_container_size_limit": MAX_SCHEMA,
+    "page_checksum_verification": True,
+}
+_BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
+_QUOTES = "'\n"
+_EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
+_FLAGS = {"true": "1", "false": "0"}
+_NUMBERS = "numbers, or empty cells where nothing was measured"
+
+
+def read_table(path: Path) -> dict[str, NDArray[Any]]:
+    """The fields of a .csv or .parquet file, names of joints, contacts and sensors among them.
+
+    Raises:
+        LogError: one line that names the file and the column.
+    """
+    pa = _pyarrow(path)
+    with _complete(path):
+        (layout, _), *found = _batches(pa, path)
+        batches = [batch for _, batch in found]
+        del found
+        return _fields(pa, path, layout, batches)
+
+
+def table_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
+    """As `read_table`, of some rows at a time, none first."""
+    pa = _pyarrow(path)
+    with _complete(path):
+        for layout, batch in _batches(pa, path, whole=False):
+            yield _fields(pa, path, layout, [] if batch is None else [batch])
+
+
+def _complete(path: Path) -> AbstractContextManager[None]:
+    return translated(str(path), "file", f"a complete {path.suffix.lower()} file")
+
+
+def _fields(pa: Any, path: Path, layout: Layout, batches: list[Any]) -> dict[str, NDArray[Any]]:
+    """The fields of some rows; forgets the batches."""
+    table = pa.Table.from_batches(batches) if batches else None
+    samples = 0 if table is None else table.num_rows
+    columns = {} if table is None else dict(zip(table.column_names, table.columns, strict=True))
+    del table
+    batches.clear()
+
+    def take(column: str) -> NDArray[Any]:
+        # popped, which frees the memory of what has been taken
+        return _values(pa, path, column, columns.pop(column)) if columns else np.zeros(0)
+
+    return layout.fields(samples, take)
+
+
+def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write the arrays of a log file as a .csv or .parquet file, which appears complete or not at all.
+
+    Raises:
+        LogError: a name that no column can carry, or the file cannot be written.
+    """
+    pa = _pyarrow(path)
+    columns = _columns(path, arrays)
+    with appearing_whole(path) as temporary:
+        if path.suffix.lower() == ".parquet":
+            import pyarrow.parquet
+
+            table = pa.table({text: pa.array(np.ascontiguousarray(x)) for text, x in columns.items()})
+            pyarrow.parquet.write_table(table, temporary, use_dictionary=[TEXT], write_page_checksum=True)
+        else:
+            _save_csv(pa, temporary, columns)
+
+
+def _pyarrow(path: Path) -> Any:
+    """The module pyarrow, or a LogError: only those who use tables need it."""
+    try:
+        import pyarrow
+    except ImportError as error:
+        found = f"a {path.suffix.lower()} file, but pyarrow is not installed"
+        raise LogError(path, "file", found, f"a .npz or .h5 file, or {install('tables')}") from error
+    return pyarrow
+
+
+def _batches(pa: Any, path: Path, whole: bool = True) -> Iterator[tuple[Layout, Any]]:
+    """The layout of a table, with None first, then with some of its rows after the other."""
+    return (_read_csv if path.suffix.lower() == ".csv" else _read_parquet)(pa, path, whole)
+
+
+def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[Layout, Any]]:
+    import pyarrow.csv
+
+    texts, empty = _header(path)
+    layout = layout_of(str(path), texts)
+    yield layout, None
+    if empty:
+        return
+    words = pa.dictionary(pa.int32(), pa.string())
+    types = {text: words if _is_text(text) else pa.float64() for text in texts}
+    with path.open("rb") as stream:
+        try:
+            reader = pyarrow.csv.open_csv(
+                stream,
+                # one thread, for else no message says which row is wrong
+                pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=texts),
+                convert_options=pyarrow.csv.ConvertOptions(
+                    column_types=types, null_values=_EMPTY, strings_can_be_null=True
+                ),
+            )
+            for batch in _bounded(path, reader, len(texts), whole):
+                yield layout, batch
+        except pa.ArrowInvalid as error:
+            bad = _BAD_CELL.match(str(error))
+            if bad is None:
+                raise
+            column, row, found = bad.groups()
+            where = "" if row is None else f" in row {row}"
+            text = f"'{shown(found.strip(_QUOTES))}'{where}"
+            raise LogError(path, f"column '{texts[int(column)]}'", text, _NUMBERS) from error
+
+
+def _header(path: Path) -> tuple[list[str], bool]:
+    """Names of a CSV file's columns, and whether nothing follows."""
+    with path.open("rb") as stream:
+        line = stream.readline(_BLOCK)
+        empty = not stream.read(_BLOCK).strip()
+    if not line.strip():
+        raise LogError(path, "header", "an empty line", "the names of the columns")
+    if len(line) == _BLOCK:
+        raise LogError(path, "header", f"a line of at least {_BLOCK} bytes", "the names of the columns")
+    text = line.decode("utf-8-sig").rstrip("\r\n")
+    try:
+        texts = [text.strip() for text in next(csv.reader([text], strict=True))]
+    except csv.Error as error:
+        raise LogError(path, "header", f"no line of names ({error})", "names separated by commas") from error
+    if len(texts) == 1 and re.search("[;\t]", text):
+        raise LogError(path, "header", f"'{shown(text)}'", "names separated by commas")
+    return texts, empty
+
+
+def _read_parquet(pa: Any, path: Path, whole: bool) -> Iterator[tuple[Layout, Any]]:
+    import pyarrow.parquet
+
+    with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
+        texts = file.schema_arrow.names
+        layout = layout_of(str(path), texts)
+    # as a dictionary, else one long text could fill the memory by being repeated
+    with pyarrow.parquet.ParquetFile(path, read_dictionary=[TEXT] if TEXT in texts else None, **_PARQUET) as file:
+        for field in file.schema_arrow:
+            number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type)
+            fits = pa.types.is_dictionary(field.type) if field.name == TEXT else number
+            if not fits and not (_is_text(field.name) and pa.types.is_boolean(field.type)):
+                accepted = "text" if field.name == TEXT else "real numbers"
+                raise LogError(path, f"column '{field.name}'", f"values of type {field.type}", accepted)
+        _check_size(path, file.metadata.num_rows, len(texts), whole)
+        yield layout, None
+        for batch in _bounded(path, file.iter_batches(_ROWS), len(texts), whole):
+            yield layout, batch
+
+
+def _bounded(path: Path, batches: Iterable[Any], columns: int, whole: bool) -> Iterator[Any]:
+    """The batches, as long as they fit: a file may hold more rows than it declares."""
+    rows = 0
+    for batch in batches:
+        rows += batch.num_rows
+        _check_size(path, rows, columns, whole)
+        if batch.num_rows:
+            yield batch
+
+
+def table_size(path: Path) -> int:
+    """Bytes of a table's numbers, without reading them.
+
+    Raises:
+        LogError: the file cannot be read.
+    """
+    _pyarrow(path)
+    with _complete(path):
+        if path.suffix.lower() == ".csv":
+            texts, _ = _header(path)
+            with path.open("rb") as stream:
+                return 8 * len(texts) * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(_BLOCK), b""))
+        import pyarrow.parquet
+
+        with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
+            return 8 * int(file.metadata.num_rows) * len(file.schema_arrow.names)
+
+
+def _check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
+    if whole and 8 * rows * columns > MAX_ARRAYS:
+        accepted = f"at most {MAX_ARRAYS} bytes in all"
+        raise LogError(path, "file", f"{rows} rows of {columns} columns", accepted)
+    check_growth(path, 8 * rows * columns)
+
+
+def _is_text(column: str) -> bool:
+    """Whether a CSV file may hold words there: the IMU's frame, and `true` and `false`."""
+    return column == TEXT or column.startswith("contact_active.")
+
+
+def _values(pa: Any, path: Path, column: str, values: Any) -> NDArray[Any]:
+    """A column's values (N,), NaN where a cell is empty; of text the one word that all rows hold."""
+    if not pa.types.is_dictionary(values.type):
+        if pa.types.is_boolean(values.type) and values.null_count:
+            values = values.cast(pa.float64())
+        return np.asarray(values.to_numpy())
+    values = values.unify_dictionaries()
+    words = values.unique().to_pylist()
+    if column == TEXT:
+        if len(words) != 1 or words[0] is None:
+            found = " and ".join("an empty cell" if word is None else f"'{shown(word)}'" for word in words[:2])
+            raise LogError(path, f"column '{column}'", found, "one name, the same in every row")
+        check_names([1], len(words[0]))
+        return np.array(words[0].strip())
+    numbers = {word: np.nan if word is None else _number(path, column, word) for word in words}
+    coded = pa.array([numbers[word] for word in words])
+    codes = pa.compute.index_in(values.cast(pa.string()), pa.array(words, pa.string()))
+    return np.asarray(coded.take(codes.combine_chunks()).to_numpy(zero_copy_only=False))
+
+
+def _number(path: Path, column: str, word: str) -> float:
+    try:
+        return float(_FLAGS.get(word.strip().lower(), word))
+    except ValueError as error:
+        raise LogError(path, f"column '{column}'", f"'{shown(word)}'", "true and false, or 1 and 0") from error
+
+
+def _columns(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The columns of a log, by name."""
+    names = {name: tuple(map(str, arrays[name])) for name in NAMES if name in arrays}
+    columns: dict[str, NDArray[Any]] = {}
+    for field, array in arrays.items():
+        if field in NAMES:
+            continue
+        if field == TEXT:
+            columns[field] = np.full(len(arrays["time"]), str(array))
+            continue
+        flat = array.reshape(len(array), -1)
+        for j, text in enumerate(columns_of(field, names)):
+            if text != text.strip():
+                raise LogError(path, f"column '{text}'", "a space at its end", "names without")
+            columns[text] = flat[:, j]
+    layout = layout_of(str(path), list(columns))
+    for name, given in names.items():
+        if given and layout.names.get(name) != given:
+            raise LogError(path, name, "names without any values", "a .npz or .h5 file, or a field of them")
+    return columns
+
+
+def _save_csv(pa: Any, path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Numbers as the shortest text that reads back the same, NaN as an empty cell."""
+    import pyarrow.csv
+
+    def rows(first: int) -> Any:
+        block = {text: x[first : first + _ROWS] for text, x in columns.items()}
+        return pa.table({text: pa.array(np.ascontiguousarray(x), from_pandas=True) for text, x in block.items()})
+
+    with path.open("xb") as stream, pyarrow.csv.CSVWriter(stream, rows(0).schema) as writer:
+        for first in range(0, len(columns["time"]), _ROWS):
+            writer.write_table(rows(first))

@@ -1,0 +1,255 @@
+"""What is constant in a contact state, worked out once: which columns, joints and wrench directions take part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid import parameters
+from torchid.parameters import Array
+from torchid.problem.extras import Extra, measured_components
+from torchid.problem.samples import Samples
+from torchid.regressor.columns import reduced_layout, reduction_matrix
+from torchid.regressor.jacobian import wrench_map
+from torchid.regressor.regressor import JointRow, joint_rows
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorSet
+
+State = tuple[bool, ...]
+"""Which contacts touch the ground."""
+
+
+def state_name(contacts: Sequence[Contact], state: State) -> str:
+    """Frames in contact, joined by "+"."""
+    return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or "none"
+
+
+_DEPENDENT = 1e-9  # singular values of constant unit wrenches below this share of the largest count as zero
+
+
+class Columns:
+    """Columns of the rows: those of `reduced_layout`, then two friction columns for each of the L - 1 joints."""
+
+    def __init__(self, tree: KinematicTree) -> None:
+        """Lay out the columns of a robot."""
+        self.tree = tree
+        self.layout = reduced_layout(tree)
+        self.joint_rows: list[JointRow] = joint_rows(tree, self.layout)
+
+    @property
+    def count(self) -> int:
+        """Number of columns, without the right-hand side."""
+        return self.layout.count + 2 * (self.tree.bodies - 1)
+
+    def friction(self, body: int) -> int:
+        """The first of the two friction columns of a body's joint."""
+        return self.layout.count + 2 * (body - 1)
+
+    def friction_of(self, joint: int) -> list[int]:
+        """Friction columns of an independent joint and those that mimic it."""
+        return [self.friction(body) + k for body, _ in self.joint_rows[joint].moved for k in (0, 1)]
+
+    def joints_above(self, body: int) -> list[int]:
+        """Independent joints that move a body."""
+        path = set(self.tree.path(body))
+        return [j for j, row in enumerate(self.joint_rows) if any(moved in path for moved, _ in row.moved)]
+
+    def from_parameters(self) -> Array:
+        """Matrix M, (count, 12 L), that takes parameters to these columns: `K = K_columns @ M`."""
+        nodes = self.tree.node_of
+        matrix = np.zeros((self.count, len(nodes), parameters.PER_BODY))
+        inertial = reduction_matrix(self.tree).reshape(self.layout.count, len(nodes), -1)
+        matrix[: self.layout.count, :, parameters.INERTIAL] = inertial
+        for body, node in list(enumerate(nodes))[1:]:
+            matrix[self.friction(node), body, parameters.COULOMB] = 1.0
+            matrix[self.friction(node) + 1, body, parameters.VISCOUS] = 1.0
+        return matrix.reshape(self.count, -1)
+
+
+@dataclass(frozen=True)
+class ContactBody:
+    """A body with active contacts.
+
+    `unmeasured`, (k_x, 6): orthonormal rows that span the unmeasured wrench directions, `measured`, (k_m, 6): one row
+    per measured component, both as wrenches at the body's joint frame, in its axes. `components`: contact and component
+    of each measured row. `joints`: places among the mixed joints of those that move the body.
+    """
+
+    body: int
+    unmeasured: Tensor
+    measured: Tensor
+    components: tuple[tuple[int, int], ...]
+    joints: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class StatePlan:
+    """A contact state: bodies in contact; measured joints that the projection mixes, and those it leaves alone.
+
+    `moved`: bodies that mixed joints move directly, ascending, with the joint's place among the mixed ones and the
+    ratio of its motion. `bodies`: on whose parameters mixed rows depend, by the columns `inertial` and `friction`.
+    `extras`: columns of unknowns beside the bodies' parameters.
+    `row_std`: noise of the base rows and mixed joints; `wrench_std`: of the measured components, body by body.
+    """
+
+    contact_bodies: tuple[ContactBody, ...]
+    mixed_joints: tuple[int, ...]
+    lone_joints: tuple[int, ...]
+    moved: tuple[tuple[int, int, float], ...]
+    bodies: range
+    inertial: range
+    friction: tuple[int, ...]
+    row_std: Tensor
+    wrench_std: Tensor
+    extras: tuple[int, ...]
+
+    @property
+    def support(self) -> tuple[int, ...]:
+        """Columns of mixed rows."""
+        return (*self.inertial, *self.friction, *self.extras)
+
+
+class Planner:
+    """Makes the plans of one robot with its contacts and sensors."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        columns: Columns,
+        contacts: Sequence[Contact],
+        sensors: SensorSet,
+        extras: Sequence[Extra] = (),
+    ) -> None:
+        """Look the contacts' frames up."""
+        self.extras = tuple(extras)
+        self.columns = columns
+        self.contacts = tuple(contacts)
+        self.sensors = sensors
+        self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
+        self._measured = measured_components(self.contacts, sensors)
+        self.dof_std = sensors.noise.dofs(robot.n, robot.dofs)
+
+    def plan(self, state: State) -> StatePlan:
+        """The plan of a contact state."""
+        touching: dict[int, list[int]] = {}
+        for contact, active in enumerate(state):
+            if active:
+                touching.setdefault(self.frames[contact][0], []).append(contact)
+        moving = {joint for body in touching for joint in self.columns.joints_above(body)}
+        measured = np.flatnonzero(self.sensors.torque).tolist()
+        mixed = tuple(joint for joint in measured if joint in moving)
+        bodies = tuple(self._contact_body(body, members, mixed) for body, members in touching.items())
+        moved = sorted(
+            (body, place, ratio)
+            for place, joint in enumerate(mixed)
+            for body, ratio in self.columns.joint_rows[joint].moved
+        )
+        bodies_below, starts = self._bodies_below([body for body, _, _ in moved]), self.columns.layout.starts
+        noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
+        return StatePlan(
+            bodies,
+            mixed,
+            tuple(joint for joint in measured if joint not in moving),
+            tuple(moved),
+            bodies_below,
+            range(starts[bodies_below.start], starts[bodies_below.stop]),
+            tuple(self.columns.friction(body) + k for body, _, _ in moved for k in (0, 1)),
+            self._tensor(np.append(noise.base[:base_rows], self.dof_std[list(mixed)])),
+            self._tensor(noise.wrench[[k for body in bodies for _, k in body.components]]),
+            tuple(
+                self.columns.count + number
+                for number, extra in enumerate(self.extras)
+                if extra.dof in mixed or (extra.contact is not None and state[extra.contact[0]])
+            ),
+        )
+
+    def _bodies_below(self, moved: list[int]) -> range:
+        """Hull of the subtrees of some bodies; with a floating base, all bodies."""
+        tree = self.columns.tree
+        if tree.base_rows:
+            return range(tree.bodies)
+        return range(min(moved, default=0), max((tree.subtree_end[body] for body in moved), default=0))
+
+    def _contact_body(self, body: int, contacts: list[int], mixed: tuple[int, ...]) -> ContactBody:
+        unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []
+        for contact in contacts:
+            at_body = wrench_map(self.frames[contact][1]).T
+            for k in self.contacts[contact].components:
+                if self._measured[contact, k]:
+                    measured.append(at_body[k][None])
+                    components.append((contact, k))
+                else:
+                    unmeasured.append(at_body[k][None])
+        _, values, Vh = np.linalg.svd(np.concatenate(unmeasured), full_matrices=False)
+        span = Vh[values > _DEPENDENT * max(values, default=0.0)]
+        above = set(self.columns.joints_above(body))
+        joints = tuple(place for place, joint in enumerate(mixed) if joint in above)
+        return ContactBody(body, self._tensor(span), self._tensor(np.concatenate(measured)), tuple(components), joints)
+
+    def _tensor(self, values: Array) -> Tensor:
+        ancestors = self.columns.tree.ancestors
+        return torch.tensor(values, dtype=ancestors.dtype, device=ancestors.device)
+
+
+def dof_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
+    """What one unit of an unknown of a degree of freedom adds to its row, (B,)."""
+    if extra.dof is None:
+        raise ValueError(f"extra: found {extra.label}; accepted: one of a degree of freedom")
+    if extra.what == "scale":
+        reading = samples.torque
+        return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, extra.dof]
+    if extra.what == "armature":
+        return samples.joint_acceleration[:, extra.dof]
+    if extra.what == "asymmetric_coulomb":
+        return tree.coulomb_sign(samples.joint_velocity[:, extra.dof]).abs()
+    return torch.ones_like(samples.time)
+
+
+def reading_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
+    """What one unit of a contact sensor's unknown takes from its reading along a recorded axis, (B,)."""
+    if extra.what == "offset":
+        return samples.active[:, contact].to(samples.time) if samples.share is None else samples.share[:, contact]
+    reading = samples.wrench
+    return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, contact, axis]
+
+
+def mixed_columns(
+    extras: Sequence[Extra],
+    samples: Samples,
+    plan: StatePlan,
+    tree: KinematicTree,
+    measured: Tensor,
+    W: Tensor,
+    rotations: dict[int, Tensor],
+) -> Iterator[Tensor]:
+    """Columns of some unknowns in mixed rows, (r, B) each.
+
+    Args:
+        extras: which.
+        samples: B of one contact state and rank.
+        plan: of that state.
+        tree: of the robot.
+        measured: (B, k_m, base rows + mixed joints), rows of the contact Jacobian of the measured components.
+        W: (B, base rows + mixed joints, r), the basis.
+        rotations: by contact, (B, 3, 3) from its frame to the recorded axes where these are the world's.
+    """
+    through = (measured @ W).permute(1, 2, 0)  # how each measured component enters the rows
+    places = [place for body in plan.contact_bodies for place in body.components]
+    for extra in extras:
+        if extra.dof is not None:
+            row = W[:, tree.base_rows + plan.mixed_joints.index(extra.dof)]
+            yield row.T * dof_column(extra, samples, tree)
+            continue
+        contact, axis = extra.contact or (0, 0)
+        column, reading = W.new_zeros(W.shape[2], len(samples)), reading_column(extra, samples, contact, axis)
+        vector = range(3) if axis < 3 else range(3, 6)
+        for k in vector if contact in rotations else [axis]:
+            if (contact, k) in places:
+                turned = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
+                column = column + through[places.index((contact, k))] * turned
+        yield column

@@ -1,0 +1,309 @@
+"""What `torchid analyze` found, as tables, text and `analysis.json`, and expected beside measured accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from textwrap import wrap
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+from rich.table import Table
+from rich.text import Text
+
+from torchid.identifiability.base_parameters import BaseParameters, relations, unseen
+from torchid.identifiability.expected_error import ExpectedErrors
+from torchid.problem import Metrics
+from torchid.problem.metrics import GROUPS, group_name
+from torchid.report.figures import STYLE
+from torchid.sensor_planning.candidates import Candidate
+from torchid.sensor_planning.check import LostBase, PostureSummary, StateCheck
+from torchid.sensor_planning.demands import TOLERANCE
+from torchid.sensor_planning.planner import PartPlan, SensorPlan
+
+_WIDTH = 100
+
+
+def plan_document(plan: SensorPlan) -> dict[str, Any]:
+    """Everything the planner found, sensors by name."""
+    ask = plan.question
+    frames = [contact.frame for contact in ask.contacts]
+    return {
+        "contact_states": [[f for f, active in zip(frames, state, strict=True) if active] for state in ask.states],
+        "criterion": ask.criterion,
+        "candidates": [{"name": c.name, "channels": c.channels, "cost": c.cost} for c in ask.candidates],
+        "keep": _names(c for c in ask.candidates if c in ask.keep),
+        "exclude": _names(c for c in ask.candidates if c in ask.exclude),
+        "sensors": _names(plan.chosen),
+        "cost": plan.cost,
+        "lower_bound": plan.lower_bound,
+        "proven": plan.proven,
+        "parts": [
+            {
+                "contacts": list(part.frames),
+                "candidates": _names(part.candidates),
+                "minimal_sets": None if part.sets is None else [_names(chosen) for chosen in part.sets],
+                "cheapest": [{"bits": bits, "sensors": _names(chosen)} for bits, chosen in part.ranked],
+            }
+            for part in plan.parts
+        ],
+        "branches": [
+            {"joints": list(b.joints), "contacts": list(b.contacts), "constrained": b.constrained}
+            for b in plan.branches
+        ],
+        "needs": [
+            {"contacts": list(n.contacts), "joints": list(n.joints), "sensors": n.needed, "proven": n.proven}
+            for n in plan.needs
+        ],
+        "checks": checks_document(plan.checks),
+        "stack": {"rank": plan.stack_rank, "full": plan.stack_full},
+        "without": [
+            {"sensor": r.candidate.name, "base_rank": r.base_rank, "stack_rank": r.stack_rank} for r in plan.removals
+        ],
+    }
+
+
+def checks_document(checks: Sequence[StateCheck]) -> list[dict[str, Any]]:
+    """How a sensor set sees the base, state by state."""
+    return [
+        {
+            "state": check.name,
+            "random_postures": _values(check.generic),
+            "zero_posture": _values(check.zero),
+            "logs": None if check.recorded is None else _values(check.recorded),
+            "lost": None
+            if check.lost is None
+            else {
+                "directions": check.lost.directions.T.tolist(),
+                "words": list(check.lost.words),
+                "posture": check.lost.posture.tolist(),
+                "lacking": [{"contacts": list(frames), "sensors": count} for frames, count in check.lost.culprits],
+                "would_help": _names(check.lost.cures),
+            },
+            "alike_at_zero_posture": [list(names) for names in check.coincident],
+        }
+        for check in checks
+    ]
+
+
+def base_document(base: BaseParameters, body_names: Sequence[str]) -> dict[str, Any]:
+    """Base parameters in numbers and words."""
+    return {
+        "rank": base.rank,
+        "parameters": int(base.free.sum()),
+        "gap": base.gap if base.rank else None,
+        "relations": relations(base, body_names),
+        "unseen": unseen(base, body_names),
+    }
+
+
+def base_text(title: str, base: BaseParameters, body_names: Sequence[str]) -> str:
+    """Base parameters to read, in 100 columns."""
+    seen = f"{base.rank} combinations of {int(base.free.sum())} parameters can be determined, SI units:"
+    lines = [title, "=" * len(title), "", seen, ""]
+    for relation in relations(base, body_names):
+        lines += wrap(relation, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    lost = unseen(base, body_names)
+    lines += ["", "In no combination, whatever the motion:", "", *(lost or ["none"])]
+    return "\n".join(lines) + "\n"
+
+
+def _names(chosen: Iterable[Candidate]) -> list[str]:
+    return [candidate.name for candidate in chosen]
+
+
+def _values(values: PostureSummary) -> dict[str, float | int]:
+    return {"rank": values.rank, "median": values.median, "low": values.low, "least": values.least}
+
+
+_MOST, _CURES, _BASE = 5, 8, 6
+_NEARLY = 1e-3  # of S_b V_x: the noise of the base's rows is a thousand times that of the sensors
+
+
+def set_text(chosen: Sequence[Candidate]) -> str:
+    """Names of sensors, joined by commas."""
+    return ", ".join(candidate.name for candidate in chosen) or "none"
+
+
+def branch_table(plan: SensorPlan) -> Table:
+    """Branches of the robot, which contacts constrain them, and what each group of contacts needs."""
+    table = _table("Branches", "branch", "contacts beyond it", "sensors needed")
+    nothing = "" if plan.question.robot.fixed_base else "none"
+    for branch in plan.branches:
+        needed = [f"{n.needed} for {' + '.join(n.contacts)}" for n in plan.needs if branch.name in n.branches]
+        contacts = ", ".join(branch.contacts) or "free"
+        table.add_row(Text(branch.name), Text(contacts), Text("; ".join(needed) or nothing))
+    for need in plan.needs:
+        if not need.branches:
+            table.add_row("(base)", Text(", ".join(need.contacts)), str(need.needed))
+    return table
+
+
+def sets_table(parts: Sequence[PartPlan]) -> Table:
+    """The cheapest sets of every part of the robot, most informative first."""
+    table = _table("Smallest sets, most informative first", "contacts", "minimal sets", "bits", "sensors")
+    for part in parts:
+        for place, (bits, chosen) in enumerate(part.ranked[:_MOST]):
+            first = place == 0
+            count = "" if not first else "not counted" if part.sets is None else str(len(part.sets))
+            table.add_row(Text(", ".join(part.frames) if first else ""), count, f"{bits:.1f}", Text(set_text(chosen)))
+        if len(part.ranked) > _MOST:
+            table.add_row("", "", "", f"({len(part.ranked) - _MOST} more in analysis.json)")
+    return table
+
+
+def check_table(title: str, checks: Sequence[StateCheck]) -> Table:
+    """rank(S_b V_x) and its smallest singular value over random postures, at position zero and over the logs'."""
+    table = _table(f"{title}: rank(S_b V_x), its smallest singular value", "in contact")
+    table.columns[0].ratio = 1
+    for heading in ("rank", "median", "5 %", "zero\nposture", "logs\nmedian", "logs\nleast"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for check in checks:
+        zero = f"rank {check.zero.rank}" if check.zero.rank < check.generic.rank else f"{check.zero.least:.2g}"
+        logs = ("-", "-") if check.recorded is None else (f"{check.recorded.median:.2g}", f"{check.recorded.least:.2g}")
+        random = (f"{check.generic.rank} of 6", f"{check.generic.median:.2g}", f"{check.generic.low:.2g}")
+        table.add_row(Text(check.name), *random, zero, *logs)
+    return table
+
+
+def check_lines(checks: Sequence[StateCheck]) -> list[str]:
+    """What is lost and what would cure it, and where a set is singular."""
+    lines = []
+    by_loss: dict[tuple[object, ...], list[StateCheck]] = {}
+    for check in checks:
+        if check.lost is not None:
+            by_loss.setdefault((check.lost.words, check.lost.culprits, check.lost.cures), []).append(check)
+    for same in by_loss.values():
+        lost, where = same[0].lost, f"{len(same)} of {len(checks)} contact states"
+        if lost is not None:
+            short = " and ".join(f"{' + '.join(frames)} lacks {_count(count)}" for frames, count in lost.culprits)
+            lines.append(f"{short} in {where}; lost is the {_words(lost)}")
+            cures = set_text(lost.cures[:_CURES]) if lost.cures else "no single candidate"
+            lines.append(f"  any of these would help: {cures}")
+    near = [check for check in checks if check.lost is None and check.recorded and check.recorded.least < _NEARLY]
+    if near:
+        least = min(check.recorded.least for check in near if check.recorded)
+        lines.append(
+            f"warning: at some postures of the logs the base is all but lost (smallest singular value {least:.2g})"
+        )
+    rare = sum(check.lost is None and check.generic.low < TOLERANCE for check in checks)
+    if rare:
+        where = f"{rare} of {len(checks)} contact states"
+        lines.append(f"warning: in {where} the base is as good as lost at one random posture in twenty or more")
+    falling = [check for check in checks if check.lost is None and check.zero.rank < check.generic.rank]
+    if falling:
+        alike = dict.fromkeys(names for check in falling for names in check.coincident)
+        cause = "; ".join(" = ".join(names) for names in alike)
+        lines.append(
+            "warning: the base is lost where all joints are at zero, and all but lost near it"
+            + (f"; sensors that read alike there: {cause}" if cause else "")
+        )
+    return lines
+
+
+def _words(lost: LostBase) -> str:
+    return "whole base" if len(lost.words) == _BASE else f"base's {' and '.join(lost.words)}"
+
+
+def _count(sensors: int) -> str:
+    return "1 sensor" if sensors == 1 else f"{sensors} sensors"
+
+
+def removal_table(plan: SensorPlan) -> Table:
+    """What is left without one sensor, by the criterion of each sample and by the stack of all."""
+    title = (
+        f"Without one sensor (inertial combinations: {plan.stack_rank} with this set, "
+        f"{plan.stack_full} with every candidate)"
+    )
+    table = _table(title, "without", "rank(S_b V_x) of each sample", "combinations, all samples together")
+    for removal in plan.removals:
+        rank = "fixed base" if removal.base_rank is None else f"{removal.base_rank} of 6"
+        table.add_row(Text(removal.candidate.name), rank, str(removal.stack_rank))
+    return table
+
+
+def _table(title: str, *headings: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    for place, heading in enumerate(headings):
+        table.add_column(heading, overflow="fold", justify="left" if place == 0 or heading == "sensors" else "right")
+    return table
+
+
+_MODEL, _EXPECTED, _MEASURED = ("o", "tab:blue"), ("s", "0.6"), ("D", "black")
+
+
+@dataclass(frozen=True)
+class SetAccuracy:
+    """Of a fit with one sensor set: errors that were expected, and those measured on unseen logs, if there are any."""
+
+    channels: int
+    rank: int
+    expected: ExpectedErrors
+    measured: Metrics | None
+
+    def as_dict(self) -> dict[str, object]:
+        """Rms by group of rows."""
+        return {
+            "channels": self.channels,
+            "rank": self.rank,
+            "expected_model_error": self.expected.model,
+            "expected_sensor_noise": self.expected.sensors,
+            "expected": self.expected.total,
+            "measured": None if self.measured is None else self.measured.rms,
+        }
+
+
+def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
+    """Expected and measured rms error by group of rows."""
+    title = "Accuracy of sensor sets, rms error: expected of the model, with noise added, measured"
+    table = Table(title=title, title_justify="left")
+    table.add_column("sensors", overflow="fold")
+    table.add_column("channels", justify="right")
+    table.add_column("rank", justify="right")
+    table.add_column("", no_wrap=True)
+    for label in GROUPS.values():
+        table.add_column(Text(label.replace(" [", "\n[")), justify="right")
+    for name, found in sets.items():
+        first: list[Text | str] = [Text(name), str(found.channels), str(found.rank)]
+        for label, errors in (
+            ("expected", found.expected.model),
+            ("with noise", found.expected.total),
+            ("measured", {} if found.measured is None else found.measured.rms),
+        ):
+            table.add_row(*first, label, *(_figure(errors.get(group)) for group in GROUPS))
+            first = ["", "", ""]
+        table.add_section()
+    return table
+
+
+def _figure(x: float | None) -> str:
+    return "-" if x is None else f"{x:.3g}"
+
+
+@matplotlib.rc_context(STYLE)
+def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
+    """One panel per group of rows, with the sensor sets side by side on a logarithmic scale."""
+    figure = Figure(figsize=(2.6 * len(GROUPS) + 0.6, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(GROUPS))
+    place = np.arange(len(sets))
+    for axis, (group, label) in zip(axes, GROUPS.items(), strict=True):
+        measured = [None if found.measured is None else found.measured.rms[group] for found in sets.values()]
+        for shift, name, (marker, color), heights in (
+            (-0.15, "expected model error", _MODEL, [found.expected.model[group] for found in sets.values()]),
+            (0.0, "expected, with noise added", _EXPECTED, [found.expected.total[group] for found in sets.values()]),
+            (0.15, "measured on the test logs", _MEASURED, measured),
+        ):
+            known = [np.nan if height is None else height for height in heights]
+            axis.plot(place + shift, known, marker, color=color, markersize=7, label=name)
+        axis.set_yscale("log")
+        axis.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
+        axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
+        axis.margins(x=0.3 / max(len(sets) - 1, 1), y=0.15)
+        axis.set_xticks(place, list(sets), rotation=40, ha="right")
+        axis.set_title(group_name(group), loc="left", fontsize=9)
+        axis.set_ylabel(f"rms error {label[label.index('[') :]}")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
+    return figure

@@ -1,0 +1,273 @@
+"""Information of sensor sets over all samples of a motion, many sets from one pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid import parameters
+from torchid.errors import SensorError
+from torchid.identifiability.information import information_in, prior_directions, unit_readings
+from torchid.identifiability.rank import structural_rank
+from torchid.identifiability.structure import structural_problem, structural_samples
+from torchid.parameters import Array
+from torchid.problem import LinearProblem, RowBuilder, Samples
+from torchid.problem.chunks import one_thread, share_out, spread_by_state, worker_count
+from torchid.problem.contact_state import State
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorNoise, SensorSet
+from torchid.sensor_planning.candidates import Candidate, sensor_set
+from torchid.sensor_planning.search import Component
+
+_UNSEEN = 1e-9  # a share of the largest column in units of the scales, or of unit columns, that is rounding
+
+
+class MotionStack:
+    """Ranks of the stack of many samples, of inertial parameters, for any choice of sensors.
+
+    `rank(S_b V_x) = 6` in every sample suffices to reach every body. It is not necessary: what a sample loses of the
+    base depends on its posture, and another sample may show it.
+
+    How inertia is split at a weld with a force/torque sensor does not count: no other sensor could tell.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        contacts: Sequence[Contact],
+        states: Sequence[State],
+        candidates: Sequence[Candidate],
+        seed: int = 0,
+    ) -> None:
+        """Draw samples of every contact state, to be used for all sets."""
+        self.robot, self.contacts, self.states = robot, tuple(contacts), tuple(states)
+        self.candidates = tuple(candidates)
+        self.samples = structural_samples(robot, contacts, states, seed=seed)
+
+    def problem(self, sensors: SensorSet, friction: bool = True) -> LinearProblem:
+        """What a sensor set sees of the samples, as `structural_problem`."""
+        return structural_problem(self.robot, self.contacts, sensors, self.states, friction, self.samples)
+
+    def rank(self, chosen: Iterable[Candidate]) -> int:
+        """Independent combinations of inertial parameters that a set of sensors determines."""
+        problem = self.problem(sensor_set(self.robot, self.contacts, chosen), friction=False)
+        return structural_rank(problem).rank - _rank_of(_splits(self.robot), problem)
+
+    @cached_property
+    def full(self) -> int:
+        """The rank with all candidates."""
+        return self.rank(self.candidates)
+
+
+def _splits(robot: Robot) -> Array:
+    """Changes of all parameters, (12 L, M), that take inertia from the body before a weld and add it to that beyond."""
+    found = [np.zeros((robot.nominal.size, 0))]
+    for index, body in enumerate(robot.bodies):
+        joint = body.joint
+        if joint is None or joint.kind != "fixed" or body.massless or robot.bodies[joint.parent].massless:
+            continue
+        changes = np.zeros((*robot.nominal.shape, parameters.INERTIAL.stop))
+        changes[index, parameters.INERTIAL] = np.eye(parameters.INERTIAL.stop)
+        X = parameters.change_of_frame(joint.T_parent_joint @ joint.T_joint_link)
+        changes[joint.parent, parameters.INERTIAL] = -X
+        found.append(changes.reshape(robot.nominal.size, -1))
+    return np.hstack(found)
+
+
+def _rank_of(changes: Array, problem: LinearProblem) -> int:
+    """Rank of what a problem's rows see of some changes of its parameters, (P, M), each of the size of one of them."""
+    least = _UNSEEN * np.linalg.norm(problem.A * problem.scale, axis=0).max(initial=0.0)
+    sizes = (np.abs(changes) / problem.scale[:, None]).max(axis=0, initial=0.0)
+    columns = problem.A @ (changes / np.maximum(sizes, np.finfo(float).tiny))
+    norms = np.linalg.norm(columns, axis=0)
+    seen = columns[:, norms > least] / norms[norms > least]
+    return int(np.linalg.matrix_rank(seen, tol=_UNSEEN)) if seen.size else 0
+
+
+def sparse_set(
+    stack: MotionStack,
+    keep: Iterable[Candidate] = (),
+    exclude: Iterable[Candidate] = (),
+    done: Callable[[], None] | None = None,
+) -> tuple[Candidate, ...]:
+    """Sensors with which the stack still has the rank of all candidates, and none of which can be spared for it.
+
+    The dearest are dropped first; a cheaper set of another kind may exist.
+
+    Raises:
+        SensorError: the candidates that are left have a lower rank than all of them.
+    """
+    kept, excluded = frozenset(keep), frozenset(exclude)
+    chosen = [c for c in stack.candidates if c not in excluded]
+    if stack.rank(chosen) < stack.full:
+        found = f"without {', '.join(sorted(c.name for c in excluded))} fewer parameters are determined"
+        raise SensorError("sensors", "exclude", found, "other exclusions, or criterion: per_sample")
+    for candidate in sorted(set(chosen) - kept, key=lambda c: (-c.cost, stack.candidates.index(c))):
+        fewer = [c for c in chosen if c is not candidate]
+        if stack.rank(fewer) == stack.full:
+            chosen = fewer
+        if done is not None:
+            done()
+    return tuple(chosen)
+
+
+_SAMPLES = 96  # a contact state: bits change by less than 1 % with four times as many
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class _StateRows:
+    """Of B samples with all sensors: rows that hang on each candidate, Q (B, c, nv) and Q R (B, c, P)."""
+
+    weight: float
+    owners: list[int]
+    Q: Tensor
+    QR: Tensor
+
+
+class SetRanking:
+    """Bits that any choice from some candidates gives, beside sensors that are there anyway.
+
+    A sensor that is left out takes one row per sample and channel with it: with R the whitened rows of all sensors and
+    c the way its channel enters the generalized force, L^-1 Q R, where Q = c^T W and L L^T = Q Q^T.
+    """
+
+    @one_thread()
+    @torch.no_grad()
+    def __init__(
+        self,
+        robot: Robot,
+        contacts: Sequence[Contact],
+        logs: Sequence[Samples],
+        candidates: Sequence[Candidate],
+        others: Sequence[Candidate],
+        noise: SensorNoise,
+        prior: Array,
+    ) -> None:
+        """Work out the rows of all sensors together.
+
+        Args:
+            robot: the robot.
+            contacts: its contacts.
+            logs: samples to weigh the sensors by; forces in them do not matter.
+            candidates: to choose from.
+            others: sensors that are there in any case.
+            noise: of all sensors.
+            prior: (12 L,), how far parameters may be off the nominal ones, 0 where they are known.
+        """
+        self.candidates = tuple(candidates)
+        sensors = sensor_set(robot, contacts, [*candidates, *others], noise)
+        builder = RowBuilder(robot, contacts, sensors)
+        directions = torch.from_numpy(prior_directions(builder, prior))
+        self._states: list[_StateRows] = []
+        self._information = torch.eye(directions.shape[1], dtype=torch.float64)
+        for samples, state, stands_for in spread_by_state(logs, _SAMPLES):
+            weight = stands_for / samples.oversampling
+            rows, W = builder.rows_by_sample(samples, state)
+            R = rows[..., :-1] @ directions
+            self._information += information_in(R, weight)
+            owners, ways = self._ways(builder, samples, state)
+            if owners:
+                Q = unit_readings(ways, W)
+                self._states.append(_StateRows(weight, owners, Q, Q @ R))
+
+    def _ways(self, builder: RowBuilder, samples: Samples, state: State) -> tuple[list[int], Tensor]:
+        """How each channel of the candidates enters the generalized force, (B, c, nv), and whose channel it is."""
+        J = builder.contact_jacobian(samples)
+        base, owners, ways = builder.tree.base_rows, [], []
+        for number, candidate in enumerate(self.candidates):
+            for dof in candidate.dofs:
+                way = J.new_zeros(len(samples), J.shape[-1])
+                way[:, base + dof] = 1.0
+                ways.append(way)
+                owners.append(number)
+            if candidate.contact is not None and state[candidate.contact]:
+                ways += [J[:, candidate.contact, k] for k in candidate.components]
+                owners += [number] * len(candidate.components)
+        return owners, torch.stack(ways, dim=1) if ways else J.new_zeros(len(samples), 0, J.shape[-1])
+
+    @one_thread()
+    @torch.no_grad()
+    def bits(self, chosen: Iterable[Candidate]) -> float:
+        """Information [bits] about the parameters, against knowing each to within its prior."""
+        kept = {self.candidates.index(candidate) for candidate in chosen}
+        information = self._information
+        for rows in self._states:
+            gone = [row for row, owner in enumerate(rows.owners) if owner not in kept]
+            if gone:
+                Q = rows.Q[:, gone]
+                gram = Q @ Q.mT
+                gram.diagonal(dim1=1, dim2=2).add_(_ROUNDING)  # channels that read alike, or nothing
+                lost = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows.QR[:, gone], upper=False)
+                information = information - information_in(lost, rows.weight)
+        return float(0.5 * torch.linalg.slogdet(information).logabsdet / np.log(2.0))
+
+
+def best_first(
+    ranking: SetRanking, sets: Sequence[tuple[Candidate, ...]], done: Callable[[], None] | None = None
+) -> list[tuple[float, tuple[Candidate, ...]]]:
+    """Sets with their bits, most informative first; `done` is told of each, from several threads."""
+
+    def run(places: Iterator[int]) -> list[tuple[float, int]]:
+        found = []
+        for place in places:
+            found.append((-ranking.bits(sets[place]), place))
+            if done is not None:
+                done()
+        return found
+
+    workers = min(worker_count(torch.device("cpu")), max(len(sets), 1))
+    found = sorted(chain.from_iterable(share_out(range(len(sets)), run, workers)))
+    return [(-bits, sets[place]) for bits, place in found]
+
+
+_ROUNDS = 12
+_SAME_COST = 1e-9
+
+
+def exchanged(
+    ranking: SetRanking,
+    part: Component,
+    first: Sequence[Candidate],
+    keep: AbstractSet[Candidate],
+    exclude: AbstractSet[Candidate],
+) -> list[tuple[float, tuple[Candidate, ...]]]:
+    """Sets found from a sufficient one by exchanging one sensor at a time, uphill in information, best first.
+
+    Args:
+        ranking: of the part's candidates.
+        part: whose demands every set meets.
+        first: where to start.
+        keep: sensors that stay.
+        exclude: sensors that cannot be taken.
+    """
+    best = (ranking.bits(first), tuple(first))
+    climbed = [best]
+    for _ in range(_ROUNDS):
+        neighbours = [(ranking.bits(found), found) for found in _neighbours(part, best[1], keep, exclude)]
+        higher = max(neighbours, key=lambda pair: pair[0], default=best)
+        if higher[0] <= best[0]:
+            break
+        best = higher
+        climbed.append(best)
+    return climbed[::-1]
+
+
+def _neighbours(
+    part: Component, chosen: Sequence[Candidate], keep: AbstractSet[Candidate], exclude: AbstractSet[Candidate]
+) -> Iterator[tuple[Candidate, ...]]:
+    """Sufficient sets that differ by one sensor of the same cost."""
+    for gone in chosen:
+        for new in part.candidates:
+            same_cost = abs(new.cost - gone.cost) <= _SAME_COST * gone.cost
+            if gone not in keep and new not in exclude and new not in chosen and same_cost:
+                found = tuple(c for c in part.candidates if (c in chosen and c is not gone) or c is new)
+                if not any(demand.missing(found) for demand in part.demands):
+                    yield found

@@ -1,0 +1,326 @@
+"""The cheapest sensor set, with a proof that no cheaper one exists, and all sets without a sensor to spare."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from itertools import chain, combinations, islice
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+
+from torchid.errors import SensorError
+from torchid.parameters import Array
+from torchid.problem.chunks import one_thread
+from torchid.sensor_planning.candidates import Candidate, total_cost
+from torchid.sensor_planning.demands import TOLERANCE, Demand, connected, orthonormal, outside, spanning
+
+_DEVICES, _COMBINATIONS, _BATCH = 5, 100_000, 4096
+
+
+@dataclass(frozen=True)
+class LeastCost:
+    """No set that meets the demand costs less than `bound`; `chosen`, the best set found, costs that if it is exact."""
+
+    bound: float
+    chosen: tuple[Candidate, ...]
+
+
+def least_cost(demand: Demand, candidates: Sequence[Candidate]) -> LeastCost:
+    """The cheapest of the candidates that meet one demand, which they can; without a set if there are too many.
+
+    Sensors of several components are taken or left in all ways; the rest is a choice among single vectors.
+    """
+    ours = [c for c in candidates if c in demand.vectors]
+    devices = [c for c in ours if demand.vectors[c].shape[1] > 1]
+    single = sorted((c for c in ours if c not in devices), key=lambda c: c.cost)
+    if len(devices) > _DEVICES:
+        return LeastCost(0.0, ())
+    cost, best = np.array([c.cost for c in single]), LeastCost(math.inf, ())
+    for taken in chain.from_iterable(combinations(devices, count) for count in range(len(devices) + 1)):
+        basis = orthonormal(demand.stacked(taken))
+        target, vectors = outside(demand.target, basis), outside(demand.stacked(single), basis)
+        bound, places = _least_of_vectors(spanning(target), vectors, cost)
+        bound += total_cost(taken)
+        if bound < best.bound:
+            best = LeastCost(bound, (*taken, *(single[k] for k in places)))
+    return best
+
+
+def _least_of_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float, Sequence[int]]:
+    """Bound and places of the choice among vectors (k, N), by ascending cost (N,), that spans a target (k, d)."""
+    d, length = target.shape[1], np.linalg.norm(vectors, axis=0)
+    if d == 0:
+        return 0.0, ()
+    places = np.flatnonzero(length > TOLERANCE)
+    vectors, cost = vectors[:, places] / length[places], cost[places]
+    rest = outside(vectors, target)
+    length = np.linalg.norm(rest, axis=0)
+    inside = length <= TOLERANCE
+    rest = (spanning(rest).T @ rest) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
+    best, chosen, budget = math.inf, np.zeros(0, dtype=int), _COMBINATIONS
+    for g in range(len(rest) + 1):
+        floor = float(cost[: d + g].sum()) if d + g <= len(cost) else math.inf
+        budget -= math.comb(int((~inside).sum()), g) if g < len(rest) else 1
+        if floor >= best or budget < 0:
+            return min(best, floor), places[chosen].tolist()
+        for flat in _flats(rest, inside, g, d + g):
+            basis = _cheapest_basis(vectors, flat)
+            if len(basis) == d + g and cost[basis].sum() < best:
+                best, chosen = float(cost[basis].sum()), np.array(basis)
+    return best, places[chosen].tolist()
+
+
+def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.ndarray]:
+    """Members (N,) bool of flats of dimension g that have at least so many."""
+    if g == len(rest):
+        yield np.ones(rest.shape[1], dtype=bool)
+        return
+    generators = combinations(np.flatnonzero(~inside).tolist(), g)
+    while some := list(islice(generators, _BATCH)):
+        picked = np.array(some, dtype=int).reshape(len(some), g)
+        basis = orthonormal(rest[:, picked].transpose(1, 0, 2))  # (some, dimensions, g)
+        member = (np.linalg.norm(outside(rest, basis), axis=1) <= TOLERANCE) | inside
+        yield from np.unique(member[member.sum(1) >= least], axis=0)
+
+
+def _cheapest_basis(vectors: Array, flat: np.ndarray) -> list[int]:
+    """Places of independent vectors among the members (N,) bool of a flat, the first ones first."""
+    basis, chosen = np.zeros((len(vectors), 0)), []
+    for place in np.flatnonzero(flat).tolist():
+        left = outside(vectors[:, [place]], basis)
+        length = np.linalg.norm(left)
+        if length > TOLERANCE:
+            basis = np.hstack([basis, left / length])
+            chosen.append(place)
+    return chosen
+
+
+_MEMORY = 2**22  # numbers in one batch of the enumeration
+
+
+@dataclass(frozen=True)
+class Component:
+    """Demands that compete for the same candidates: a part of the problem that can be solved on its own."""
+
+    demands: tuple[Demand, ...]
+    candidates: tuple[Candidate, ...]
+
+
+def components(demands: Sequence[Demand], candidates: Sequence[Candidate]) -> list[Component]:
+    """Independent parts. A candidate in none of them is never needed."""
+    acting = [demand.vectors.keys() & set(candidates) for demand in demands]
+    return [
+        Component(
+            tuple(demands[place] for place in places),
+            tuple(c for c in candidates if any(c in acting[place] for place in places)),
+        )
+        for places in connected(acting)
+    ]
+
+
+@one_thread()
+def all_minimal_sets(
+    demands: Sequence[Demand],
+    candidates: Sequence[Candidate],
+    keep: Iterable[Candidate] = (),
+    exclude: Iterable[Candidate] = (),
+    limit: int = 14,
+) -> list[tuple[Candidate, ...]] | None:
+    """Every sufficient set that would not suffice without any one of its candidates (but the kept ones).
+
+    Meant for the demands and candidates of one `Component`: the sets of a robot are all unions of one set of each.
+
+    Args:
+        demands: to be met.
+        candidates: to choose from.
+        keep: in every set.
+        exclude: in none.
+        limit: the most candidates to enumerate the sets of.
+
+    Returns:
+        The sets by size; None if more than `limit` candidates are open.
+
+    Raises:
+        SensorError: as `usable_candidates`.
+    """
+    kept, usable = usable_candidates(demands, candidates, keep, exclude)
+    free = [c for c in usable if c not in kept]
+    if len(free) > limit:
+        return None
+    numbers = np.arange(2 ** len(free))
+    member = (numbers[:, None] >> np.arange(len(free))) & 1 == 1  # (sets, candidates)
+    size = member.sum(1)
+    sufficient, found = np.zeros(len(numbers), dtype=bool), []
+    for count in range(len(free) + 1):
+        same = numbers[size == count]
+        for bit in range(len(free)):  # a sufficient set with one more candidate is sufficient, and not minimal
+            sufficient[same] |= sufficient[same & ~(1 << bit)]
+        same = same[~sufficient[same]]
+        sufficient[same] = _sufficient(demands, free, kept, member[same])
+        found += [frozenset(free[k] for k in np.flatnonzero(member[s])) | kept for s in same[sufficient[same]]]
+    return [tuple(c for c in candidates if c in chosen) for chosen in found]
+
+
+def usable_candidates(
+    demands: Sequence[Demand], candidates: Sequence[Candidate], keep: Iterable[Candidate], exclude: Iterable[Candidate]
+) -> tuple[frozenset[Candidate], tuple[Candidate, ...]]:
+    """The kept candidates and all that are not excluded, once these are known to suffice.
+
+    Raises:
+        SensorError: they do not suffice, or one is both kept and excluded.
+    """
+    kept, excluded = frozenset(keep), frozenset(exclude)
+    for both in kept & excluded:
+        raise SensorError("sensors", "keep", f"'{both.name}', which is also excluded", "one or the other")
+    usable = tuple(c for c in candidates if c not in excluded)
+    lacking = [
+        f"{short} of {demand.target.shape[1]} dimensions of {' + '.join(demand.frames)}"
+        for demand in demands
+        if (short := demand.missing(usable))
+    ]
+    if lacking:
+        found = f"all of them leave {'; '.join(lacking)} unseen"
+        raise SensorError(
+            "sensors", "candidates", found, "more candidates: joints on the way there, contact components"
+        )
+    return kept, usable
+
+
+def _sufficient(
+    demands: Sequence[Demand], free: Sequence[Candidate], kept: AbstractSet[Candidate], member: Array
+) -> Array:
+    """Which sets meet every demand, (N,) bool, for membership (N, len(free)) of candidates beside the kept ones."""
+    result = np.ones(len(member), dtype=bool)
+    for demand in demands:
+        ours = [k for k, c in enumerate(free) if c in demand.vectors]
+        owner = np.repeat(ours, [demand.vectors[free[k]].shape[1] for k in ours]).astype(int)
+        always, vectors = demand.stacked(kept), demand.stacked(free)
+        for some in np.array_split(np.flatnonzero(result), 1 + len(member) * vectors.size // _MEMORY):
+            masked = vectors * member[some][:, None, owner]
+            fixed = np.broadcast_to(always, (len(some), *always.shape))
+            basis = orthonormal(np.concatenate([fixed, masked], axis=2))
+            result[some] = demand.unreached(basis) == 0
+    return result
+
+
+def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: AbstractSet[Candidate]) -> Iterator[Array]:
+    """Some that a set violates which does not meet the demand.
+
+    Each F is `chosen`, enlarged while it leaves as much of the target unreached: fewer and smaller weights for the same
+    right-hand side. Enlarging first by what does not act on one of the contacts finds what that contact needs.
+
+    Yields:
+        Rows (n + 1,): weights of the n candidates, then the right-hand side.
+    """
+    ours = [c for c in candidates if c in demand.vectors]
+    start = orthonormal(demand.stacked(c for c in ours if c in chosen))
+    short = int(demand.unreached(start))
+    for contact in demand.contacts:
+        rows = np.array(demand.rows) == contact
+        there = {c for c in ours if demand.vectors[c][rows].any()}
+        for order in (ours, ours[::-1]):
+            basis = start
+            for candidate in sorted(order, key=lambda c: c in there):
+                wider = orthonormal(np.hstack([basis, demand.vectors[candidate]]))
+                if demand.unreached(wider) == short:
+                    basis = wider
+            gains = demand.gains(basis)
+            weights = [0 if c in chosen else min(gains.get(c, 0), short) for c in candidates]
+            yield np.array([*weights, short], dtype=float)
+
+
+_EXACT = 1e-7  # relative; what a solver of integer programs rounds
+
+
+@dataclass(frozen=True)
+class CheapestSet:
+    """A sufficient set, by the order of the candidates; `proven` if its cost is `lower_bound`, the least possible."""
+
+    chosen: tuple[Candidate, ...]
+    cost: float
+    lower_bound: float
+    proven: bool
+
+
+@one_thread()
+def cheapest_set(
+    demands: Sequence[Demand],
+    candidates: Sequence[Candidate],
+    keep: Iterable[Candidate] = (),
+    exclude: Iterable[Candidate] = (),
+    seconds: float = 60.0,
+) -> CheapestSet:
+    """The cheapest set of candidates that meets every demand.
+
+    Args:
+        demands: from `torchid.sensor_planning.demands.demands`.
+        candidates: to choose from.
+        keep: in the set, needed or not.
+        exclude: not in the set.
+        seconds: after these, the best set found is returned with the bound reached, unproven.
+
+    Raises:
+        SensorError: as `usable_candidates`.
+    """
+    kept, usable = usable_candidates(demands, candidates, keep, exclude)
+    deadline = time.monotonic() + seconds
+    solved = [_cheapest_part(part, kept, deadline) for part in components(demands, usable)]
+    chosen = kept.union(*(result.chosen for result in solved))
+    beside = total_cost(kept.difference(*(result.chosen for result in solved)))
+    return CheapestSet(
+        tuple(c for c in candidates if c in chosen),
+        total_cost(chosen),
+        beside + sum(result.lower_bound for result in solved),
+        all(result.proven for result in solved),
+    )
+
+
+def _cheapest_part(part: Component, kept: AbstractSet[Candidate], deadline: float) -> CheapestSet:
+    cost = np.array([c.cost for c in part.candidates])
+    must = np.array([float(c in kept) for c in part.candidates])
+    alone = [least_cost(demand, part.candidates) for demand in part.demands]
+    cuts = [row for demand in part.demands for row in inequalities(demand, part.candidates, frozenset())]
+    cuts += [
+        np.append(cost * [c in d.vectors for c in part.candidates], least.bound)
+        for d, least in zip(part.demands, alone, strict=True)
+    ]
+    guesses = [frozenset(chosen for least in alone for chosen in least.chosen), *(frozenset(a.chosen) for a in alone)]
+    best, bound = min((_pruned(part, guess, kept) for guess in guesses), key=total_cost), max(a.bound for a in alone)
+    while True:
+        A = np.unique(np.array(cuts).reshape(-1, len(cost) + 1), axis=0)
+        left = max(deadline - time.monotonic(), 0.0)
+        solved = milp(
+            cost,
+            constraints=LinearConstraint(A[:, :-1], A[:, -1], np.inf),
+            integrality=np.ones(len(cost)),
+            bounds=Bounds(must, 1.0),
+            options={"mip_rel_gap": 0.0, "time_limit": left},
+        )
+        bound = max(bound, solved.mip_dual_bound or 0.0)
+        if solved.status != 0:  # out of time
+            break
+        relaxed = frozenset(c for c, x in zip(part.candidates, solved.x, strict=True) if x > 0.5)
+        violated = [
+            row for d in part.demands if d.missing(relaxed) for row in inequalities(d, part.candidates, relaxed)
+        ]
+        best = min(best, _pruned(part, relaxed, kept), key=total_cost)
+        if not violated or total_cost(best) <= bound * (1.0 + _EXACT):
+            break
+        cuts += violated
+    proven = math.isclose(total_cost(best), bound, rel_tol=_EXACT)
+    chosen = tuple(c for c in part.candidates if c in best)
+    return CheapestSet(chosen, total_cost(best), total_cost(best) if proven else bound, proven)
+
+
+def _pruned(part: Component, wanted: AbstractSet[Candidate], kept: AbstractSet[Candidate]) -> frozenset[Candidate]:
+    """A sufficient set: all candidates, less whatever can be spared, the unwanted and the dear first."""
+    chosen = frozenset(part.candidates)
+    for candidate in sorted(chosen - kept, key=lambda c: (c in wanted, -c.cost, c.name)):
+        fewer = chosen - {candidate}
+        if not any(d.missing(fewer) for d in part.demands if candidate in d.vectors):
+            chosen = fewer
+    return chosen
