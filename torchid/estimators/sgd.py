@@ -172,7 +172,7 @@ class Loss(nn.Module):
 
     Attributes:
         learnable: parameters of the bodies.
-        residual: module r(q, v, a) -> (B, nv) [N, N m] whose output adds to K phi, or None.
+        residual: module r(q, v, a) -> (B, n_rows) [N, N m] whose output adds to K phi, or None.
         residual_weight: of the mean square of the module's whitened force; None, which counts as 0, until it is chosen.
     """
 
@@ -216,7 +216,7 @@ class Loss(nn.Module):
         return Terms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
 
     def forces(self, batch: Batch, phi: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Whitened projected forces, (B, nv), of parameters (12 L,) and of the residual module."""
+        """Whitened projected forces, (B, n_rows), of parameters (12 L,) and of the residual module."""
         rigid = batch.K @ (self._columns @ phi)
         if self.residual is None:
             return rigid, None

@@ -123,7 +123,7 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
     )
     for samples, state, weight in spread_by_state(logs, _CHECKED):
         for _, V in builder.bases(samples.to(builder.device), state):
-            rows[state] = max(rows[state], V.shape[2] + len(builder.plan(state).lone_joints))
+            rows[state] = max(rows[state], V.shape[2] + len(builder.layout(state).uncoupled_joints))
             if builder.tree.base_rows:
                 values[state].append(base_singular_values(V).cpu())
                 weights[state].append(torch.full((len(V),), weight))

@@ -15,7 +15,7 @@ from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import State
 from torchid.regressor import FrameJacobian, motion_from_state
-from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross, joint_states
+from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross_product, joint_motion
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
@@ -132,7 +132,7 @@ def _drift(robot: Robot, held: Sequence[Contact], q: Tensor, v: Tensor) -> Tenso
     """dJ_C/dt v, (B, k): what the held components would accelerate by with a = 0, in the contacts' own axes."""
     tree = KinematicTree(robot)
     motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
-    states = body_states(tree, motion, joint_states(tree, motion))
+    states = body_states(tree, motion, joint_motion(tree, motion))
     rows = []
     for contact in held:
         node, T_joint_frame = tree.frame(robot, contact.frame)
@@ -145,7 +145,9 @@ def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor) -> Tenso
     rotation = states.rotation[:, :, body]
     arm = (rotation * T_joint_frame[:3, 3, None]).sum(1)
     omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
-    linear = states.specific_force[:, body] + cross(alpha, arm) + cross(omega, cross(omega, arm))
+    linear = (
+        states.specific_force[:, body] + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
+    )
     in_joint_frame = (rotation[:, :, None] * torch.stack([linear, alpha], dim=1)[:, None]).sum(0)
     return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))
 

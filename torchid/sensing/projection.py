@@ -136,7 +136,7 @@ _BASE_RANK_TOLERANCE = 1e-6  # V_x is orthonormal: singular values of S_b V_x ar
 class ProjectedGroup:
     """Samples that share a contact state and a rank.
 
-    `index`, (B',), into the batch; `active`, (k,) bool, rows of J_C in contact; `V`, (B', nv, r); `K`, (B', r, P);
+    `index`, (B',), into the batch; `active`, (k,) bool, rows of J_C in contact; `V`, (B', n_rows, r); `K`, (B', r, P);
     `f`, (B', r); `base_rank`, (B',), rank(S_b V_x). `V` is whitened, no longer orthonormal, if a noise was given.
     """
 
@@ -149,7 +149,7 @@ class ProjectedGroup:
 
 
 def base_singular_values(V: Tensor) -> Tensor:
-    """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, nv, r) orthonormal."""
+    """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, n_rows, r) orthonormal."""
     values = torch.linalg.svdvals(V[:, :6])
     return nn.functional.pad(values, (0, 6 - values.shape[1]))
 
@@ -223,9 +223,9 @@ class Projection(nn.Module):
         """Project a batch.
 
         Args:
-            J_C: (B, k, nv), contact Jacobian with the rows of all contacts, active or not.
+            J_C: (B, k, n_rows), contact Jacobian with the rows of all contacts, active or not.
             active: (B, k) bool, rows whose contact touches the ground. The wrench of others is zero, whatever was read.
-            K: (B, nv, P), or any other matrix with the rows of the dynamics.
+            K: (B, n_rows, P), or any other matrix with the rows of the dynamics.
             torque: (B, n), read only where measured [N m].
             wrench: (B, k), by the rows of J_C, read only where measured and active [N, N m].
 

@@ -147,7 +147,7 @@ def _demand(
     J: Array,
     candidates: Sequence[Candidate],
 ) -> Demand:
-    """What a group demands, from the Jacobians of all contacts, (C, 6, nv + 6 F)."""
+    """What a group demands, from the Jacobians of all contacts, (C, 6, n_rows)."""
     rows = [(place, k) for place in group for k in contacts[place].components]
     J_group = np.stack([J[row] for row in rows])
     J_group /= np.linalg.norm(J_group[:, :6])

@@ -124,7 +124,7 @@ _ROUNDING = 1e-13
 
 @dataclass(frozen=True)
 class _StateRows:
-    """Of B samples with all sensors: rows that hang on each candidate, Q (B, c, nv) and Q R (B, c, P)."""
+    """Of B samples with all sensors: rows that hang on each candidate, Q (B, c, n_rows) and Q R (B, c, P)."""
 
     weight: float
     owners: list[int]
@@ -179,7 +179,7 @@ class SetRanking:
                 self._states.append(_StateRows(weight, owners, Q, Q @ R))
 
     def _ways(self, builder: RowBuilder, samples: Samples, state: State) -> tuple[list[int], Tensor]:
-        """How each channel of the candidates enters the generalized force, (B, c, nv), and whose channel it is."""
+        """How each channel of the candidates enters the generalized force, (B, c, n_rows), and whose it is."""
         J = builder.contact_jacobian(samples)
         base, owners, ways = builder.tree.base_rows, [], []
         for number, candidate in enumerate(self.candidates):
