@@ -74,7 +74,14 @@ class ChunkTerms:
 
 
 class RowBuilder(nn.Module):
-    """Rows of `W^T [K_columns | f]`: W a basis of V_x's span under which the projected sensor noise is white."""
+    """Rows of `W^T [K_columns | f]`: W a basis of V_x's span under which the projected sensor noise is white.
+
+    The fast path to the equations that `torchid.Projection` makes of `torchid.Regressor` and `torchid.FrameJacobian`:
+    the same but for a rotation of each sample's rows, in fewer columns (see `Columns`). It shares their kernels, the
+    functions of `torchid.regressor` and the null spaces of `torchid.sensing.projection`, but takes samples one contact
+    state at a time, where all shapes are constant, and multiplies W^T into the bodies' wrenches without forming K.
+    `tests/test_rows_two_ways.py` compares both ways; read the other first.
+    """
 
     def __init__(
         self, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms | None = None

@@ -110,6 +110,10 @@ class Regressor(nn.Module):
     Differentiable; `.to(device, dtype)` moves it. Columns: 12 per body, bodies in `robot.body_names`' order,
     parameters in `torchid.parameters`' order. Rows: base force, base moment (base frame, about the base origin), then
     `robot.dof_names`: joints, and the wrenches of force/torque sensors in limbs; a fixed base has no base rows.
+
+    With `FrameJacobian` and `torchid.Projection`, the plain way to the equations of a fit. Fits take
+    `torchid.RowBuilder`, which shares the functions of this package but never forms K, for speed
+    (`tests/test_rows_two_ways.py` compares both).
     """
 
     def __init__(

@@ -170,6 +170,9 @@ class Projection(nn.Module):
     Gradients flow to all arguments, the Jacobian included: through `V_x` too, whose choice is arbitrary, so that only
     losses that do not depend on it (squares of projected forces, their sum over a batch) have one that means
     something. Where an active contact loses rank (a straight knee), the null space jumps and has no derivative.
+
+    Takes any K, dense and with any sensors, and is differentiable. Fits take `torchid.RowBuilder`, which uses the same
+    null spaces but multiplies V_x^T into the bodies' wrenches, for speed (`tests/test_rows_two_ways.py` compares both).
     """
 
     def __init__(
