@@ -15,6 +15,7 @@ from torchid import parameters
 from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.optimizers import try_out
 from torchid.problem import Batch, LinearProblem, MiniBatches
+from torchid.rounding import RANK_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ class Sgd:
     """
 
     ridge: float = 0.0
-    rank_tolerance: float = 1e-10
+    rank_tolerance: float = RANK_TOLERANCE
     consistency: Consistency = "log_cholesky"
     margin: float = 1e-4
     penalties: PenaltyWeights = field(default_factory=PenaltyWeights)

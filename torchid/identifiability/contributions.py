@@ -23,6 +23,7 @@ from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import state_name
 from torchid.problem.elimination import without
+from torchid.rounding import RANK_TOLERANCE, numerical_rank
 
 
 @dataclass(frozen=True)
@@ -134,8 +135,7 @@ def _without_each(factors: Sequence[Array]) -> Iterator[Array]:
 
 def _rank(values: Array, tolerance: float) -> int:
     """As `LeastSquares` counts it."""
-    least = max(tolerance, np.finfo(float).eps * len(values)) * values.max(initial=0.0)
-    return int((values > least).sum())
+    return numerical_rank(values, tolerance, values.shape)
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def contributions(
     builder: RowBuilder,
     problem: LinearProblem,
     dof_names: Sequence[str],
-    rank_tolerance: float = 1e-10,
+    rank_tolerance: float = RANK_TOLERANCE,
     done: ProgressCallback | None = None,
 ) -> Contributions:
     """Leave every log, contact state and sensor out in turn.

@@ -17,12 +17,17 @@ from torchid.problem.chunks import one_thread, spread_by_state
 from torchid.problem.contact_state import State
 from torchid.problem.metrics import GROUPS, ForceSums, figure, projected
 from torchid.problem.predict import predicted_forces
+from torchid.rounding import RANK_TOLERANCE, is_significant
 from torchid.sensing import SensorNoise
 
 
 @one_thread()
 def error_directions(
-    problem: LinearProblem, ridge: float, noise_variance: float, prior_error: float, rank_tolerance: float = 1e-10
+    problem: LinearProblem,
+    ridge: float,
+    noise_variance: float,
+    prior_error: float,
+    rank_tolerance: float = RANK_TOLERANCE,
 ) -> Array:
     """Independent errors of least squares with a ridge, (M, P): their outer products sum up to the error's covariance.
 
@@ -40,7 +45,7 @@ def error_directions(
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, lapack_driver="gesvd")  # see `base_parameters`
     values = np.pad(values, (0, len(scale) - len(values)))
-    values[values <= rank_tolerance * values.max(initial=0.0)] = 0.0
+    values[~is_significant(values, rank_tolerance)] = 0.0
     pull = ridge * problem.rows
     with np.errstate(invalid="ignore", divide="ignore"):
         through = np.where(values > 0.0, values / (values**2 + pull), 0.0)

@@ -16,9 +16,7 @@ from torchid.problem.chunks import ProgressCallback, by_state, one_thread, sprea
 from torchid.problem.compression import unloaded_channels
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
-
-DEPENDENT = 1e-9
-"""What moves the whitened rows by less than this share of its size is rounding."""
+from torchid.rounding import KINEMATIC_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -64,16 +62,16 @@ def information_without(H: Array, unknown: Sequence[int], size: Array) -> Array:
     Args:
         H: (N, N).
         unknown: places of M columns.
-        size: (M,), squared norms of these; what is below the share `DEPENDENT` of them is rounding.
+        size: (M,), squared norms of these; what is below the share `KINEMATIC_TOLERANCE` of them is rounding.
     """
     if not unknown:
         return H
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
     crossed = np.delete(H[list(unknown)], unknown, axis=1) * scale[:, None]
     values, V = np.linalg.eigh(H[np.ix_(unknown, unknown)] * scale * scale[:, None])
-    along = V[:, values > DEPENDENT].T @ crossed
+    along = V[:, values > KINEMATIC_TOLERANCE].T @ crossed
     rest = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
-    return np.asarray(rest - along.T @ (along / values[values > DEPENDENT, None]))
+    return np.asarray(rest - along.T @ (along / values[values > KINEMATIC_TOLERANCE, None]))
 
 
 def information_in(rows: Tensor, weight: float) -> Tensor:
@@ -94,7 +92,7 @@ def unit_readings(ways: Tensor, W: Tensor) -> Tensor:
     """
     readings = ways @ W
     size = torch.linalg.vector_norm(readings, dim=-1, keepdim=True)
-    least = DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
+    least = KINEMATIC_TOLERANCE * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
     return torch.where(size > least, readings / size, 0.0)
 
 
@@ -222,5 +220,5 @@ def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State
 def _span(C: Tensor, W: Tensor) -> Tensor:
     """Orthonormal rows, (B, c, n_rows), that span those of `C W`, zeros for dependent ones."""
     _, values, Vh = torch.linalg.svd(C @ W, full_matrices=False)
-    least = DEPENDENT * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
+    least = KINEMATIC_TOLERANCE * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
     return Vh * (values > least[:, None])[..., None]

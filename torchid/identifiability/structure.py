@@ -18,8 +18,8 @@ from torchid.regressor import FrameJacobian, motion_from_state
 from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross_product, joint_motion
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
+from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact, SensorSet
-from torchid.sensing.projection import RANK_TOLERANCE
 
 _ANGLE, _STROKE = 1.5, 0.3  # [rad], [m] either way
 
@@ -102,11 +102,11 @@ def standing_states(
     if not held:
         return q[:count], v[:count], a[:count]
     values = torch.linalg.svdvals(J)
-    regular = values > RANK_TOLERANCE * values[:, :1]
+    regular = values > KINEMATIC_TOLERANCE * values[:, :1]
     smallest = torch.where(regular, values, torch.inf).amin(1) / values[:, 0]
     best = torch.argsort(smallest, descending=True)[:count]
     q, v, a, J = q[best], v[best], a[best], J[best]
-    inverse = torch.linalg.pinv(J, rtol=RANK_TOLERANCE)
+    inverse = torch.linalg.pinv(J, rtol=KINEMATIC_TOLERANCE)
     v = _without(v, inverse, J)
     v = torch.where(v.abs() < _AT_REST, 0.0, v)
     drift = _drift(robot, held, q, v)

@@ -18,6 +18,7 @@ from torchid.regressor.jacobian import wrench_map
 from torchid.regressor.regressor import JointRow, joint_rows
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
+from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 from torchid.sensing import Contact, SensorSet
 
 State = tuple[bool, ...]
@@ -27,9 +28,6 @@ State = tuple[bool, ...]
 def state_name(contacts: Sequence[Contact], state: State) -> str:
     """Frames in contact, joined by "+"."""
     return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or "none"
-
-
-_DEPENDENT = 1e-9  # singular values of constant unit wrenches below this share of the largest count as zero
 
 
 class Columns:
@@ -196,7 +194,7 @@ class ContactStateLayouts:
                 else:
                     unmeasured.append(at_body[k][None])
         _, values, Vh = np.linalg.svd(np.concatenate(unmeasured), full_matrices=False)
-        span = Vh[values > _DEPENDENT * max(values, default=0.0)]
+        span = Vh[is_significant(values, KINEMATIC_TOLERANCE)]
         above = set(self.columns.joints_above(body))
         joints = tuple(place for place, joint in enumerate(coupled) if joint in above)
         return ContactBody(body, self._tensor(span), self._tensor(np.concatenate(measured)), tuple(components), joints)

@@ -25,6 +25,7 @@ from torchid.problem.extras import measured_components
 from torchid.problem.linear import LinearProblem, TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.rounding import is_significant
 from torchid.sensing import SensorNoise
 
 BASE = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
@@ -363,7 +364,7 @@ def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
     """G, (width, rank), so that `|x G|^2` is the leverage of a whitened row x; offsets and the like are few."""
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=False, lapack_driver="gesvd")
-    kept = values > 1e-10 * values.max(initial=0.0)
+    kept = is_significant(values)
     G = np.zeros((builder.width, int(kept.sum())))
     basis = scale[:, None] * Vh[kept].T / values[kept]
     G[: builder.columns.count] = builder.columns.from_parameters()[:, problem.free] @ basis

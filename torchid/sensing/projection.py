@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-RANK_TOLERANCE = 1e-9
-"""A singular value of A_x below this share of the largest counts as zero (more in single precision)."""
+from torchid.rounding import BASE_RANK_TOLERANCE, KINEMATIC_TOLERANCE, relative_tolerance
 
 _SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an SVD
 
@@ -45,7 +44,7 @@ def _differentiable(A: Tensor, V: Tensor) -> Tensor:
 
 
 def _tolerance(A: Tensor) -> float:
-    return max(RANK_TOLERANCE, max(A.shape[1:]) * torch.finfo(A.dtype).eps)
+    return relative_tolerance(KINEMATIC_TOLERANCE, A.shape[1:], torch.finfo(A.dtype).eps)
 
 
 def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
@@ -129,9 +128,6 @@ def _along(X: Tensor, axes: Tensor) -> Tensor:
     return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)
 
 
-_BASE_RANK_TOLERANCE = 1e-6  # V_x is orthonormal: singular values of S_b V_x are at most 1
-
-
 @dataclass(frozen=True)
 class ProjectedGroup:
     """Samples that share a contact state and a rank.
@@ -156,7 +152,7 @@ def base_singular_values(V: Tensor) -> Tensor:
 
 def base_rank(singular_values: Tensor) -> Tensor:
     """rank(S_b V_x), (B,), from `base_singular_values`."""
-    tolerance = max(_BASE_RANK_TOLERANCE, 100.0 * torch.finfo(singular_values.dtype).eps)
+    tolerance = max(BASE_RANK_TOLERANCE, 100.0 * torch.finfo(singular_values.dtype).eps)
     return (singular_values > tolerance).sum(1)
 
 
