@@ -76,9 +76,9 @@ def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) 
 
 @dataclass(frozen=True)
 class Series:
-    """Generalized forces of one log: `true` (N, nv) and what every parameter vector predicts.
+    """Generalized forces of one log: `true` (N, n_rows) and what every parameter vector predicts.
 
-    `projected_true` and `projected` are the same inside the contacts' null space, V_x V_x^T f. `rows`: names of the nv
+    `projected_true` and `projected` are the same inside the contacts' null space, V_x V_x^T f. `rows`: names of the
     rows.
     """
 

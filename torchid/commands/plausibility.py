@@ -21,6 +21,7 @@ from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.problem.metrics import ADVICE, Worse, verdict
 from torchid.robot import Robot
+from torchid.rounding import is_significant
 
 OFF = 10.0
 """Factor that no model of a robot is off by: units are by a thousand, a gear by 50 to 160."""
@@ -73,7 +74,7 @@ def force_gain(problem: LinearProblem) -> float | None:
     free, fixed = ~chosen & problem.free, ~chosen & ~problem.free
     measured = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
     U, values, _ = np.linalg.svd(problem.A[:, free] * problem.scale[free], full_matrices=False)
-    friction = U[:, values > 1e-10 * values.max(initial=0.0)]
+    friction = U[:, is_significant(values)]
     needed, measured = (x - friction @ (friction.T @ x) for x in (needed, measured))
     size = np.linalg.norm(needed) * np.sqrt(measured @ measured + problem.residual)
     if not size > 0.0 or abs(needed @ measured) < _CLEAR * size:

@@ -18,6 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT, NotNegative, Number, Positive, Seed, no_flag
 from torchid.errors import ConfigError
+from torchid.rounding import RANK_TOLERANCE
 
 
 def _with_name(value: dict[str, Any]) -> dict[str, Any]:
@@ -136,7 +137,7 @@ class EstimatorConfig:
 
     name: Literal["least_squares", "consistent", "sgd"] = "least_squares"
     ridge: Ridge = 0.0
-    rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
+    rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = RANK_TOLERANCE
     friction: bool = True
     frozen: list[str] = dataclasses.field(default_factory=list)
     robust: Robust | None = None

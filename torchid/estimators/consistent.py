@@ -18,6 +18,7 @@ from torchid.estimators.least_squares import BoundEstimate, LeastSquares, roundi
 from torchid.estimators.vanishing import Vanishing, vanishing_ridge
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
+from torchid.rounding import RANK_TOLERANCE
 
 Method = Literal["barrier", "certified"]
 
@@ -66,7 +67,7 @@ class Consistent:
     conditions: Conditions = field(default_factory=Conditions)
     method: Method = "barrier"
     certify: bool = False
-    rank_tolerance: float = 1e-10
+    rank_tolerance: float = RANK_TOLERANCE
 
     def __post_init__(self) -> None:
         """Check names and weights.

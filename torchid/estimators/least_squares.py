@@ -13,6 +13,7 @@ from torchid.errors import InputError
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
 UNSEEN, FIXED = "cannot be seen", "fixed"
@@ -129,7 +130,6 @@ def rounding_reported(estimator: str) -> Iterator[None]:
 
 
 _SEEN = 1e-12  # a finger's share in a sum with the trunk's mass is 1e-7, that of no row but rounding
-_HIDDEN = 1e-6  # far above rounding (1e-10 on a humanoid) and below any share found in a robot (1e-4)
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class LeastSquares:
     """
 
     ridge: float = 0.0
-    rank_tolerance: float = 1e-10
+    rank_tolerance: float = RANK_TOLERANCE
 
     def __post_init__(self) -> None:
         """Check the weights."""
@@ -180,7 +180,7 @@ class LeastSquares:
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         seen, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
-        seen[free], identifiable[free] = hidden**2 < 1.0 - _SEEN, hidden < _HIDDEN
+        seen[free], identifiable[free] = hidden**2 < 1.0 - _SEEN, hidden < UNOBSERVABLE_SHARE
         standard_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
         standard_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
         standard_error[~identifiable] = np.nan
@@ -204,6 +204,6 @@ class LeastSquares:
 def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:
     """Minimum-norm inverse, singular values and rank, from one call of `torch.linalg.lstsq`."""
     identity = torch.eye(A.shape[0], dtype=torch.float64)
-    rcond = max(tolerance, np.finfo(float).eps * max(A.shape))
+    rcond = relative_tolerance(tolerance, A.shape)
     solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
     return solved.solution.numpy(), solved.singular_values.numpy(), int(solved.rank)

@@ -15,6 +15,7 @@ from torchid import parameters
 from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.optimizers import try_out
 from torchid.problem import Batch, LinearProblem, MiniBatches
+from torchid.rounding import RANK_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ class Sgd:
     """
 
     ridge: float = 0.0
-    rank_tolerance: float = 1e-10
+    rank_tolerance: float = RANK_TOLERANCE
     consistency: Consistency = "log_cholesky"
     margin: float = 1e-4
     penalties: PenaltyWeights = field(default_factory=PenaltyWeights)
@@ -172,7 +173,7 @@ class Loss(nn.Module):
 
     Attributes:
         learnable: parameters of the bodies.
-        residual: module r(q, v, a) -> (B, nv) [N, N m] whose output adds to K phi, or None.
+        residual: module r(q, v, a) -> (B, n_rows) [N, N m] whose output adds to K phi, or None.
         residual_weight: of the mean square of the module's whitened force; None, which counts as 0, until it is chosen.
     """
 
@@ -216,7 +217,7 @@ class Loss(nn.Module):
         return Terms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
 
     def forces(self, batch: Batch, phi: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Whitened projected forces, (B, nv), of parameters (12 L,) and of the residual module."""
+        """Whitened projected forces, (B, n_rows), of parameters (12 L,) and of the residual module."""
         rigid = batch.K @ (self._columns @ phi)
         if self.residual is None:
             return rigid, None

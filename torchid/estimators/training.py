@@ -99,7 +99,7 @@ class Trainer:
             problem: the compressed training logs: preconditioner, prior, and what to compare with.
             batches: of the training logs.
             held_out: of logs for early stopping.
-            residual: any module r(q, v, a) -> (B, nv) [N, N m], on the device of the batches, whose output adds to
+            residual: any module r(q, v, a) -> (B, n_rows) [N, N m], on the device of the batches, whose output adds to
                 K phi; arguments as in `Batch`.
         """
         self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,13 +15,12 @@ from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import posed, solved, stand_in, stated_conditions
 from torchid.parameters import Array
 from torchid.problem import Evaluation, Metrics, RowBuilder, Samples, compress_parts
-from torchid.problem.chunks import one_thread
+from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import Part, states_together
 from torchid.problem.extras import read_components
 from torchid.problem.metrics import ForceSums
 from torchid.sensing import SensorSet
 
-Progress = Callable[[int], None]
 Pair = tuple[Metrics, Metrics]
 """Of nominal and identified parameters."""
 
@@ -54,7 +53,9 @@ class Judge:
     evaluation: Evaluation
     builder: RowBuilder
 
-    def errors(self, logs: Sequence[Samples], both: Sequence[Calibration], progress: Progress | None = None) -> Pair:
+    def errors(
+        self, logs: Sequence[Samples], both: Sequence[Calibration], progress: ProgressCallback | None = None
+    ) -> Pair:
         """Of nominal and identified parameters on logs as recorded, each with the unknowns that suit them.
 
         Rows that a fit would see count where a log has all their sensors.
@@ -68,7 +69,7 @@ class Judge:
         parts: Sequence[Part],
         both: tuple[Calibration, Calibration],
         left_out: Sequence[tuple[Calibration, Calibration]],
-        progress: Progress | None = None,
+        progress: ProgressCallback | None = None,
     ) -> tuple[Pair, CrossValidation | None]:
         """Of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
 
@@ -95,7 +96,7 @@ class Judge:
         logs: Sequence[Samples],
         parts: Sequence[Part],
         calibrations: Sequence[Calibration],
-        progress: Progress | None,
+        progress: ProgressCallback | None,
     ) -> list[tuple[ForceSums, ForceSums]]:
         """Of the measured forces and of the errors, for each calibration."""
         phi = np.stack([one.parameters(self.evaluation) for one in calibrations])
@@ -185,7 +186,7 @@ def chosen_ridge(
     sensors: SensorSet,
     builder: RowBuilder,
     source: object = "experiment",
-    done: Callable[[int], None] | None = None,
+    done: ProgressCallback | None = None,
 ) -> RidgeChoice:
     """The largest ridge whose error on left-out folds is within a standard error of the least.
 
@@ -227,7 +228,7 @@ def _left_out(
     sensors: SensorSet,
     builder: RowBuilder,
     source: object,
-    done: Callable[[int], None] | None,
+    done: ProgressCallback | None,
 ) -> Array:
     """Mean squares on a fold of what is fitted without it, one for each ridge tried."""
     settings, robot = scene.config.estimator, scene.robot

@@ -16,6 +16,7 @@ from torchid.estimators import BoundEstimate
 from torchid.fitting.fit import Fit
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
+from torchid.problem.chunks import ProgressCallback
 from torchid.problem.compression import Part, merged
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
@@ -141,7 +142,7 @@ def robust_fit(
     logs: Sequence[Samples],
     builder: RowBuilder,
     solve: Callable[[list[Part]], Fit],
-    progress: Callable[[int], None] | None = None,
+    progress: ProgressCallback | None = None,
 ) -> tuple[Fit, RobustSummary]:
     """Iteratively re-weighted least squares, a pass over the logs each time, memory flat in their length.
 

@@ -19,6 +19,7 @@ from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import by_state, one_thread, spread_by_state
 from torchid.problem.contact_state import State, state_name
+from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank
 from torchid.sensing.projection import base_rank, base_singular_values
 
 _CLEAR_GAP = 1e3  # a rank is told by a step of many decades (14 on exact motions), not by a slope
@@ -31,7 +32,7 @@ class RankGap(NamedTuple):
     gap: float
 
 
-def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
+def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
     """Rank of a matrix with columns of one size.
 
     What lies below rounding is not known: the gap takes it for `eps` times the largest value, and is 4.5e15 at most.
@@ -43,7 +44,7 @@ def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
     Warns:
         NumericalWarning: a gap below 1e3, so that another tolerance finds another rank.
     """
-    rank = int((values > tolerance * values[:1]).sum())
+    rank = numerical_rank(values, tolerance)
     if rank == 0:
         return RankGap(0, np.inf)
     dropped = max(float(values[rank]) if rank < len(values) else 0.0, np.finfo(float).eps * float(values[0]))
@@ -55,7 +56,7 @@ def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
 
 
 @one_thread()
-def structural_rank(problem: LinearProblem, tolerance: float = 1e-10) -> RankGap:
+def structural_rank(problem: LinearProblem, tolerance: float = RANK_TOLERANCE) -> RankGap:
     """Rank of a problem's free columns, scaled to norm 1.
 
     Args:
@@ -77,7 +78,7 @@ def unit_columns(problem: LinearProblem, tolerance: float) -> tuple[Array, Array
     scale = problem.scale[problem.free]
     columns = problem.A[:, problem.free] * scale
     norms = np.linalg.norm(columns, axis=0)
-    seen = norms > tolerance * norms.max(initial=0.0)
+    seen = is_significant(norms, tolerance)
     norms[~seen] = 1.0
     return np.where(seen, columns, 0.0) / norms, scale / norms
 
@@ -123,7 +124,7 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
     )
     for samples, state, weight in spread_by_state(logs, _CHECKED):
         for _, V in builder.bases(samples.to(builder.device), state):
-            rows[state] = max(rows[state], V.shape[2] + len(builder.plan(state).lone_joints))
+            rows[state] = max(rows[state], V.shape[2] + len(builder.layout(state).uncoupled_joints))
             if builder.tree.base_rows:
                 values[state].append(base_singular_values(V).cpu())
                 weights[state].append(torch.full((len(V),), weight))

@@ -56,7 +56,7 @@ _MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
 
 @dataclass(frozen=True)
 class ForceSeries:
-    """Forces of one log for plotting: `measured` (N, nv), `nominal` and `identified` (N, nv), NaN where unknown."""
+    """Forces of one log for plotting: `measured`, `nominal`, `identified`, (N, n_rows) each, NaN where unknown."""
 
     source: str
     time: Array

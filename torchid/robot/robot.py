@@ -127,8 +127,13 @@ class Robot:
 
     @property
     def nv(self) -> int:
-        """Number of generalized velocities."""
+        """Number of generalized velocities: n + 6, or n for a fixed base."""
         return self.n + self.base_rows
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of K: those of the base, then one for each of `dof_names`; nv + 6 F."""
+        return self.base_rows + self.dofs
 
     @property
     def body_names(self) -> tuple[str, ...]:
