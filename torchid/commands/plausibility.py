@@ -117,7 +117,7 @@ _USUAL = (
 )
 
 
-def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
+def check_plausible(fit: Fit, scene: Scene) -> TotalMass:
     """Stop at a fit that no robot can have left, and warn of one that leaves much more than the stated noise.
 
     Returns:
@@ -133,7 +133,9 @@ def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
     """
     estimate = fit.estimate
     if not estimate.rank:
-        raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
+        raise SensorError(
+            scene.source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs"
+        )
     mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance)
     absurd = implausible(fit.assembly.problem, estimate.phi, mass, scene.robot)
     unexplained = _unexplained(fit)
@@ -143,17 +145,19 @@ def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
     if finding is not None and (absurd is not None or finding.condemns_all):
         told = f"{log}: {finding.field}: {finding.found}"
         raise ImplausibleFitError(
-            source, "logs", f"{absurd or unexplained}; torchid check finds in {told}", finding.advice
+            scene.source, "logs", f"{absurd or unexplained}; torchid check finds in {told}", finding.advice
         )
     if absurd is not None:
-        raise ImplausibleFitError(source, "logs", absurd, f"data and URDF that fit each other; usual reasons: {_USUAL}")
+        raise ImplausibleFitError(
+            scene.source, "logs", absurd, f"data and URDF that fit each other; usual reasons: {_USUAL}"
+        )
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
-    warnings.warn(f"{source}: {unexplained}{named}; {advice}", NumericalWarning, stacklevel=3)
+    warnings.warn(f"{scene.source}: {unexplained}{named}; {advice}", NumericalWarning, stacklevel=3)
     return mass
 
 
-def check_not_worse(found: list[Worse], scene: Scene, source: object) -> None:
+def check_not_worse(found: list[Worse], scene: Scene) -> None:
     """Stop where the URDF's parameters predict better and the checks condemn a training log; else say so.
 
     Raises:
@@ -169,8 +173,8 @@ def check_not_worse(found: list[Worse], scene: Scene, source: object) -> None:
     if finding is not None:
         told, advice = f"{told}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
         if finding.condemns_all:
-            raise ImplausibleFitError(source, "logs", told, advice)
-    warnings.warn(f"{source}: {told}; {advice}", NumericalWarning, stacklevel=3)
+            raise ImplausibleFitError(scene.source, "logs", told, advice)
+    warnings.warn(f"{scene.source}: {told}; {advice}", NumericalWarning, stacklevel=3)
 
 
 def _unexplained(fit: Fit) -> str | None:

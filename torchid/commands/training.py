@@ -37,6 +37,7 @@ from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError, InputError, SensorError, TorchidWarning
 from torchid.estimators import Epoch, PenaltyWeights, Sgd, SgdEstimate, Trainer
+from torchid.fitting.experiment import Experiment
 from torchid.guards import MAX_STATE, check_regular
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Samples
@@ -205,15 +206,16 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
 class Training:
     """The descent of one run, which leaves its state in a folder of its own until the run is done."""
 
-    def __init__(self, config: ExperimentConfig, robot: Robot, source: object = "experiment") -> None:
+    def __init__(self, experiment: Experiment) -> None:
         """Fix the settings.
 
         Raises:
             InputError: optimizer, schedule or a number that cannot be.
         """
-        self.config, self.robot, self.source = config, robot, source
+        config = experiment.config
+        self.config, self.robot, self.source = config, experiment.robot, experiment.source
         self.folder = training_folder(config.output)
-        self.settings = descent_settings(config, source)
+        self.settings = descent_settings(config, self.source)
         self._text, self._saved = dump_config(config), 0
 
     def run(

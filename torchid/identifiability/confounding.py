@@ -70,18 +70,18 @@ class Known:
 class TotalMass:
     """The total mass and how well it is known [kg]: `standard_error`, infinite where the data do not determine it.
 
-    `told_apart`: whether they tell it from offsets and scales of sensors, as of `ExtraEstimate`. `nominal`: the URDF's.
+    `separable`: whether they tell it from offsets and scales of sensors, as of `ExtraEstimate`. `nominal`: the URDF's.
     """
 
     standard_error: float
-    told_apart: bool
+    separable: bool
     value: float
     nominal: float
 
     @property
     def determined(self) -> bool:
         """Whether the data say anything of it: a 95 % interval no wider than the URDF's mass on either side."""
-        return self.told_apart and 2.0 * self.standard_error <= self.nominal
+        return self.separable and 2.0 * self.standard_error <= self.nominal
 
 
 def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = RANK_TOLERANCE) -> TotalMass:
@@ -127,7 +127,7 @@ class ExtraEstimate:
         nominal_value: the one that would fit best if the bodies' parameters were the nominal ones.
         standard_error: without the pull to nominal parameters, infinite where the data do not determine it.
         inflation: of the standard error by not knowing all other unknowns and parameters, at least 1.
-        mixed_with: what it cannot be told from, most first; empty if it can.
+        confounded_with: what it cannot be told from, most first; empty if it can.
     """
 
     extra: Extra
@@ -136,10 +136,10 @@ class ExtraEstimate:
     nominal_value: float
     standard_error: float
     inflation: float
-    mixed_with: tuple[str, ...]
+    confounded_with: tuple[str, ...]
 
     @property
-    def told_apart(self) -> bool:
+    def separable(self) -> bool:
         """Whether the data tell it from everything else."""
         return self.inflation <= APART
 

@@ -86,8 +86,8 @@ def _extra(found: ExtraEstimate) -> dict[str, Any]:
         "nominal_value": found.nominal_value,
         "standard_error": _plain(found.standard_error),
         "inflation": _plain(found.inflation),
-        "told_apart": found.told_apart,
-        "mixed_with": list(found.mixed_with),
+        "told_apart": found.separable,
+        "mixed_with": list(found.confounded_with),
         "label": extra.label,
     }
 
