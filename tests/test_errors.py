@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 
+import numpy as np
 import pytest
+from motions import moving_log
 
 from torchid.errors import (
     BaseLostError,
@@ -13,9 +16,12 @@ from torchid.errors import (
     LogError,
     SensorError,
     TorchidError,
+    TorchidWarning,
     UnknownNameError,
     UrdfError,
+    warn,
 )
+from torchid.logs.preprocess import preprocess
 from torchid.logs.read import UnknownFieldError
 
 PLAIN = [kind("a.yaml", "field", "a\nb", "c") for kind in (InputError, UrdfError, LogError, ConfigError, SensorError)]
@@ -39,3 +45,13 @@ def test_an_unknown_name_keeps_the_names_that_are_known() -> None:
 
 def test_a_message_is_one_line_whatever_was_found() -> None:
     assert str(PLAIN[0]) == "a.yaml: field: a b; accepted: c"
+
+
+def test_a_warning_is_of_the_line_outside_of_torchid_that_led_to_it_however_deep() -> None:
+    log = moving_log(np.array([0.0, 0.01, 0.02, 0.0201, 0.03, 0.04, 0.05, 0.06]))
+    with pytest.warns(TorchidWarning, match="a step of") as caught:
+        preprocess(log)
+    assert [Path(one.filename) for one in caught] == [Path(__file__)]
+    with pytest.warns(TorchidWarning, match="^a gap$") as direct:
+        warn("a gap")
+    assert Path(direct[0].filename) == Path(__file__)

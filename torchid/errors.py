@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import inspect
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
@@ -91,6 +93,19 @@ class ConfoundedWarning(TorchidWarning):
 
 class NumericalWarning(TorchidWarning):
     """A result whose accuracy is limited by the conditioning of the problem."""
+
+
+def warn(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
+    """Warn, as of the line outside of torchid that led here: that is the line that a user can change.
+
+    Args:
+        message: one line.
+        category: of the warning.
+    """
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __package__:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
 
 
 def install(extra: str) -> str:

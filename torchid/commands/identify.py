@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -18,7 +17,7 @@ from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, check_training, descent_settings, training_folder
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning
+from torchid.errors import NumericalWarning, warn
 from torchid.estimators import Conditions, Estimate, LeastSquares, violations
 from torchid.fitting.calibration import Calibration, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, Judge, Pair, RidgeChoice, chosen_ridge
@@ -232,7 +231,7 @@ def _robust(
     bars.update(bar, total=1, completed=1)
     if not found.converged:
         message = f"{source}: estimator.robust: not settled after {found.passes} passes; accepted: more passes"
-        warnings.warn(message, NumericalWarning, stacklevel=3)
+        warn(message, NumericalWarning)
     return better, found
 
 

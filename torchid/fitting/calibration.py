@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from torch import Tensor
 
-from torchid.errors import ConfoundedWarning, LogError, TorchidWarning
+from torchid.errors import ConfoundedWarning, LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit, assembled
@@ -109,7 +108,7 @@ class Calibration:
             check_forces(log, scene.robot, scene.contacts, self.sensors)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
-            warnings.warn(message, TorchidWarning, stacklevel=2)
+            warn(message)
             return 0.0
         builder, own = self._builder, np.array([x.per_log for x in self._builder.extras])
 
@@ -141,7 +140,7 @@ def warn_of_confounded(found: Sequence[ExtraEstimate], source: object) -> None:
             others = _grouped(name for x in mixed for name in x.mixed_with if " of " not in name)
             message = f"{log or source}: {named} cannot be told from {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
-            warnings.warn(f"{message}; {advice}", ConfoundedWarning, stacklevel=3)
+            warn(f"{message}; {advice}", ConfoundedWarning)
 
 
 def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: object) -> None:
@@ -159,7 +158,7 @@ def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: ob
             channels = (builder.extras[number] for number in sorted(gated))
             named = _grouped(f"{x.name} {x.component}" for x in channels)
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
-            warnings.warn(f"{message}, which says nothing of their offsets", TorchidWarning, stacklevel=3)
+            warn(f"{message}, which says nothing of their offsets")
     settings = scene.config.estimator
     assembly = assembled(on_ground, builder, scene.robot, settings, source)
     estimate = LeastSquares(settings.pull, settings.rank_tolerance).solve(assembly.problem)
@@ -175,7 +174,7 @@ def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: ob
         )
         more = f"; and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
         advice = "look for drift, a gain, cross talk, wrong contact_active, or noise in the base's motion"
-        warnings.warn(f"{log}: {named}{more}; {advice}", TorchidWarning, stacklevel=3)
+        warn(f"{log}: {named}{more}; {advice}")
 
 
 def _grouped(labels: Iterable[str]) -> str:

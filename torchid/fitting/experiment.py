@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from torchid import parameters
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
 from torchid.config.sensors import ChoiceConfig
-from torchid.errors import ConfigError, TorchidWarning, UnknownNameError
+from torchid.errors import ConfigError, UnknownNameError, warn
 from torchid.estimators import Conditions, Enclosure, Mirror
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import ExtraTerms
@@ -87,7 +86,7 @@ def _enclosures(settings: EstimatorConfig, robot: Robot, source: object) -> tupl
     if outside:
         message = f"the URDF's own centre of mass is outside the {settings.com_inside} at {', '.join(outside)}"
         advice = "are the shapes where the matter is? (estimator.com_shapes)"
-        warnings.warn(f"{source}: estimator.com_inside: {message}; {advice}", TorchidWarning, stacklevel=4)
+        warn(f"{source}: estimator.com_inside: {message}; {advice}")
     return tuple(out)
 
 

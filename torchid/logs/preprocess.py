@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import InputError, LogError, TorchidWarning
+from torchid.errors import InputError, LogError, warn
 from torchid.logs.log import NAN_ALLOWED, WRENCHES, BoolArray, FloatArray, Log, check_finite, labels_of, place
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, sign_continuous
 from torchid.logs.timeline import JITTER, Timeline, plan
@@ -79,7 +78,7 @@ def check_coverage(log: Log, name: str, coverage: Coverage) -> None:
     ]
     if broken:
         message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
 
 
 def coverage_of(log: Log, name: str) -> Coverage:

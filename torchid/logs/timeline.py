@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import numbers
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +11,7 @@ import numpy as np
 from scipy import signal
 from scipy.interpolate import make_interp_spline
 
-from torchid.errors import InputError, LogError, TorchidWarning
+from torchid.errors import InputError, LogError, warn
 from torchid.logs.log import BoolArray, FloatArray, check_time
 
 #: Samples per spline. One spline through a long log needs 22 numbers a sample for its banded matrix alone; through
@@ -278,7 +277,7 @@ def _median_step(source: str, native: FloatArray) -> float:
             f"{source}: time: a step of {steps[shortest]:.6g} s after sample {shortest}, the median being {step:.6g} s:"
             " interpolation multiplies the noise there"
         )
-        warnings.warn(message, TorchidWarning, stacklevel=5)
+        warn(message)
     return step
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, TorchidWarning, UnknownNameError
+from torchid.errors import LogError, UnknownNameError, warn
 from torchid.guards import MAX_ARRAYS, check_names, plain
 from torchid.logs.log import FloatArray
 from torchid.logs.ros.files import Channel
@@ -289,6 +288,6 @@ class Rows:
                 found = f"messages of different content with one stamp, {at:.9f} s"
                 raise LogError(self._source, self.topic, found, "every stamp once")
             message = f"{self._source}: {self.topic}: {len(again)} messages come twice; each counts once"
-            warnings.warn(message, TorchidWarning, stacklevel=4)
+            warn(message)
             stamps, rows = np.delete(stamps, again), np.delete(rows, again, axis=0)
         return Series(self.topic, stamps, self._decoder.fields(rows), stamped)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, TorchidWarning, UnknownNameError
+from torchid.errors import LogError, UnknownNameError, warn
 from torchid.logs.containers import bag_files
 from torchid.logs.log import FloatArray, is_quaternion, unit_quaternion
 from torchid.logs.quaternion import sign_continuous
@@ -94,7 +93,7 @@ class Clock:
         gaps = np.isnan(values).any(axis=0)
         if gaps.any() and not np.isnan(values[:, gaps]).all():
             message = f"{self.source}: {series.topic}: NaN in part of {name}: NaN throughout after interpolation"
-            warnings.warn(message, TorchidWarning, stacklevel=6)
+            warn(message)
         out = np.full((len(self.stamps), values.shape[1]), np.nan)
         out[:, ~gaps] = spline_derivatives(stamps, values[:, ~gaps], self.time, (0,))[0]
         return out
@@ -192,7 +191,7 @@ def read_bag(
     unstamped = dict.fromkeys(x.topic for x in series.values() if not x.stamped)
     if unstamped:
         what = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
-        warnings.warn(f"{source}: {', '.join(unstamped)}: {what}", TorchidWarning, stacklevel=3)
+        warn(f"{source}: {', '.join(unstamped)}: {what}")
     sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
     events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
     clock = clock_of(source, sampled[topics.rate_topic], sampled, events)
@@ -318,4 +317,4 @@ def _check_frame(bag: _Bag, role: str, expected: str | None, otherwise: str = ""
         taken_for = otherwise if expected is None else f"'{expected}'"
         what = f"frame '{found}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
         message = f"{bag.source}: {bag.rows[role].topic}: {what}"
-        warnings.warn(message, TorchidWarning, stacklevel=5)
+        warn(message)
