@@ -6,7 +6,7 @@ from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, UnknownNameError, warn
 from torchid.guards import MAX_ARRAYS, check_names, plain
 from torchid.logs.log import FloatArray
-from torchid.logs.ros.files import Channel
+
+if TYPE_CHECKING:
+    from torchid.logs.ros.files import Channel
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _JOINT_FIELDS = {"position": "joint_position", "velocity": "joint_velocity", "effort": "joint_torque"}

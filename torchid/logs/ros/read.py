@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, UnknownNameError, warn
-from torchid.logs.containers import bag_files
+from torchid.errors import LogError, UnknownNameError, install, warn
+from torchid.logs.containers import bag_files, translated
 from torchid.logs.log import FloatArray, is_quaternion, unit_quaternion
 from torchid.logs.quaternion import sign_continuous
-from torchid.logs.ros.files import Channel, open_bag_file
 from torchid.logs.ros.messages import (
     Decoder,
     Flag,
@@ -29,6 +30,9 @@ from torchid.logs.ros.messages import (
 )
 from torchid.logs.ros.topics import ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
 from torchid.logs.timeline import LONGEST_STEP, spline_derivatives
+
+if TYPE_CHECKING:
+    from torchid.logs.ros.files import BagFile, Channel
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +129,10 @@ def clock_of(source: str, rate: Series, others: Mapping[str, Series], events: Ma
     return Clock(source, stamps)
 
 
+#: What bags of any kind are read with.
+_PACKAGES = ("rosbags", "mcap", "lz4", "zstandard")
+
+
 _EVENT = "contact_active"
 #: Messages between two reports of progress, and topics that a message lists.
 _REPORT_EVERY, _LISTED = 1000, 30
@@ -201,6 +209,28 @@ def read_bag(
         **_contacts(bag, clock, series),
         **_ft_sensors(bag, clock, series),
     }
+
+
+@contextmanager
+def open_bag_file(path: Path) -> Iterator[BagFile]:
+    """Open a .bag, .mcap or .db3 file.
+
+    Raises:
+        LogError: it is damaged, and so does what is read later; or its reader is not installed.
+    """
+    suffix = path.suffix.lower()
+    try:
+        # here: only those who read bags need the libraries of its readers
+        from torchid.logs.ros.files import McapFile, Ros1File, SqliteFile
+    except ImportError as error:
+        absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
+        found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
+        raise LogError(path, "file", found, install("ros")) from error
+
+    readers: dict[str, Callable[[Path], BagFile]] = {".bag": Ros1File, ".mcap": McapFile, ".db3": SqliteFile}
+    accepted = f"a complete {suffix} file of ROS messages"
+    with translated(str(path), "file", accepted), closing(readers[suffix](path)) as file:
+        yield file
 
 
 def _listed(channels: Mapping[str, Channel]) -> str:
