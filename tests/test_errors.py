@@ -12,6 +12,7 @@ from motions import moving_log
 from torchid.errors import (
     BaseLostError,
     ConfigError,
+    FieldError,
     InputError,
     LogError,
     SensorError,
@@ -19,6 +20,9 @@ from torchid.errors import (
     TorchidWarning,
     UnknownNameError,
     UrdfError,
+    about_file,
+    current_file,
+    during,
     warn,
 )
 from torchid.logs.preprocess import preprocess
@@ -55,3 +59,15 @@ def test_a_warning_is_of_the_line_outside_of_torchid_that_led_to_it_however_deep
     with pytest.warns(TorchidWarning, match="^a gap$") as direct:
         warn("a gap")
     assert Path(direct[0].filename) == Path(__file__)
+
+
+def test_an_error_that_names_a_field_alone_is_about_the_innermost_file_and_stays_so() -> None:
+    with about_file("walk.npz"):
+        with during("reading", "jump.npz"):
+            inner = FieldError("time", "no samples", "some")
+        outer = FieldError("time", "no samples", "some")
+    assert current_file() == ""
+    assert str(inner) == "jump.npz: time: no samples; accepted: some"
+    assert str(outer) == "walk.npz: time: no samples; accepted: some"
+    back = pickle.loads(pickle.dumps(inner))  # in a process that works on no file or on another one
+    assert (type(back), str(back)) == (LogError, str(inner))

@@ -7,6 +7,7 @@ import inspect
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 from torchid.text import one_line
 
@@ -38,6 +39,17 @@ class UrdfError(InputError):
 
 class LogError(InputError):
     """A log that is malformed, inconsistent, or lacks what the run needs."""
+
+
+class FieldError(LogError):
+    """A field of the log at hand, or a column or topic, is not what it should be; `about_file` says of which file."""
+
+    def __init__(self, field: str, found: str, accepted: str) -> None:
+        super().__init__(current_file(), field, found, accepted)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Another process works on another file."""
+        return LogError, (self.source, self.field, self.found, self.accepted)
 
 
 class ConfigError(InputError):
@@ -113,16 +125,35 @@ def install(extra: str) -> str:
     return f"pip install '.[{extra}]' in the clone of torchid"
 
 
+_file: ContextVar[str] = ContextVar("_file", default="")
+
+
+@contextmanager
+def about_file(file: object) -> Iterator[None]:
+    """Let errors and warnings within the block that name a field alone be about a field of this file."""
+    token = _file.set(str(file))
+    try:
+        yield
+    finally:
+        _file.reset(token)
+
+
+def current_file() -> str:
+    """The file that the innermost `about_file` names; empty outside of all."""
+    return _file.get()
+
+
 @contextmanager
 def during(doing: str, source: object) -> Iterator[None]:
-    """Let an error that leaves the block say what was being done to which file: the innermost block says it.
+    """As `about_file`; and let an error that leaves the block say what was being done to it: the innermost says it.
 
     Args:
         doing: such as "reading".
         source: the file or folder.
     """
     try:
-        yield
+        with about_file(source):
+            yield
     except Exception as error:
         if not doing_of(error):
             error._torchid_doing = f"{doing} {source}"  # type: ignore[attr-defined]
