@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, ref
 from torchid.commands.reading import LogReader
 from torchid.commands.results import forces_of
 from torchid.config import load_config
-from torchid.errors import ConfigError, TorchidWarning, during
+from torchid.errors import ConfigError, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, set_up
@@ -66,7 +65,7 @@ def evaluate(
             metrics[Path(log.source).stem] = pair
             if not any(x is not None for x in pair[1].rms.values()):
                 message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
-                warnings.warn(message, TorchidWarning, stacklevel=2)
+                warn(message)
         document: dict[str, dict[str, object]] = {
             name: {"identified": after.as_dict(), "nominal": before.as_dict()}
             for name, (before, after) in metrics.items()

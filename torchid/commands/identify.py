@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -18,7 +17,7 @@ from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, check_training, descent_settings, training_folder
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning
+from torchid.errors import NumericalWarning, warn
 from torchid.estimators import Conditions, Estimate, LeastSquares, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
@@ -222,7 +221,7 @@ def _robust(
     bars.update(bar, total=1, completed=1)
     if not found.summary.converged:
         settled = f"estimator.robust: not settled after {found.summary.passes} passes; accepted: more passes"
-        warnings.warn(f"{experiment.source}: {settled}", NumericalWarning, stacklevel=3)
+        warn(f"{experiment.source}: {settled}", NumericalWarning)
     return found.fit, found.summary
 
 

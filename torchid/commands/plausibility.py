@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
 from torchid import parameters
 from torchid.commands.check import log_to_check
-from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError
+from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.identifiability.confounding import TotalMass, total_mass
@@ -153,7 +152,7 @@ def check_plausible(fit: Fit, scene: Scene) -> TotalMass:
         )
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
-    warnings.warn(f"{scene.source}: {unexplained}{named}; {advice}", NumericalWarning, stacklevel=3)
+    warn(f"{scene.source}: {unexplained}{named}; {advice}", NumericalWarning)
     return mass
 
 
@@ -174,7 +173,7 @@ def check_not_worse(found: list[Worse], scene: Scene) -> None:
         told, advice = f"{told}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
         if finding.condemns_all:
             raise ImplausibleFitError(scene.source, "logs", told, advice)
-    warnings.warn(f"{scene.source}: {told}; {advice}", NumericalWarning, stacklevel=3)
+    warn(f"{scene.source}: {told}; {advice}", NumericalWarning)
 
 
 def _unexplained(fit: Fit) -> str | None:

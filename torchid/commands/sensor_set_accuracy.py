@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rich.progress import Progress
 
 from torchid.commands.plausibility import check_plausible
-from torchid.errors import ImplausibleFitError, LogError, TorchidWarning
+from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.estimator import batch_estimator
 from torchid.fitting.experiment import Scene
@@ -49,9 +48,9 @@ def accuracies(
             out[name] = _accuracy(scene, sensors, train, test, evaluation, reference)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'"
-            warnings.warn(message, TorchidWarning, stacklevel=2)
+            warn(message)
         except ImplausibleFitError as error:
-            warnings.warn(f"{error}; no accuracy of the sensors '{name}'", TorchidWarning, stacklevel=2)
+            warn(f"{error}; no accuracy of the sensors '{name}'")
         bars.advance(bar)
     return out
 

@@ -35,7 +35,7 @@ from torchid.commands.folder import (
 from torchid.commands.manifest import Manifest, inspect, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
-from torchid.errors import ConfigError, InputError, SensorError, TorchidWarning
+from torchid.errors import ConfigError, InputError, SensorError, warn
 from torchid.estimators import Epoch, PenaltyWeights, Sgd, SgdEstimate, Trainer
 from torchid.fitting.experiment import Experiment
 from torchid.guards import MAX_STATE, check_regular
@@ -195,7 +195,7 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
         if output.exists() and not config.overwrite:
             raise ConfigError(output, "--resume", "a finished run", "an unfinished one, or overwrite=true")
         message = f"{folder}: no checkpoint to go on from; training starts at the beginning"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
     elif waiting and not resume and not config.overwrite:
         raise ConfigError(folder, "output", "an unfinished training", "--resume, overwrite=true, or another output")
     if not waiting or not resume:
@@ -276,7 +276,7 @@ class Training:
             found.remove()
         if self.folder.exists():
             message = f"{self.folder}: stays: it holds what torchid did not write"
-            warnings.warn(message, TorchidWarning, stacklevel=3)
+            warn(message)
 
     def _train(self, trainer: Trainer, evaluate: Evaluate, events: RunEvents, progress: Callable[[str], None]) -> None:
         training = self.config.estimator.training

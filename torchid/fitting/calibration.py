@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import ConfoundedWarning, LogError, TorchidWarning
+from torchid.errors import ConfoundedWarning, LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import RobustLoss, fit_extras_robustly
@@ -115,7 +114,7 @@ class Calibration:
             check_forces(log, self.robot, builder.contacts, builder.sensors)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
-            warnings.warn(message, TorchidWarning, stacklevel=2)
+            warn(message)
             return 0.0
         own = np.array([x.per_log for x in builder.extras])
 
@@ -172,7 +171,7 @@ def warn_of_confounded(found: Sequence[ExtraEstimate], source: object = "logs") 
             others = _grouped(name for x in mixed for name in x.confounded_with if " of " not in name)
             message = f"{log or source}: {named} confounded with {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
-            warnings.warn(f"{message}; {advice}", ConfoundedWarning, stacklevel=3)
+            warn(f"{message}; {advice}", ConfoundedWarning)
 
 
 def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
@@ -195,7 +194,7 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
             channels = (builder.extras[number] for number in sorted(gated))
             named = _grouped(f"{x.name} {x.component}" for x in channels)
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
-            warnings.warn(f"{message}, which says nothing of their offsets", TorchidWarning, stacklevel=3)
+            warn(f"{message}, which says nothing of their offsets")
     assembly = fitter.assemble(on_ground)
     estimate = LeastSquares(estimator.ridge, estimator.rank_tolerance).solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, fitter.robot.body_names, estimator.rank_tolerance)
@@ -210,7 +209,7 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
         )
         more = f"; and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
         advice = "look for drift, a gain, cross talk, wrong contact_active, or noise in the base's motion"
-        warnings.warn(f"{log}: {named}{more}; {advice}", TorchidWarning, stacklevel=3)
+        warn(f"{log}: {named}{more}; {advice}")
 
 
 def _grouped(labels: Iterable[str]) -> str:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
 from torchid import parameters
 from torchid.config.estimator import EstimatorConfig
-from torchid.errors import ConfigError, TorchidWarning, UnknownNameError
+from torchid.errors import ConfigError, UnknownNameError, warn
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.parameters import PARAMETERS, Array
 from torchid.robot import Robot, body_extents, mirror_pairs
@@ -99,7 +97,7 @@ def _enclosures(settings: EstimatorConfig, robot: Robot, source: object) -> tupl
     if outside:
         message = f"the URDF's own centre of mass is outside the {settings.com_inside} at {', '.join(outside)}"
         advice = "are the shapes where the matter is? (estimator.com_shapes)"
-        warnings.warn(f"{source}: estimator.com_inside: {message}; {advice}", TorchidWarning, stacklevel=4)
+        warn(f"{source}: estimator.com_inside: {message}; {advice}")
     return tuple(out)
 
 

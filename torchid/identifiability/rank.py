@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning
+from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, warn
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import by_state, one_thread, spread_by_state
@@ -51,7 +50,7 @@ def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
     gap = float(values[rank - 1]) / dropped
     if gap < _CLEAR_GAP:
         message = f"rank {rank}: the next singular value is only {gap:.3g} times smaller than the last that counts"
-        warnings.warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning, 2)
+        warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning)
     return RankGap(rank, gap)
 
 
@@ -168,7 +167,7 @@ def check_base(reports: Sequence[StateReport], on_base_lost: str = "error") -> N
     message = f"sensors: the base is lost, rank(S_b V_x) < 6, in contact with {where}"
     if on_base_lost == "error":
         raise BaseLostError(f"{message}; accepted: more sensors, other contacts, or sensors.on_base_lost: warn")
-    warnings.warn(f"{message}; parameters of some bodies are out of reach there", BaseLostWarning, stacklevel=2)
+    warn(f"{message}; parameters of some bodies are out of reach there", BaseLostWarning)
 
 
 def _described(report: StateReport) -> str:
