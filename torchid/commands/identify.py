@@ -19,7 +19,7 @@ from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, check_training, descent_settings, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning
-from torchid.estimators import Conditions, Estimate, LeastSquares, violations
+from torchid.estimators import Conditions, Estimate, violations
 from torchid.fitting.calibration import Calibration, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, Judge, Pair, RidgeChoice, chosen_ridge
 from torchid.fitting.experiment import Experiment, set_up
@@ -243,7 +243,7 @@ def _by_state(
     settings, samples = experiment.config.estimator, Counter[State]()
     for part in parts:
         samples[part.state] += part.samples
-    estimator, out = LeastSquares(settings.pull, settings.rank_tolerance), {}
+    estimator, out = settings.least_squares, {}
     for state, _ in samples.most_common():
         of_state = [part for part in parts if part.state == state]
         problem = assembled(of_state, builder, experiment.robot, settings, source).problem

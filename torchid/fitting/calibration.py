@@ -11,7 +11,6 @@ import numpy as np
 from torch import Tensor
 
 from torchid.errors import ConfoundedWarning, LogError, TorchidWarning
-from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit, assembled
 from torchid.fitting.robust import loss_of, robust_unknowns
@@ -162,7 +161,7 @@ def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: ob
             warnings.warn(f"{message}, which says nothing of their offsets", TorchidWarning, stacklevel=3)
     settings = scene.config.estimator
     assembly = assembled(on_ground, builder, scene.robot, settings, source)
-    estimate = LeastSquares(settings.pull, settings.rank_tolerance).solve(assembly.problem)
+    estimate = settings.least_squares.solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, scene.robot.body_names, settings.rank_tolerance)
     noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
     found = disagreements(fit.parts, builder, extras, noise)

@@ -77,9 +77,9 @@ def stand_in(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares 
     """
     if settings.name != "sgd":
         return batch_estimator(settings, conditions)
-    if settings.consistency == "penalties" or not settings.pull:
-        return LeastSquares(settings.pull, settings.rank_tolerance)
-    return Consistent(settings.pull, conditions=conditions, rank_tolerance=settings.rank_tolerance)
+    if settings.consistency == "penalties" or not settings.numeric_ridge:
+        return settings.least_squares
+    return settings.consistent(conditions)
 
 
 def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
@@ -89,10 +89,8 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
         InputError: the certified method without CVXPY and Clarabel.
     """
     if settings.name == "least_squares":
-        return LeastSquares(settings.pull, settings.rank_tolerance)
-    return Consistent(
-        settings.pull, settings.prior, conditions, settings.method, settings.certify, settings.rank_tolerance
-    )
+        return settings.least_squares
+    return settings.consistent(conditions)
 
 
 @dataclass(frozen=True)
@@ -168,7 +166,7 @@ def posed(
     assembly = assembled(parts, builder, scene.robot, settings, source)
     if not any(part.unloaded for part in parts):
         return list(parts), assembly
-    first = LeastSquares(settings.pull, settings.rank_tolerance).solve(assembly.problem)
+    first = settings.least_squares.solve(assembly.problem)
     weighed = [_with_own_noise(part, first.residual_std) for part in parts]
     return weighed, assembled(weighed, builder, scene.robot, settings, source)
 
