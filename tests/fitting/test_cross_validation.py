@@ -102,7 +102,7 @@ def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple
     robot, blocks, squares, rows = torchid.load_robot(DEMO / "quadruped.urdf"), in_folds([log], builder), 0.0, 0
     for fold in range(FOLDS):
         seen = [block for block in blocks if block.fold != fold]
-        phi = LeastSquares(config.estimator.pull).solve(linear_problem(compress(seen, builder), builder, robot)).phi
+        phi = config.estimator.least_squares.solve(linear_problem(compress(seen, builder), builder, robot)).phi
         (unseen,) = (block for block in blocks if block.fold == fold)
         left = linear_problem(compress([unseen], builder), builder, robot)
         squares, rows = squares + left.cost(phi), rows + left.rows

@@ -230,7 +230,7 @@ def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
     samples = Counter[State]()
     for part in parts:
         samples[part.state] += part.samples
-    estimator, out = LeastSquares(fitter.estimator.ridge, fitter.estimator.rank_tolerance), {}
+    estimator, out = LeastSquares(fitter.estimator.ridge, rank_tolerance=fitter.estimator.rank_tolerance), {}
     for state, _ in samples.most_common():
         problem = fitter.assemble([part for part in parts if part.state == state]).problem
         out[state_name(fitter.builder.contacts, state)] = estimator.solve(problem)

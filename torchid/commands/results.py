@@ -286,7 +286,7 @@ def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
     return {
         "sensors": config.sensors.set or "by name",
         "estimator": estimator.name,
-        "ridge": estimator.pull,
+        "ridge": estimator.numeric_ridge,
         "friction": estimator.friction,
         "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
         "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,

@@ -114,7 +114,7 @@ def _accuracy(
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling
     prior_error = scene.config.analysis.prior_error
-    directions = error_directions(problem, settings.pull, variance, prior_error, settings.rank_tolerance)
+    directions = error_directions(problem, settings.numeric_ridge, variance, prior_error, settings.rank_tolerance)
     found = scene.noise.times(noise)
     bodies = Evaluation(robot, scene.contacts, scene.config.device, ExtraTerms(sign_width=scene.terms.sign_width))
     expected = expected_errors(bodies.builder, test or train, directions, found)

@@ -36,7 +36,7 @@ from torchid.commands.manifest import Manifest, inspect, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError, InputError, SensorError, warn
-from torchid.estimators import Epoch, PenaltyWeights, Sgd, SgdEstimate, Trainer
+from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
 from torchid.fitting.experiment import Experiment
 from torchid.guards import MAX_STATE, check_regular
 from torchid.parameters import Array
@@ -345,26 +345,12 @@ def descent_settings(config: ExperimentConfig, source: object = "experiment") ->
     Raises:
         InputError: an optimizer or schedule that torch does not have or that does not take its options.
     """
-    estimator, training = config.estimator, config.estimator.training
-    optimizer, schedule = dict(training.optimizer), dict(training.schedule or {})
+    settings = config.estimator.sgd
     try:
-        return Sgd(
-            ridge=estimator.pull,
-            rank_tolerance=estimator.rank_tolerance,
-            consistency=estimator.consistency,
-            margin=estimator.margin,
-            penalties=PenaltyWeights(**vars(estimator.penalties)),
-            optimizer=optimizer.pop("name"),
-            optimizer_options=optimizer,
-            schedule=schedule.pop("name", None),
-            schedule_options=schedule,
-            epochs=training.epochs,
-            patience=training.patience,
-            clip=training.clip,
-            damping=training.damping,
-        )
+        settings.try_out()
     except InputError as error:
         raise ConfigError(source, f"estimator.training.{error.field}", error.found, error.accepted) from error
+    return settings
 
 
 def body_eigenvalues(robot: Robot, phi: Array) -> dict[str, float]:

@@ -19,9 +19,6 @@ from torchid.config.sensors import (
     Choice,
     Device,
     FileName,
-    NotNegative,
-    Positive,
-    Seed,
     Sensors,
     SensorsConfig,
     check_choice,
@@ -31,6 +28,7 @@ from torchid.errors import ConfigError, warn
 from torchid.logs import Topics
 from torchid.logs.containers import bag_files
 from torchid.logs.ros.topics import check_topics
+from torchid.settings import NotNegative, Positive, Seed
 
 
 @dataclass(config=STRICT, frozen=True)

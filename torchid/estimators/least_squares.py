@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
+from torchid.settings import NotNegative, Tolerance, check_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
 UNSEEN, FIXED = "cannot be seen", "fixed"
@@ -133,25 +134,38 @@ _SEEN = 1e-12  # a finger's share in a sum with the trunk's mass is 1e-7, that o
 
 
 @dataclass(frozen=True)
-class LeastSquares:
-    """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
-
-    With `ridge` 0 the deviation from the nominal parameters of least scaled norm among all minimizers.
+class Regularized:
+    """The settings that all estimators have.
 
     Attributes:
-        ridge: weight of the pull to the nominal parameters against the mean square of the whitened residual.
+        ridge: weight of the prior, the squared deviation from the nominal parameters, against the mean squared whitened
+            residual.
         rank_tolerance: a singular value of the scaled problem below this share of the largest counts as zero.
     """
 
-    ridge: float = 0.0
-    rank_tolerance: float = RANK_TOLERANCE
+    ridge: NotNegative = 0.0
+    rank_tolerance: Tolerance = field(default=RANK_TOLERANCE, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check the weights."""
-        if not (np.isfinite(self.ridge) and self.ridge >= 0.0):
-            raise ValueError(f"ridge: found {self.ridge}; accepted: a finite number of at least 0")
-        if not 0.0 < self.rank_tolerance < 1.0:
-            raise ValueError(f"rank_tolerance: found {self.rank_tolerance}; accepted: a number between 0 and 1")
+        """Check the settings.
+
+        Raises:
+            ValueError: names the first that is not accepted.
+        """
+        check_settings(self)
+
+    @property
+    def least_squares(self) -> LeastSquares:
+        """Least squares with the same ridge and the same rank."""
+        return LeastSquares(self.ridge, rank_tolerance=self.rank_tolerance)
+
+
+@dataclass(frozen=True)
+class LeastSquares(Regularized):
+    """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
+
+    With `ridge` 0 the deviation from the nominal parameters of least scaled norm among all minimizers.
+    """
 
     @rounding_reported("least_squares")
     @one_thread()  # twice as fast as two on some hundred columns

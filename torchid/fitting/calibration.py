@@ -196,7 +196,7 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
             warn(f"{message}, which says nothing of their offsets")
     assembly = fitter.assemble(on_ground)
-    estimate = LeastSquares(estimator.ridge, estimator.rank_tolerance).solve(assembly.problem)
+    estimate = LeastSquares(estimator.ridge, rank_tolerance=estimator.rank_tolerance).solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, fitter.robot.body_names, estimator.rank_tolerance)
     noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
     found = disagreements(fit.parts, builder, extras, noise)

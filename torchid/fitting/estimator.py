@@ -27,18 +27,11 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
     Raises:
         InputError: the certified method without CVXPY and Clarabel.
     """
-    if settings.name == "consistent":
-        return Consistent(
-            ridge=settings.pull,
-            prior=settings.prior,
-            conditions=conditions,
-            method=settings.method,
-            certify=settings.certify,
-            rank_tolerance=settings.rank_tolerance,
-        )
-    if settings.name == "least_squares" or settings.consistency == "penalties" or not settings.pull:
-        return LeastSquares(settings.pull, settings.rank_tolerance)
-    return Consistent(settings.pull, conditions=conditions, rank_tolerance=settings.rank_tolerance)
+    if settings.name == "least_squares":
+        return settings.least_squares
+    if settings.name == "sgd" and (settings.consistency == "penalties" or not settings.numeric_ridge):
+        return settings.least_squares
+    return settings.consistent(conditions)
 
 
 def conditions_from(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> Conditions:

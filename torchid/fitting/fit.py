@@ -112,7 +112,7 @@ class LogFitter:
         assembly = self.assemble(parts)
         if not any(part.unloaded for part in parts):
             return LogProblem(list(parts), assembly)
-        first = LeastSquares(self.estimator.ridge, self.estimator.rank_tolerance).solve(assembly.problem)
+        first = LeastSquares(self.estimator.ridge, rank_tolerance=self.estimator.rank_tolerance).solve(assembly.problem)
         weighed = [_with_own_noise(part, first.residual_std) for part in parts]
         return LogProblem(weighed, self.assemble(weighed))
 
