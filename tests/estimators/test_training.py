@@ -152,16 +152,6 @@ def test_the_held_out_loss_is_the_cost_of_the_held_out_logs_compressed_per_row()
         assert epoch.held_out == pytest.approx(held_out.problem.cost(trainer.phi()) / held_out.problem.rows, rel=1e-12)
 
 
-def test_what_is_frozen_stays_to_the_last_bit() -> None:
-    w = arm()
-    free = w.problem.free.reshape(-1, 12).copy()
-    free[[1, 2, 3]] = False
-    problem = replace(w.problem, free=free.ravel())
-    estimate, _ = trained(replace(w, problem=problem), epochs=2)
-    np.testing.assert_array_equal(estimate.phi[~problem.free], problem.nominal[~problem.free])
-    assert (estimate.phi != problem.nominal).sum() > 0.8 * problem.free.sum()
-
-
 # ------------------------------------------------------------------------------------------------------ when to stop
 
 
