@@ -261,7 +261,7 @@ class TestDescentInLogCholesky(EstimatorContract):
     kind = SgdEstimate
     accuracy = 2e-4
     without_data = ("rows of zeros",)  # a descent takes samples, and an optimizer something to move
-    settings = Sgd(optimizer="LBFGS", epochs=15, schedule=None)
+    settings = Sgd(optimizer={"name": "LBFGS"}, epochs=15, schedule=None)
 
     def solve(self, problem: LinearProblem, ridge: float = RIDGE) -> Estimate:
         """On the rows of the problem as samples."""
@@ -277,4 +277,4 @@ class TestDescentWithPenalties(TestDescentInLogCholesky):
     """Bodies that only nearly exist; 6e-8 was found."""
 
     accuracy = 1e-6
-    settings = Sgd(optimizer="LBFGS", epochs=15, schedule=None, consistency="penalties")
+    settings = Sgd(optimizer={"name": "LBFGS"}, epochs=15, schedule=None, consistency="penalties")
