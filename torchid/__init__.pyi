@@ -13,6 +13,26 @@ from .estimators import (
     project,
     violations,
 )
+from .fitting.calibration import (
+    Calibration,
+    calibrations,
+)
+from .fitting.cross_validation import (
+    RIDGES,
+    choose_ridge,
+    cross_validate,
+)
+from .fitting.fit import (
+    LogFitter,
+    frozen_parameters,
+)
+from .fitting.noise import (
+    estimate_noise,
+)
+from .fitting.robust import (
+    RobustLoss,
+    fit_robustly,
+)
 from .identifiability.base_parameters import (
     BaseParameters,
     base_parameters,
@@ -51,6 +71,9 @@ from .problem import (
     compress_parts,
     linear_problem,
 )
+from .problem.compression import (
+    in_folds,
+)
 from .regressor import (
     FrameJacobian,
     Motion,
@@ -74,7 +97,9 @@ from .sensing import (
 __version__: str
 
 __all__ = [
+    "RIDGES",
     "BaseParameters",
+    "Calibration",
     "Checked",
     "Conditions",
     "Consistent",
@@ -86,11 +111,13 @@ __all__ = [
     "LinearProblem",
     "Log",
     "LogCholeskyParameters",
+    "LogFitter",
     "MiniBatches",
     "Motion",
     "Projection",
     "Regressor",
     "Robot",
+    "RobustLoss",
     "RowBuilder",
     "SensorNoise",
     "SensorSet",
@@ -103,11 +130,18 @@ __all__ = [
     "assemble",
     "base_parameters",
     "bind",
+    "calibrations",
     "check",
+    "choose_ridge",
     "chosen_sensors",
     "compress",
     "compress_parts",
+    "cross_validate",
     "estimate_extras",
+    "estimate_noise",
+    "fit_robustly",
+    "frozen_parameters",
+    "in_folds",
     "linear_problem",
     "load_robot",
     "motion_from_state",

@@ -16,7 +16,7 @@ from torchid.staging import interrupt_held_back as _interrupt_held_back
 
 if TYPE_CHECKING:
     from torchid.commands import Identification
-    from torchid.commands.analyze import Scenario
+    from torchid.commands.analyze import ScenarioAnalysis
     from torchid.fitting.cross_validation import CrossValidation
     from torchid.fitting.noise import NoiseSummary
     from torchid.identifiability.confounding import TotalMass
@@ -128,7 +128,7 @@ def _identify(options: argparse.Namespace) -> None:
         _print_headline(run.worse)
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
     print_tables(
-        contribution_table(run.adds),
+        contribution_table(run.contributions),
         verdict_table(robot.body_names, estimate.verdict),
         verdict_counts_table(run.by_state, estimate),
     )
@@ -193,7 +193,7 @@ def _mass_text(mass: TotalMass) -> str:
     """The total mass with its standard error, or why there is none to be printed."""
     if mass.determined:
         return f"{mass.value:.3f} ± {mass.standard_error:.2g} kg"
-    if not mass.told_apart:
+    if not mass.separable:
         return "not determined: the data do not tell it from offsets"
     known = f", standard error {mass.standard_error:.2g} kg" if isfinite(mass.standard_error) else ""
     return f"not determined by the data{known}"
@@ -232,7 +232,7 @@ def _analyze(options: argparse.Namespace) -> None:
     print(f"written to    {found.output}")
 
 
-def _print_scenario(scenario: Scenario) -> None:
+def _print_scenario(scenario: ScenarioAnalysis) -> None:
     from torchid.report.analysis import branch_table, check_lines, check_table, removal_table, set_text, sets_table
     from torchid.report.tables import print_tables
 

@@ -86,6 +86,8 @@ try:
 except ImportError:  # not on Windows, where what a killed process left stays
     fcntl = None  # type: ignore[assignment]
 
+CAN_LOCK = fcntl is not None
+
 NEW, OLD = "new", "old"  # what is being made, and what it replaces
 _LOCK = "lock"
 _NAME = re.compile(r"\..+-[0-9a-f]{8}\.torchid", re.DOTALL)
@@ -163,21 +165,21 @@ def _made(target: Path) -> tuple[Path, int]:
     for _ in range(_TRIES):
         folder = target.with_name(f".{target.name}-{secrets.token_hex(4)}.torchid")
         folder.mkdir()
-        if fcntl is None:
+        if not CAN_LOCK:
             return folder, -1
         with suppress(FileNotFoundError):
             lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            if _locked(folder, lock) is not False:
+            if locks(lock, folder / _LOCK) is not False:
                 return folder, lock
             os.close(lock)
     raise FileNotFoundError(f"{target.parent}: another process removes every folder that is made there")
 
 
-def _locked(folder: Path, lock: int) -> bool | None:
-    """Whether a descriptor of its lock now holds a folder; None where the file system knows no locks."""
+def locks(handle: int, path: Path) -> bool | None:
+    """Whether a descriptor of a file now locks what is at its path; None where the file system knows no locks."""
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(lock), os.lstat(folder / _LOCK))
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(handle), os.lstat(path))
     except (BlockingIOError, FileNotFoundError):
         return False
     except OSError:
@@ -186,7 +188,7 @@ def _locked(folder: Path, lock: int) -> bool | None:
 
 def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
     """The folder if it is of a process that is gone; removed afterwards, unless it is to be kept."""
-    if fcntl is None or folder.is_symlink() or not folder.is_dir():
+    if not CAN_LOCK or folder.is_symlink() or not folder.is_dir():
         return
     lock = -1
     try:
@@ -195,7 +197,7 @@ def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
             return
         if _LOCK in names:
             lock = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            if not _locked(folder, lock):
+            if not locks(lock, folder / _LOCK):
                 return
         yield folder
         if not keep:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchid.estimators import Estimate
+from torchid.fitting.estimator import batch_estimator, conditions_from
 from torchid.fitting.experiment import Experiment
-from torchid.fitting.fit import batch_estimator, stated_conditions, with_frozen
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, linear_problem
 from torchid.problem.chunks import by_state
@@ -58,8 +58,9 @@ class CompressedLogs:
     def _solve(self, factor: TriangularFactor, nominal: Array, friction: bool) -> Estimate:
         robot = replace(self.experiment.robot, nominal=nominal)
         settings = self.experiment.config.estimator
-        problem = with_frozen(linear_problem(factor, self.builder, robot, friction), settings, robot)
-        return batch_estimator(settings, stated_conditions(settings, robot)).solve(problem)
+        problem = linear_problem(factor, self.builder, robot, friction)
+        problem = replace(problem, free=problem.free & ~self.experiment.frozen())
+        return batch_estimator(settings, conditions_from(settings, robot)).solve(problem)
 
 
 def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
@@ -76,9 +77,9 @@ def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) 
 
 @dataclass(frozen=True)
 class Series:
-    """Generalized forces of one log: `true` (N, nv) and what every parameter vector predicts.
+    """Generalized forces of one log: `true` (N, n_rows) and what every parameter vector predicts.
 
-    `projected_true` and `projected` are the same inside the contacts' null space, V_x V_x^T f. `rows`: names of the nv
+    `projected_true` and `projected` are the same inside the contacts' null space, V_x V_x^T f. `rows`: names of the
     rows.
     """
 

@@ -141,7 +141,13 @@ def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(run
         document = run.folder / "run" / "parameters.json"
         shared = {("", label): x for label, x in read_shared_extras(document).items()}
         phi = read_parameters(document, experiment.robot).ravel()
-        calibration = Calibration(experiment, experiment.sensors, phi, shared)
+        calibration = Calibration(
+            robot=experiment.robot,
+            builder=experiment.builder(experiment.sensors),
+            phi=phi,
+            values=shared,
+            loss=experiment.loss,
+        )
         (read,) = calibration.logs([bind(new, experiment.robot, CONTACTS)])
         expected = torque - run.off[str(run.folder / "new.npz")].torque
         errors[robust] = np.abs(value(read.torque)[:, : len(expected[0])].numpy() - expected).max()

@@ -25,7 +25,7 @@ from motions import RATE
 from torchid.errors import InputError, LogError, TorchidWarning
 from torchid.logs import read_log, write_log
 from torchid.logs.blocks import open_blocks, size_of
-from torchid.logs.timeline import plan
+from torchid.logs.timeline import lay_out_timeline
 
 SETTINGS = {
     "differentiated": ({}, 0.0),
@@ -51,7 +51,7 @@ def test_blocks_give_the_samples_of_the_whole_log(
 def test_the_neighbourhood_of_a_block_is_as_long_as_the_filter_remembers() -> None:
     for cutoff, rate in ((8.0, 500.0), (0.5, 100.0), (49.0, 100.0), (20.0, 1000.0)):
         time = np.arange(60_000) / rate
-        low_pass = plan("x", time, cutoff, None, differentiates=False).low_pass
+        low_pass = lay_out_timeline(time, cutoff, None, differentiates=False).low_pass
         assert low_pass is not None
         impulse = np.zeros(60_000)
         impulse[30_000] = 1.0

@@ -13,9 +13,10 @@ from refusals import assert_unknown_key, assert_wrong_value
 
 from torchid.commands.training import descent_settings
 from torchid.config import ExperimentConfig, dump_config, load_config
-from torchid.config.experiment import EstimatorConfig, PreprocessingConfig
+from torchid.config.estimator import ESTIMATORS, EstimatorConfig
+from torchid.config.experiment import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, TorchidWarning
-from torchid.estimators import Sgd
+from torchid.estimators import Conditions, Consistent, LeastSquares, Sgd
 
 ALL: dict[str, Any] = {
     "robot": {"urdf": "models/robot.urdf", "base_link": "pelvis", "fixed_base": True},
@@ -410,11 +411,9 @@ def test_every_key_of_a_descent_is_that_of_its_estimator(file: Path) -> None:
     training = DESCENT["training"]
     for key in ("ridge", "rank_tolerance", "margin", "consistency"):
         assert getattr(settings, key) == DESCENT[key]
-    for key in ("epochs", "patience", "clip", "damping"):
+    for key in ("epochs", "patience", "clip", "damping", "optimizer", "schedule"):
         assert getattr(settings, key) == training[key]
     assert vars(settings.penalties) == DESCENT["penalties"]
-    assert {"name": settings.optimizer} | settings.optimizer_options == training["optimizer"]
-    assert {"name": settings.schedule} | settings.schedule_options == training["schedule"]
 
 
 def test_a_descent_without_a_schedule_keeps_its_rate(file: Path) -> None:
@@ -427,9 +426,9 @@ def test_a_descent_without_a_schedule_keeps_its_rate(file: Path) -> None:
 @pytest.mark.parametrize("rate", ["1e-3", "1E-3", "0.001"])
 def test_options_of_an_optimizer_may_be_written_as_people_write_them(file: Path, rate: str) -> None:
     text = yaml.safe_dump(LEAST) + f"estimator: {{name: sgd, training: {{optimizer: {{name: Adam, lr: {rate}}}}}}}\n"
-    assert descent_settings(load(file, text)).optimizer_options == {"lr": 1e-3}
+    assert descent_settings(load(file, text)).optimizer == {"name": "Adam", "lr": 1e-3}
     config = load(file, descent(optimizer={"name": "Adam", "lr": 1}), f"estimator.training.optimizer.lr={rate}")
-    assert descent_settings(config).optimizer_options == {"lr": 1e-3}
+    assert descent_settings(config).optimizer == {"name": "Adam", "lr": 1e-3}
 
 
 @pytest.mark.parametrize(
@@ -531,7 +530,17 @@ def test_held_out_logs_are_for_a_descent_and_not_those_that_are_fitted_on(file: 
         load(file, both)
 
 
-def test_what_a_file_leaves_out_of_a_descent_is_what_the_estimator_leaves_out(file: Path) -> None:
-    """Stated twice: the config would take a second longer to import if it knew the estimators."""
-    config = load(file, LEAST, "estimator.name=sgd")
-    assert descent_settings(config) == Sgd()
+def test_what_a_file_leaves_out_is_what_the_estimators_leave_out(file: Path) -> None:
+    estimator = load(file, LEAST).estimator
+    assert estimator.least_squares == LeastSquares()
+    assert estimator.consistent(Conditions()) == Consistent()
+    assert descent_settings(load(file, LEAST, "estimator.name=sgd")) == Sgd()
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_setting_of_an_estimator_is_a_key_or_needs_more_than_a_file(file: Path, name: str) -> None:
+    """Conditions need a robot, residual modules are code."""
+    needs_more = {"conditions", "residual", "residual_lr", "residual_weight"}
+    estimator = load(file, LEAST).estimator
+    keys = vars(estimator).keys() | vars(estimator.training).keys()
+    assert {field.name for field in dataclasses.fields(ESTIMATORS[name])} - keys <= needs_more

@@ -202,7 +202,7 @@ def test_conditions_that_fit_no_robot_are_refused_as_values(change: dict[str, ob
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "ball"}, "kind: found 'ball'; accepted: box, ellipsoid"),
+        ({"kind": "ball"}, "kind: found 'ball'; accepted: 'box' or 'ellipsoid'"),
         ({"centre": np.zeros(2)}, "centre: found"),
         ({"centre": np.array([0.0, np.nan, 0.0])}, "centre: found"),
         ({"half": np.array([1.0, 0.0, 1.0])}, "half: found"),

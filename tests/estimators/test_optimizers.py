@@ -43,20 +43,21 @@ def one_line(error: BaseException) -> str:
 
 
 def refused(**settings: Any) -> str:
+    descent = Sgd(**settings)
     with pytest.raises(InputError) as raised:
-        Sgd(**settings)
+        descent.try_out()
     return one_line(raised.value)
 
 
 def parabola(name: str, **options: Any) -> tuple[Optimizer, torch.nn.Parameter]:
     x = torch.nn.Parameter(torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
-    return make_optimizer(name, options, [{"params": [x]}]), x
+    return make_optimizer({"name": name, **options}, [{"params": [x]}]), x
 
 
 def rates(name: str, options: dict[str, Any], epochs: int = EPOCHS, losses: list[float] | None = None) -> list[float]:
     """The learning rate in every epoch."""
     optimizer, x = parabola("Adam", lr=0.05)
-    schedule, out = make_schedule(name, options, optimizer, epochs), []
+    schedule, out = make_schedule({"name": name, **options}, optimizer, epochs), []
     x.grad = torch.zeros_like(x)
     for epoch in range(epochs):
         out.append(optimizer.param_groups[0]["lr"])
@@ -81,7 +82,7 @@ def test_the_names_are_those_of_torch() -> None:
 
 @pytest.mark.parametrize("name", sorted(REFUSED))
 def test_an_optimizer_of_torch_that_cannot_do_it_is_refused_by_those_that_can(name: str) -> None:
-    accepted = refused(optimizer=name).split("; accepted: ")[1]
+    accepted = refused(optimizer={"name": name}).split("; accepted: ")[1]
     assert accepted.split(", ") == optimizer_names()
 
 
@@ -89,7 +90,7 @@ def test_an_optimizer_of_torch_that_cannot_do_it_is_refused_by_those_that_can(na
 def test_every_supported_optimizer_comes_near_the_closed_form_by_its_name_alone(name: str) -> None:
     """52 times the closed form at the nominal parameters; after so few epochs most are within 2 %, ASGD at 1.7."""
     w = demo()
-    estimate = Trainer(Sgd(0.001, optimizer=name, epochs=EPOCHS_OF.get(name, 15)), w.problem, w.batches).run()
+    estimate = Trainer(Sgd(0.001, optimizer={"name": name}, epochs=EPOCHS_OF.get(name, 15)), w.problem, w.batches).run()
     assert 1.0 < estimate.objective / estimate.unconstrained < (2.0 if name == "ASGD" else 1.3)
 
 
@@ -99,7 +100,7 @@ def test_every_supported_optimizer_comes_near_the_closed_form_by_its_name_alone(
 )
 def test_a_misspelt_optimizer_is_refused_by_the_nearest_names(name: str, nearest: str) -> None:
     with pytest.raises(UnknownNameError) as raised:
-        Sgd(optimizer=name)
+        Sgd(optimizer={"name": name}).try_out()
     message = one_line(raised.value)
     assert f"optimizer: unknown name '{name}'" in message
     assert nearest in message.split("accepted: ")[1].split(", ")
@@ -108,15 +109,15 @@ def test_a_misspelt_optimizer_is_refused_by_the_nearest_names(name: str, nearest
 @pytest.mark.parametrize("name", ["CosineAnealingLR", "cosineannealinglr", "CosineAnnealing"])
 def test_a_misspelt_schedule_is_refused_by_the_nearest_names(name: str) -> None:
     with pytest.raises(UnknownNameError) as raised:
-        Sgd(schedule=name)
+        Sgd(schedule={"name": name}).try_out()
     assert "CosineAnnealingLR" in one_line(raised.value).split("accepted: ")[1].split(", ")
 
 
 def test_an_option_that_does_not_exist_is_refused_by_those_that_do() -> None:
-    message = refused(optimizer="SGD", optimizer_options={"lr": 0.1, "momentun": 0.9})
+    message = refused(optimizer={"name": "SGD", "lr": 0.1, "momentun": 0.9})
     assert "momentun" in message
     assert {"lr", "momentum", "weight_decay", "nesterov"} <= set(message.split("options ")[1].split(", "))
-    message = refused(schedule="ExponentialLR", schedule_options={"gama": 0.9})
+    message = refused(schedule={"name": "ExponentialLR", "gama": 0.9})
     assert "gama" in message
     assert message.endswith("accepted: options gamma, last_epoch")
 
@@ -131,7 +132,7 @@ def test_an_option_that_does_not_exist_is_refused_by_those_that_do() -> None:
     ids=str,
 )  # fmt: skip
 def test_options_that_cannot_be_are_refused(options: dict[str, Any]) -> None:
-    assert "estimator: optimizer Adam: " in refused(optimizer="Adam", optimizer_options=options)
+    assert "estimator: optimizer Adam: " in refused(optimizer={"name": "Adam", **options})
 
 
 # ---------------------------------------------------------------------------------------------------------- schedules
@@ -141,9 +142,9 @@ def test_options_that_cannot_be_are_refused(options: dict[str, Any]) -> None:
 def test_every_schedule_of_torch_lasts_all_epochs_by_its_name_or_is_refused(name: str) -> None:
     if name in ONLY_CODE:
         for options in ({}, {"schedulers": [], "milestones": []}, {"lr_lambda": "x"}):
-            assert f"schedule {name}" in refused(schedule=name, schedule_options=options)
+            assert f"schedule {name}" in refused(schedule={"name": name, **options})
         return
-    Sgd(schedule=name, schedule_options=SCHEDULES[name], epochs=EPOCHS)
+    Sgd(schedule={"name": name, **SCHEDULES[name]}, epochs=EPOCHS).try_out()
     found = rates(name, SCHEDULES[name])
     assert min(found) >= 0.0
     assert len(set(found)) > 1, "it does something"
@@ -160,7 +161,7 @@ def test_a_schedule_that_spans_the_run_spans_its_epochs_unless_told_otherwise() 
 
 def test_no_schedule_leaves_the_rate_alone() -> None:
     optimizer, _ = parabola("SGD", lr=0.3)
-    assert make_schedule(None, {}, optimizer, 5) is None
+    assert make_schedule(None, optimizer, 5) is None
     step_schedule(None, 1.0)
     assert optimizer.param_groups[0]["lr"] == 0.3
 
@@ -185,14 +186,20 @@ def test_a_schedule_by_plateaus_looks_at_the_loss() -> None:
 def test_a_schedule_that_would_fail_in_some_epoch_is_refused_before_the_first(
     name: str, options: dict[str, Any]
 ) -> None:
-    assert f"estimator: schedule {name}: " in refused(schedule=name, schedule_options=options, epochs=EPOCHS)
+    assert f"estimator: schedule {name}: " in refused(schedule={"name": name, **options}, epochs=EPOCHS)
 
 
 def test_a_schedule_that_does_not_suit_its_optimizer_is_refused() -> None:
-    message = refused(
-        optimizer="Adagrad", optimizer_options={}, schedule="OneCycleLR", schedule_options={"max_lr": 0.1}
-    )
+    message = refused(optimizer={"name": "Adagrad"}, schedule={"name": "OneCycleLR", "max_lr": 0.1})
     assert "must support momentum" in message
+
+
+def test_what_does_not_work_is_refused_where_training_starts_and_not_before() -> None:
+    """Settings are made without running anything, a trainer refuses them before any other work."""
+    settings = Sgd(optimizer={"name": "Adam", "betas": 3})
+    w = demo()
+    with pytest.raises(InputError, match="estimator: optimizer Adam: "):
+        Trainer(settings, w.problem, w.batches)
 
 
 # ----------------------------------------------------------------------------------------------------- other settings
@@ -201,16 +208,18 @@ def test_a_schedule_that_does_not_suit_its_optimizer_is_refused() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"consistency": "cholesky"}, "consistency: found 'cholesky'; accepted: log_cholesky, penalties"),
-        ({"residual": "both"}, "residual: found 'both'; accepted: joint, parameters_first, alternating"),
-        ({"ridge": -1.0}, "ridge: found -1.0; accepted: a finite number of at least 0"),
+        ({"consistency": "cholesky"}, "consistency: found 'cholesky'; accepted: 'log_cholesky' or 'penalties'"),
+        ({"residual": "both"}, "residual: found 'both'; accepted: 'joint', 'parameters_first' or 'alternating'"),
+        ({"ridge": -1.0}, "ridge: found -1.0; accepted: greater than or equal to 0"),
         ({"residual_weight": float("nan")}, "residual_weight: found nan"),
-        ({"clip": 0.0}, "clip: found 0.0; accepted: a positive number"),
-        ({"damping": float("inf")}, "damping: found inf; accepted: a positive number"),
-        ({"epochs": 0}, "epochs: found 0; accepted: a positive number"),
-        ({"patience": 0}, "patience: found 0; accepted: a positive number"),
-        ({"residual_lr": -0.1}, "residual_lr: found -0.1; accepted: a positive number"),
-        ({"margin": 1.0}, "margin: found 1.0; accepted: a number from 0 to 1, without 1"),
+        ({"optimizer": {"lr": 0.1}}, "optimizer: found {'lr': 0.1}; accepted: a mapping with the name of a class"),
+        ({"epochs": True}, "epochs: found True; accepted: a number"),
+        ({"clip": 0.0}, "clip: found 0.0; accepted: greater than 0"),
+        ({"damping": float("inf")}, "damping: found inf; accepted: a finite number"),
+        ({"epochs": 0}, "epochs: found 0; accepted: greater than or equal to 1"),
+        ({"patience": 0}, "patience: found 0; accepted: greater than or equal to 1"),
+        ({"residual_lr": -0.1}, "residual_lr: found -0.1; accepted: greater than 0"),
+        ({"margin": 1.0}, "margin: found 1.0; accepted: less than 1"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )

@@ -102,14 +102,14 @@ def test_the_figures_of_an_estimate_are_those_of_its_parameters(
 
 def test_penalties_pull_nearly_as_near_and_nearly_into_what_can_exist() -> None:
     """1.0049 was found, and eigenvalues down to -1e-5."""
-    estimate, _ = trained(demo(), consistency="penalties", epochs=30, optimizer_options={"lr": 0.1})
+    estimate, _ = trained(demo(), consistency="penalties", epochs=30, optimizer={"name": "Adam", "lr": 0.1})
     assert ratio(estimate) <= 1.02
     assert np.nanmin(estimate.eigenvalues) > -1e-3
     assert estimate.phi.reshape(-1, 12)[1:, 10:].min() > -1e-3
 
 
-MOMENTUM: dict[str, Any] = {"optimizer": "SGD", "optimizer_options": {"lr": 0.2, "momentum": 0.9}, "epochs": 40}
-RMSPROP: dict[str, Any] = {"optimizer": "RMSprop", "optimizer_options": {"lr": 0.02}, "epochs": 30}
+MOMENTUM: dict[str, Any] = {"optimizer": {"name": "SGD", "lr": 0.2, "momentum": 0.9}, "epochs": 40}
+RMSPROP: dict[str, Any] = {"optimizer": {"name": "RMSprop", "lr": 0.02}, "epochs": 30}
 
 
 @pytest.mark.parametrize("settings", [MOMENTUM, RMSPROP], ids=["SGD with momentum", "RMSprop"])
@@ -157,7 +157,7 @@ def test_the_held_out_loss_is_the_cost_of_the_held_out_logs_compressed_per_row()
 
 def test_the_parameters_with_the_least_held_out_loss_are_kept_and_patience_ends_the_descent() -> None:
     w, held_out = arm(), half_way()
-    settings = Sgd(RIDGE, epochs=60, patience=4, optimizer_options={"lr": 0.02}, schedule=None)
+    settings = Sgd(RIDGE, epochs=60, patience=4, optimizer={"name": "Adam", "lr": 0.02}, schedule=None)
     trainer = Trainer(settings, w.problem, w.batches, held_out.batches)
     losses, phis = [], []
 
@@ -179,7 +179,7 @@ def test_the_parameters_with_the_least_held_out_loss_are_kept_and_patience_ends_
 
 def test_without_patience_all_epochs_are_run_and_the_best_kept() -> None:
     w, held_out = arm(), half_way()
-    settings = Sgd(RIDGE, epochs=25, optimizer_options={"lr": 0.05}, schedule=None)
+    settings = Sgd(RIDGE, epochs=25, optimizer={"name": "Adam", "lr": 0.05}, schedule=None)
     estimate = Trainer(settings, w.problem, w.batches, held_out.batches).run()
     assert estimate.epochs == 25
     assert estimate.best_epoch < 20
@@ -198,7 +198,7 @@ def test_without_held_out_logs_the_last_parameters_are_kept_and_patience_means_n
 def test_a_schedule_by_plateaus_goes_by_the_held_out_loss_if_there_is_one(with_held_out: bool) -> None:
     w, held_out = arm(), half_way()
     options = {"patience": 0, "factor": 0.5, "threshold": 0.0}
-    settings = Sgd(RIDGE, epochs=20, schedule="ReduceLROnPlateau", schedule_options=options)
+    settings = Sgd(RIDGE, epochs=20, schedule={"name": "ReduceLROnPlateau"} | options)
     trainer = Trainer(settings, w.problem, w.batches, held_out.batches if with_held_out else None)
     epochs: list[Epoch] = []
     trainer.run(epochs.append)
@@ -227,7 +227,7 @@ def test_a_descent_that_diverges_says_so_in_one_line_and_returns_no_parameters(
     consistency: str, batch_size: int, rate: float
 ) -> None:
     w = arm()
-    options = {"optimizer": "SGD", "optimizer_options": {"lr": rate}, "schedule": None, "epochs": 5}
+    options = {"optimizer": {"name": "SGD", "lr": rate}, "schedule": None, "epochs": 5}
     batches = MiniBatches(w.logs, w.builder, batch_size)
     trainer = Trainer(Sgd(RIDGE, consistency=consistency, **options), w.problem, batches)
     with pytest.raises(InputError) as raised:
@@ -265,19 +265,19 @@ class Spring(nn.Module):
 
 
 SETTINGS: dict[str, dict[str, Any]] = {
-    **{f"{name} alone": {"optimizer": name, "optimizer_options": {}, "schedule": None} for name in optimizer_names()},
+    **{f"{name} alone": {"optimizer": {"name": name}, "schedule": None} for name in optimizer_names()},
     "Adam": {},
     "Adam with penalties": {"consistency": "penalties"},
-    "SGD momentum": {"optimizer": "SGD", "optimizer_options": {"lr": 0.05, "momentum": 0.9, "nesterov": True}},
-    "OneCycleLR": {"schedule": "OneCycleLR", "schedule_options": {"max_lr": 0.1}},
-    "ReduceLROnPlateau": {"schedule": "ReduceLROnPlateau", "schedule_options": {"patience": 0, "threshold": 0.5}},
-    "MultiStepLR": {"schedule": "MultiStepLR", "schedule_options": {"milestones": [1, 3]}},
-    "CyclicLR": {"schedule": "CyclicLR", "schedule_options": {"base_lr": 0.01, "max_lr": 0.1, "step_size_up": 2}},
+    "SGD momentum": {"optimizer": {"name": "SGD", "lr": 0.05, "momentum": 0.9, "nesterov": True}},
+    "OneCycleLR": {"schedule": {"name": "OneCycleLR", "max_lr": 0.1}},
+    "ReduceLROnPlateau": {"schedule": {"name": "ReduceLROnPlateau", "patience": 0, "threshold": 0.5}},
+    "MultiStepLR": {"schedule": {"name": "MultiStepLR", "milestones": [1, 3]}},
+    "CyclicLR": {"schedule": {"name": "CyclicLR", "base_lr": 0.01, "max_lr": 0.1, "step_size_up": 2}},
     "a residual": {"residual_lr": 0.01},
     "a residual in turns": {"residual": "alternating"},
     "a residual at last": {"residual": "parameters_first"},
 }
-SETTINGS["LBFGS alone"]["optimizer_options"] = {"max_iter": 3}
+SETTINGS["LBFGS alone"]["optimizer"] = {"name": "LBFGS", "max_iter": 3}
 
 
 def new_trainer(name: str) -> Trainer:
@@ -327,7 +327,7 @@ def test_a_descent_taken_up_again_after_any_epoch_is_the_uninterrupted_one_to_th
 
 def test_early_stopping_goes_on_where_it_was() -> None:
     w, held_out = arm(), half_way()
-    settings = Sgd(RIDGE, epochs=60, patience=4, optimizer_options={"lr": 0.02}, schedule=None)
+    settings = Sgd(RIDGE, epochs=60, patience=4, optimizer={"name": "Adam", "lr": 0.02}, schedule=None)
 
     def new() -> Trainer:
         return Trainer(settings, w.problem, w.batches, held_out.batches)

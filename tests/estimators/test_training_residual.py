@@ -46,7 +46,8 @@ def run(mode: str | None) -> Run:
     """Without a module if there is no mode."""
     w = with_cable()
     residual = None if mode is None else Springs(w.robot.n)
-    settings = Sgd(RIDGE, epochs=EPOCHS, optimizer_options={"lr": 0.1}, residual=mode or "joint", residual_weight=0.0)
+    adam = {"name": "Adam", "lr": 0.1}
+    settings = Sgd(RIDGE, epochs=EPOCHS, optimizer=adam, residual=mode or "joint", residual_weight=0.0)
     trainer = Trainer(settings, w.problem, w.batches, unseen().batches, residual)
     record = Run(trainer.estimate(), [], [], [])
 
@@ -92,7 +93,7 @@ def test_a_module_finds_the_strength_of_the_cable_that_there_is() -> None:
 
 def test_a_force_that_is_known_needs_no_training() -> None:
     w, held_out = with_cable(), unseen()
-    settings = Sgd(RIDGE, epochs=20, optimizer_options={"lr": 0.1})
+    settings = Sgd(RIDGE, epochs=20, optimizer={"name": "Adam", "lr": 0.1})
     estimate = Trainer(settings, w.problem, w.batches, held_out.batches, Fixed(cable)).run()
     assert cost(without_cable(), estimate.phi) < 0.1 * cost(without_cable(), run(None).estimate.phi)
 
@@ -140,7 +141,7 @@ def test_a_module_is_left_as_it_was_found_and_can_be_trained_again(mode: str) ->
 
 def test_a_module_may_learn_at_a_rate_of_its_own() -> None:
     w, residual = arm(), Springs(arm().robot.n)
-    settings = Sgd(optimizer_options={"lr": 0.05}, residual_lr=0.5, residual_weight=0.0)
+    settings = Sgd(optimizer={"name": "Adam", "lr": 0.05}, residual_lr=0.5, residual_weight=0.0)
     trainer = Trainer(settings, w.problem, w.batches, residual=residual)
     assert [group["lr"] for group in trainer.optimizer.param_groups] == [0.05, 0.5]
     assert trainer.run_epoch().learning_rate == 0.05

@@ -22,7 +22,7 @@ from torchid.commands.plausibility import absurd, force_gain, implausible
 from torchid.config import load_config
 from torchid.errors import BaseLostError
 from torchid.estimators import LeastSquares
-from torchid.fitting.cross_validation import complete
+from torchid.fitting.cross_validation import with_all_readings
 from torchid.fitting.experiment import set_up
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.rank import StateReport, _of_base, check_base
@@ -102,7 +102,7 @@ def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple
     robot, blocks, squares, rows = torchid.load_robot(DEMO / "quadruped.urdf"), in_folds([log], builder), 0.0, 0
     for fold in range(FOLDS):
         seen = [block for block in blocks if block.fold != fold]
-        phi = LeastSquares(config.estimator.pull).solve(linear_problem(compress(seen, builder), builder, robot)).phi
+        phi = config.estimator.least_squares.solve(linear_problem(compress(seen, builder), builder, robot)).phi
         (unseen,) = (block for block in blocks if block.fold == fold)
         left = linear_problem(compress([unseen], builder), builder, robot)
         squares, rows = squares + left.cost(phi), rows + left.rows
@@ -352,7 +352,7 @@ def test_samples_without_a_reading_are_left_out_of_the_residual() -> None:
     samples.torque[3, 2] = np.nan
     samples.wrench[4, 0, 1] = samples.wrench[5, 0, 1] = np.nan  # 5: in the air
     for name, lost in (("full", {3, 4}), ("joints", {3}), ("contacts", {4})):
-        found = complete(samples, RowBuilder(robot, contacts, named_sensors(name, robot.n, 1)))
+        found = with_all_readings(samples, RowBuilder(robot, contacts, named_sensors(name, robot.n, 1)))
         assert set(range(20)) - {samples.time.tolist().index(t) for t in found.time.tolist()} == lost
     silent = replace(samples, torque=None)
-    assert len(complete(silent, RowBuilder(robot, contacts, named_sensors("joints", robot.n, 1)))) == 0
+    assert len(with_all_readings(silent, RowBuilder(robot, contacts, named_sensors("joints", robot.n, 1)))) == 0

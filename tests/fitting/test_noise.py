@@ -15,9 +15,9 @@ from true_robots import true_parameters
 
 from torchid.config import load_config
 from torchid.estimators import Estimate, LeastSquares
-from torchid.fitting.experiment import Experiment, set_up
-from torchid.fitting.fit import fitted
-from torchid.fitting.noise import NoiseSummary, estimated_noise, recorded_sensors, stating, weighed
+from torchid.fitting.experiment import Experiment, set_up, with_noise
+from torchid.fitting.fit import LogFitter
+from torchid.fitting.noise import NoiseSummary, recorded_sensors
 from torchid.parameters import MASS, PER_BODY
 from torchid.problem import RowBuilder, Samples, bind, compress_parts
 from torchid.problem.base_motion import levelled
@@ -145,8 +145,8 @@ def shaken(scene: Scene, rng: np.random.Generator) -> Samples:
 def fit(experiment: Experiment, samples: Samples, noise: SensorNoise | None = None) -> Estimate:
     sensors = experiment.sensors if noise is None else replace(experiment.sensors, noise=noise)
     builder = RowBuilder(experiment.robot, experiment.contacts, sensors)
-    parts = compress_parts([samples], builder, threads=1)
-    return fitted(parts, experiment, builder, LeastSquares().solve).estimate
+    fitter = LogFitter(robot=experiment.robot, builder=builder, estimator=LeastSquares())
+    return fitter.fit(compress_parts([samples], builder, threads=1)).estimate
 
 
 def origins(found: NoiseSummary) -> dict[str, str]:
@@ -159,7 +159,7 @@ def fits(scene: Scene, sensors: str, noisy: Callable[[Scene, np.random.Generator
     out = Fits([], [], [])
     for seed in range(repeats):
         samples = noisy(scene, np.random.default_rng(seed))
-        found = estimated_noise(experiment, experiment.sensors, [samples])
+        found = experiment.estimate_noise([samples], experiment.sensors)
         out.found.append(found)
         out.guessed.append(fit(experiment, samples, SensorNoise()))
         out.estimated.append(fit(experiment, samples, found.noise))
@@ -227,7 +227,8 @@ def test_noise_that_is_all_stated_is_used_to_the_last_bit(scene: Scene) -> None:
     )
     experiment = scene.experiment(stated)
     samples = pushed(scene, np.random.default_rng(0))
-    used, found = weighed(experiment, [samples])
+    found = experiment.estimate_noise([samples], experiment.sensors)
+    used = with_noise(experiment, found)
     assert set(origins(found).values()) == {"stated"}
     assert found.passes == 1
     assert used.config == experiment.config
@@ -239,19 +240,19 @@ def test_noise_that_is_all_stated_is_used_to_the_last_bit(scene: Scene) -> None:
 def test_stated_noise_that_residuals_contradict_is_kept_and_the_estimate_suggested(scene: Scene) -> None:
     stated = "sensors.noise={joint_torque: 0.1, contact_force: 0.2, base_force: 0.2, base_moment: 0.15}"
     experiment = scene.experiment(stated)
-    found = estimated_noise(experiment, experiment.sensors, [pushed(scene, np.random.default_rng(0))])
+    found = experiment.estimate_noise([pushed(scene, np.random.default_rng(0))], experiment.sensors)
     assert found.noise.base_force == (0.2,) * 3
     assert found.suggested["joint_torque"] == pytest.approx(0.1, rel=0.1)
     assert found.suggested["contact_force"] == pytest.approx(0.2, rel=0.2)
     right = scene.experiment("sensors.noise={joint_torque: 0.1, contact_force: 0.2}")
-    assert not estimated_noise(right, right.sensors, [pushed(scene, np.random.default_rng(0))]).suggested
+    assert not right.estimate_noise([pushed(scene, np.random.default_rng(0))], right.sensors).suggested
 
 
 def test_what_is_estimated_keeps_the_proportion_to_what_is_stated(scene: Scene) -> None:
     """As where a filter has left a tenth of a sensor's noise: weights and intervals are those of the right noise."""
     samples = pushed(scene, np.random.default_rng(0))
     alone, beside = scene.experiment(), scene.experiment("sensors.noise={joint_torque: 1.0}")
-    estimated, proportional = (estimated_noise(x, x.sensors, [samples]).noise for x in (alone, beside))
+    estimated, proportional = (x.estimate_noise([samples], x.sensors).noise for x in (alone, beside))
     assert proportional.joint_torque == 1.0
     ratio = 1.0 / estimated.joint_torque
     np.testing.assert_allclose(proportional.base[:2], ratio * estimated.base[:2], rtol=0.05)
@@ -269,9 +270,7 @@ def test_impacts_do_not_pass_for_noise(scene: Scene) -> None:
     hit[::25] += 20.0
     experiment = scene.experiment()
     clean, spoilt = (
-        estimated_noise(
-            experiment, experiment.sensors, [replace(samples, base=replace(samples.base, specific_force=f))]
-        )
+        experiment.estimate_noise([replace(samples, base=replace(samples.base, specific_force=f))], experiment.sensors)
         for f in (samples.base.specific_force, hit)
     )
     assert spoilt.noise.base[0] < 1.5 * clean.noise.base[0]
@@ -280,8 +279,8 @@ def test_impacts_do_not_pass_for_noise(scene: Scene) -> None:
 
 def test_exact_logs_and_logs_of_a_few_samples_leave_noise_that_is_positive(scene: Scene) -> None:
     experiment = scene.experiment()
-    exact = estimated_noise(experiment, experiment.sensors, [scene.samples])
-    few = estimated_noise(experiment, experiment.sensors, [scene.samples[:3]])
+    exact = experiment.estimate_noise([scene.samples], experiment.sensors)
+    few = experiment.estimate_noise([scene.samples[:3]], experiment.sensors)
     assert all(one.used > 0.0 for one in [*exact.groups, *few.groups])
     assert exact.noise.joint_torque == pytest.approx(1e-3 * SensorNoise.joint_torque), "the floor"
     assert "assumed" in origins(few).values()
@@ -289,12 +288,13 @@ def test_exact_logs_and_logs_of_a_few_samples_leave_noise_that_is_positive(scene
 
 def test_the_same_logs_give_the_same_noise_and_settings_that_state_it(scene: Scene) -> None:
     experiment, samples = scene.experiment(), pushed(scene, np.random.default_rng(0))
-    (used, found), (_, again) = (weighed(experiment, [samples]) for _ in range(2))
+    found, again = (experiment.estimate_noise([samples], experiment.sensors) for _ in range(2))
     assert found == again
+    used = with_noise(experiment, found)
     assert used.sensors.noise == found.noise
     assert used.noise == replace(found.noise, contact_moment=0.2, ft_force=None, ft_moment=None), "none of these"
-    assert stating(used.config, found) == used.config
-    assert origins(weighed(used, [samples])[1])["joint_torque"] == "stated"
+    assert with_noise(used, found).config == used.config
+    assert origins(used.estimate_noise([samples], used.sensors))["joint_torque"] == "stated"
 
 
 def test_the_sensors_of_a_log_are_those_whose_every_value_it_has(scene: Scene) -> None:
@@ -302,7 +302,11 @@ def test_the_sensors_of_a_log_are_those_whose_every_value_it_has(scene: Scene) -
     wrench, torque = samples.wrench.clone(), samples.torque.clone()
     wrench[~samples.active] = torch.nan
     torque[5, 2] = wrench[0, 0, 1] = torch.nan
-    found = recorded_sensors(experiment, [samples, replace(samples, wrench=wrench, torque=torque)])
+    found = recorded_sensors(
+        experiment.robot, experiment.contacts, [samples, replace(samples, wrench=wrench, torque=torque)]
+    )
     assert np.flatnonzero(~found.torque).tolist() == [2]
     assert np.argwhere(~found.wrench[:, :3]).tolist() == [[0, 1]]
-    assert not recorded_sensors(experiment, [replace(samples, wrench=None, torque=None)]).wrench.any()
+    assert not recorded_sensors(
+        experiment.robot, experiment.contacts, [replace(samples, wrench=None, torque=None)]
+    ).wrench.any()

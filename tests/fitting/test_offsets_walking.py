@@ -111,7 +111,7 @@ def test_swing_phases_tell_offsets_from_mass(
     assert abs(mass_error(found)) < mass
     assert np.abs(errors).max() < force
     assert max(x.inflation for x in forces) < 0.5 * APART
-    assert total_mass(found.assembly, found.estimate).told_apart
+    assert total_mass(found.assembly, found.estimate).separable
 
 
 @pytest.mark.parametrize("kind", ["exact", "logs"])
@@ -123,9 +123,9 @@ def test_feet_that_never_leave_the_ground_do_not_and_that_is_said_by_a_wide_marg
     vertical = [x for x in found.extras if x.extra.component == "fz"]
     assert len(vertical) == 2 * len(SQUATTING)
     assert min(x.inflation for x in vertical) > 30.0 * APART
-    assert not any(x.told_apart for x in found.extras)
-    assert not total_mass(found.assembly, found.estimate).told_apart
-    assert all(x.mixed_with for x in vertical)
+    assert not any(x.separable for x in found.extras)
+    assert not total_mass(found.assembly, found.estimate).separable
+    assert all(x.confounded_with for x in vertical)
 
 
 # --------------------------------------------------------------------------- noise in the acceleration of the base
@@ -210,12 +210,12 @@ def test_readings_in_the_air_give_the_offsets_and_the_mass_where_the_acceleratio
         masses.append(mass_error(found))
         held.append(abs(masses[-1]) * 65.9 < 1.96 * mass.standard_error)
         offsets += [abs(x.value - true_offset(x)) < 1.96 * x.standard_error for x in found.extras]
-        assert mass.told_apart
-        assert all(x.told_apart for x in found.extras)
+        assert mass.separable
+        assert all(x.separable for x in found.extras)
         if not draw:
             blind = gait.fit(gait.samples(logs, in_the_air=False))
             assert mass_error(blind) < -0.015, "or nothing is shown: 2 to 3 %, and at 4 standard errors"
-            assert total_mass(blind.assembly, blind.estimate).told_apart, "the gait alone seems enough"
+            assert total_mass(blind.assembly, blind.estimate).separable, "the gait alone seems enough"
     assert np.abs(masses).max() < 5e-3
     assert np.mean(offsets) >= (0.92 if draws > 20 else 0.8)
     if cutoff_hz:  # without, noise in the regressor is 0.1 % of the mass, which no standard error tells

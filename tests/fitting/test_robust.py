@@ -23,10 +23,9 @@ from urdfs import inertial, joint, link, write
 from torchid import parameters
 from torchid.cli import main
 from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares, violations
-from torchid.fitting.fit import Fit
-from torchid.fitting.robust import TUNING, Reweighting, RobustLoss, RobustSummary, loss_of, robust_fit
-from torchid.identifiability.confounding import estimate_extras
-from torchid.problem import ExtraTerms, RowBuilder, Samples, assemble, bind, compress_parts
+from torchid.fitting.fit import Fit, LogFitter
+from torchid.fitting.robust import TUNING, Reweighting, RobustLoss, RobustSummary, fit_robustly
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind, compress_parts
 from torchid.problem.compression import Part
 from torchid.problem.rows import ChunkTerms, Workspace
 from torchid.robot import Robot
@@ -57,7 +56,7 @@ def test_weights_and_slopes_are_derivatives_of_the_loss(kind: str, size: float, 
         return  # Huber's loss has no second derivative there
     (first,) = torch.autograd.grad(rho(kind, u, tuning), u, create_graph=True)
     second = torch.autograd.grad(first, u)[0] if first.requires_grad else torch.zeros(())
-    loss = loss_of(kind, tuning)
+    loss = RobustLoss.named(kind, tuning)
     torch.testing.assert_close(loss.weight(u.detach()) * u.detach(), first.detach())
     torch.testing.assert_close(loss.slope(u.detach()), second.to(torch.float64), rtol=1e-9, atol=1e-12)
 
@@ -66,7 +65,7 @@ def test_weights_and_slopes_are_derivatives_of_the_loss(kind: str, size: float, 
 @settings(deadline=None)
 @given(size=st.floats(0.0, 1e200), more=st.floats(1.0, 1e3), tuning=st.floats(0.1, 10.0))
 def test_larger_residuals_never_weigh_more(kind: str, size: float, more: float, tuning: float) -> None:
-    loss = loss_of(kind, tuning)
+    loss = RobustLoss.named(kind, tuning)
     weight, larger, other = loss.weight(torch.tensor([size, size * more, -size], dtype=torch.float64)).tolist()
     assert 0.0 <= larger <= weight <= 1.0
     assert other == weight
@@ -77,7 +76,7 @@ def test_larger_residuals_never_weigh_more(kind: str, size: float, more: float, 
 def test_the_usual_tuning_has_95_percent_efficiency_on_gaussian_noise(kind: str) -> None:
     u = torch.linspace(-12.0, 12.0, 200_001, dtype=torch.float64)
     density = torch.exp(-u.square() / 2.0) / np.sqrt(2.0 * np.pi) * (u[1] - u[0])
-    loss = loss_of(kind, None)
+    loss = RobustLoss.named(kind, None)
     variance = (density * (loss.weight(u) * u).square()).sum() / (density * loss.slope(u)).sum() ** 2
     assert 1.0 / float(variance) == pytest.approx(0.95, abs=5e-4)
 
@@ -86,7 +85,7 @@ def test_the_usual_tuning_has_95_percent_efficiency_on_gaussian_noise(kind: str)
 @given(st.integers(2, 60), st.floats(-6.0, 6.0))
 def test_the_scale_is_the_median_of_the_residuals_sizes(count: int, decades: float) -> None:
     residuals = 10.0**decades * np.random.default_rng(count).normal(size=2 * count + 1)
-    one_pass = Reweighting(loss_of("huber", None), {"x": torch.zeros(1, dtype=torch.float64)}, 2.0)
+    one_pass = Reweighting(RobustLoss.named("huber", None), {"x": torch.zeros(1, dtype=torch.float64)}, 2.0)
     rows = torch.from_numpy(np.stack([np.ones_like(residuals), residuals], axis=1))
     for part in rows.split(7):
         one_pass(log_named("x"), (0,), part)
@@ -112,15 +111,18 @@ class Bench:
     true: Array
     estimator: LeastSquares | Consistent = LeastSquares()
 
+    @property
+    def fitter(self) -> LogFitter:
+        return LogFitter(robot=self.robot, builder=self.builder, estimator=self.estimator)
+
     def solve(self, parts: list[Part]) -> Fit:
-        assembly = assemble(parts, self.builder, self.robot)
-        estimate = self.estimator.solve(assembly.problem)
-        return Fit(parts, assembly, estimate, estimate_extras(assembly, estimate, self.robot.body_names))
+        return self.fitter.fit(parts)
 
     def fits(self, kind: str, *logs: Samples, passes: int = PASSES) -> tuple[Fit, Fit, RobustSummary]:
         """The least-squares fit, and the robust one."""
         first = self.solve(compress_parts(logs, self.builder, threads=1))
-        return first, *robust_fit(first, loss_of(kind, None), passes, logs, self.builder, self.solve)
+        found = fit_robustly(logs, self.fitter, RobustLoss.named(kind, None, passes), first=first)
+        return first, found.fit, found.summary
 
     def noisy(self, rng: np.random.Generator, share: float = 0.0, spike: float | None = None) -> Samples:
         """The log with noise on its torques, and spikes, of either sign if no other is given, on a share of them."""
@@ -294,7 +296,7 @@ def test_the_fixed_point_is_that_of_other_algorithms_at_the_same_scale(
     A, b = whitened(arm, log)
     phi = first.estimate.phi
     for number in range(200):
-        loss = loss_of(kind if number > 20 else "huber", None)
+        loss = RobustLoss.named(kind if number > 20 else "huber", None)
         weight = np.sqrt(loss.weight(torch.from_numpy((A @ phi - b) / 1.1)).numpy())
         phi = np.linalg.lstsq(A * weight[:, None], b * weight, rcond=1e-10)[0]
     np.testing.assert_allclose(A @ fit.estimate.phi, A @ phi, atol=1e-7)

@@ -94,7 +94,7 @@ def half_way() -> World:
 
 def still(**settings: Any) -> dict[str, Any]:
     """Steps that change nothing."""
-    return {"optimizer": "SGD", "optimizer_options": {"lr": 1e-300}, "schedule": None, "epochs": 1} | settings
+    return {"optimizer": {"name": "SGD", "lr": 1e-300}, "schedule": None, "epochs": 1} | settings
 
 
 def cable(q: Tensor, _v: Tensor, _a: Tensor) -> Tensor:

@@ -182,9 +182,9 @@ def test_an_offset_and_a_weight_are_as_far_apart_as_the_acceleration_is_from_con
     if acceleration:
         assert found.inflation == pytest.approx(np.sqrt((s**2).mean()) / a.std(), rel=1e-6)
         assert found.value == pytest.approx(7.0, abs=1e-6)
-    assert found.told_apart == (acceleration > 9.81 / APART)
-    if not found.told_apart:
-        assert found.mixed_with == ("arm m",)
+    assert found.separable == (acceleration > 9.81 / APART)
+    if not found.separable:
+        assert found.confounded_with == ("arm m",)
         assert (found.standard_error == np.inf) == (acceleration == 0.0)
 
 
@@ -221,18 +221,18 @@ def standing(lifted: bool) -> Fit:
 @pytest.mark.parametrize("lifted", [False, True], ids=["both feet always down", "each lifted in turn"])
 def test_only_a_lifted_foot_tells_its_plates_vertical_offset_from_the_mass_of_a_robot_at_rest(lifted: bool) -> None:
     found = standing(lifted)
-    apart = {x.extra.component: x.told_apart for x in found.extras}
+    apart = {x.extra.component: x.separable for x in found.extras}
     vertical = [x for x in found.extras if x.extra.component == "fz"]
     mass = total_mass(found.assembly, found.estimate)
     assert len(vertical) == 2
     assert apart["fz"] == lifted
-    assert mass.told_apart == lifted
+    assert mass.separable == lifted
     for x in vertical:
-        assert x.told_apart == lifted
+        assert x.separable == lifted
         if lifted:
             assert abs(x.value) < 1e-6
         else:
-            assert any(name.endswith(" m") for name in x.mixed_with), x.mixed_with
+            assert any(name.endswith(" m") for name in x.confounded_with), x.confounded_with
 
 
 # ---------------------------------------------------------------------------------------------------- filtered logs
@@ -272,7 +272,7 @@ def test_a_filter_that_smears_the_switching_of_contacts_leaves_offsets_exact(rec
     for c, contact in enumerate(CONTACTS):
         for k in range(len(contact.components)):
             true[f"offset of {contact.frame} {COMPONENTS[k]}"] = off.wrench[c, k]
-    told = [x for x in after.extras if x.told_apart and x.extra.label in true]
+    told = [x for x in after.extras if x.separable and x.extra.label in true]
     assert len(told) >= 9
     for x in told:
         shift = x.value - before.values[x.log, x.extra.label]

@@ -9,7 +9,7 @@ from motions import jittered, uniform, value
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
-from torchid.logs.timeline import JITTER, plan
+from torchid.logs.timeline import JITTER, lay_out_timeline
 
 CUTOFF = 10.0  # Hz: a reach of 0.1 s
 
@@ -38,7 +38,7 @@ def any_within(reach: float, native: FloatArray, flags: BoolArray, at: FloatArra
 def test_a_filtered_contact_is_active_where_it_truly_is_within_the_filters_reach(
     time: FloatArray, rate: float | None
 ) -> None:
-    timeline = plan("x", time, CUTOFF, rate, differentiates=True)
+    timeline = lay_out_timeline(time, CUTOFF, rate, differentiates=True)
     assert timeline.reach == pytest.approx(1.0 / CUTOFF)
     flags = stepping(time)
     found = timeline.active(flags)
@@ -51,7 +51,7 @@ def test_a_filtered_contact_is_active_where_it_truly_is_within_the_filters_reach
 @pytest.mark.parametrize("rate", [123.0, 40.0, 2000.0])
 @pytest.mark.parametrize("time", [uniform(2.0), jittered(2.0)], ids=["uniform", "jittered"])
 def test_without_a_filter_a_resampled_flag_is_that_of_the_sample_before(time: FloatArray, rate: float) -> None:
-    timeline = plan("x", time, None, rate, differentiates=True)
+    timeline = lay_out_timeline(time, None, rate, differentiates=True)
     assert timeline.reach == 0.0
     flags = stepping(time)
     np.testing.assert_array_equal(timeline.active(flags), any_within(0.0, timeline.native, flags, timeline.at))
@@ -61,7 +61,7 @@ def test_without_a_filter_a_resampled_flag_is_that_of_the_sample_before(time: Fl
 
 @pytest.mark.parametrize("time", [uniform(2.0), jittered(2.0)], ids=["uniform", "jittered"])
 def test_without_a_filter_or_resampling_flags_are_the_logs_own(time: FloatArray) -> None:
-    timeline = plan("x", time, None, None, differentiates=True)
+    timeline = lay_out_timeline(time, None, None, differentiates=True)
     flags = stepping(time)
     np.testing.assert_array_equal(timeline.active(flags), flags[timeline.kept])
 
@@ -71,7 +71,7 @@ def test_a_shorter_reach_belongs_to_a_higher_cutoff() -> None:
     flags = np.zeros((len(time), 1), bool)
     flags[500] = True  # 1 s
     for cutoff in (5.0, 10.0, 50.0):
-        timeline = plan("x", time, cutoff, None, differentiates=False)
+        timeline = lay_out_timeline(time, cutoff, None, differentiates=False)
         active = timeline.at[timeline.active(flags)[:, 0]]
         assert active.min() == pytest.approx(1.0 - 1.0 / cutoff, abs=0.0021)
         assert active.max() == pytest.approx(1.0 + 1.0 / cutoff, abs=0.0021)

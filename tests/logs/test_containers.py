@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from torchid.errors import LogError
+from torchid.errors import LogError, about_file
 from torchid.logs.containers import translated
 
 
 def line_of(text: str) -> str:
     """The message made of a reader's own."""
-    with pytest.raises(LogError) as caught, translated("walk.h5", "time", "an array"):
+    with pytest.raises(LogError) as caught, about_file("walk.h5"), translated("time", "an array"):
         raise OSError(text)
     return str(caught.value)
 

@@ -50,7 +50,7 @@ def assert_recovered(w: World, found: Fit, terms: ExtraTerms) -> None:
     assert set(found.values) == set(true)
     for key, expected in true.items():
         assert found.values[key] == pytest.approx(expected, rel=EXACT, abs=1e-9), key
-    assert all(x.told_apart and np.isfinite(x.standard_error) and not x.mixed_with for x in found.extras)
+    assert all(x.separable and np.isfinite(x.standard_error) and not x.confounded_with for x in found.extras)
     state = random_states(np.random.default_rng(99), w.robot.n, 100)
     seen = np.append(np.ones(6, dtype=bool), found.builder.sensors.torque)
     forces, expected = predicted(w.robot, found.estimate.phi, *state), w.oracle.forces(*state)
@@ -96,9 +96,9 @@ def test_where_no_sensor_is_true_to_scale_none_can_be_told_from_the_masses() -> 
     found = fitted(w, sensors_of(w.robot, "full+limbs"), terms)
     assert found.extras
     for x in found.extras:
-        assert not x.told_apart
+        assert not x.separable
         assert x.standard_error == np.inf
-        assert x.mixed_with
+        assert x.confounded_with
 
 
 @pytest.mark.parametrize("name", ["contacts", "mixed"])
@@ -196,7 +196,7 @@ def test_a_humanoid_with_ankle_sensors_and_an_imu_is_found_with_all_offsets_that
         for name, expected in offsets.items():
             label = f"offset of {'limb sensor ' if '.' in name else ''}{' '.join(name.rsplit('.', 1))}"
             assert found.values[log.source, label] == pytest.approx(expected, rel=EXACT), (log.source, label)
-    assert all(x.told_apart for x in found.extras)
+    assert all(x.separable for x in found.extras)
 
     state = random_states(np.random.default_rng(99), robot.n, 100)
     assert worst(predicted(robot, found.estimate.phi, *state), oracle.forces(*state)) < 1e-9

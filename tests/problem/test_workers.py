@@ -43,5 +43,5 @@ def test_every_task_is_done_once_with_one_thread_each_and_without_gradients(work
 def test_a_builder_that_moves_makes_its_plans_anew() -> None:
     robot = load(SOLO12)
     builder = RowBuilder(robot, [Contact("FL_FOOT", "point")], named_sensors("joints", robot.n, 1))
-    assert builder.plan((True,)).row_std.dtype == torch.float64
-    assert builder.float().plan((True,)).row_std.dtype == torch.float32
+    assert builder.layout((True,)).row_std.dtype == torch.float64
+    assert builder.float().layout((True,)).row_std.dtype == torch.float32

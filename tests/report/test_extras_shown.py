@@ -75,16 +75,16 @@ def test_a_value_has_as_many_decimals_as_its_error_and_that_two_digits(
 
 def test_a_warning_of_what_cannot_be_told_apart_lists_sensors_and_parameters_by_their_commas() -> None:
     mixed = ("trunk m", "trunk Izz", "thigh mcy", "scale of hip0")
-    joints = [replace(found("scale", f"hip{j}", ""), inflation=1e9, mixed_with=mixed) for j in range(8)]
+    joints = [replace(found("scale", f"hip{j}", ""), inflation=1e9, confounded_with=mixed) for j in range(8)]
     foot = Extra("offset", "sole", "fz", "N", 1.0, False, contact=(0, 2))
     off = ExtraEstimate(foot, "", 1.5, 1.4, 0.1, 1e9, mixed)
     with pytest.warns(ConfoundedWarning) as caught:
         warn_of_confounded([*joints, off], "a.yaml")
     message = str(caught.list[0].message)
     assert message.startswith(
-        "a.yaml: scale of hip0, hip1, hip2, hip3, hip4, hip5 and 2 more; offset of sole fz cannot"
+        "a.yaml: scale of hip0, hip1, hip2, hip3, hip4, hip5 and 2 more; offset of sole fz confounded"
     )
-    assert "told from m, Izz of trunk; mcy of thigh; do not trust" in message
+    assert "with m, Izz of trunk; mcy of thigh; do not trust" in message
 
 
 def test_the_figures_legend_names_every_log_whichever_panel_it_is_in() -> None:

@@ -25,7 +25,7 @@ def biped() -> Simulation:
 
 
 def goals(biped: Simulation, motion: MotionConfig) -> tuple[Array, list[Goal]]:
-    found = biped.motion(motion)
+    found = biped.reference(motion)
     return found.time, list(found)
 
 
@@ -138,12 +138,12 @@ def test_a_step_that_would_have_to_begin_before_the_log_is_left_out(biped: Simul
 @pytest.mark.parametrize("what", ["com_w", "torso", "l_sole", ""])
 def test_a_wave_of_something_the_robot_has_not_is_refused(biped: Simulation, what: str) -> None:
     with pytest.raises(UnknownNameError, match=r"motions.m.waves.1.what: unknown name"):
-        biped.motion(MotionConfig("m", 1.0, [wave("com_x", 1.0, 0.0), wave(what, 1.0, 0.1)]))
+        biped.reference(MotionConfig("m", 1.0, [wave("com_x", 1.0, 0.0), wave(what, 1.0, 0.1)]))
 
 
 def test_a_step_of_a_foot_the_robot_has_not_is_refused(biped: Simulation) -> None:
     with pytest.raises(UnknownNameError, match=r"motions.stepping.steps.order: .*'l_foot'; accepted: l_sole"):
-        biped.motion(stepping("r_sole", "l_foot"))
+        biped.reference(stepping("r_sole", "l_foot"))
 
 
 # -------------------------------------------------------------------------------------------------------------- stance
@@ -187,12 +187,12 @@ def test_a_posture_beyond_a_joints_range_is_refused() -> None:
 
 def test_a_wave_faster_than_half_the_control_rate_is_refused(biped: Simulation) -> None:
     with pytest.raises(InputError, match=r"motions.m.waves.0.hz: 499; accepted: below 250"):
-        biped.motion(MotionConfig("m", 1.0, [wave("com_x", 499.0, 0.01)]))
+        biped.reference(MotionConfig("m", 1.0, [wave("com_x", 499.0, 0.01)]))
 
 
 def test_a_swing_longer_than_its_period_is_refused(biped: Simulation) -> None:
     with pytest.raises(InputError, match=r"motions.stepping.steps.swing_s: 3 in the air"):
-        biped.motion(stepping("r_sole", "l_sole", hz=0.5, swing_s=3.0))
+        biped.reference(stepping("r_sole", "l_sole", hz=0.5, swing_s=3.0))
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,8 @@ from pathlib import Path
 
 from torchid.commands.manifest import MANIFEST, Contents, FolderKind, inspect, manifest_of, read_manifest
 from torchid.errors import ConfigError
-from torchid.staging import NEW, OLD, interrupt_held_back, leftovers, note_written, staging
+from torchid.staging import CAN_LOCK, NEW, OLD, interrupt_held_back, leftovers, locks, note_written, staging
 from torchid.text import listed, shown
-
-try:
-    import fcntl
-except ImportError:  # not on Windows
-    fcntl = None  # type: ignore[assignment]
 
 
 @contextmanager
@@ -27,7 +22,7 @@ def claimed(folder: Path) -> Iterator[None]:
     Raises:
         ConfigError: another process is at work there.
     """
-    if fcntl is None:
+    if not CAN_LOCK:
         yield
         return
     lock, handle = folder.with_name(f".{folder.name}.lock"), -1
@@ -45,21 +40,13 @@ def claimed(folder: Path) -> Iterator[None]:
 
 def _locked(lock: Path, folder: Path) -> int:
     """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
-    while True:
+    for _ in range(_TRIES):
         with creating(folder):
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(handle)
-            found, accepted = "another run is at work there", "another output, or patience"
-            raise ConfigError(folder, "output", found, accepted) from error
-        except OSError:  # a file system without locks: one run at a time is then the user's affair
+        if locks(handle, lock) is not False:  # None, no locks there: one run at a time is then the user's affair
             return handle
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(handle), lock.stat()):
-                return handle
-        os.close(handle)  # who had it has just removed it
+        os.close(handle)  # another has it, or has just removed it
+    raise ConfigError(folder, "output", "another run is at work there", "another output, or patience")
 
 
 EVENTS = "events.out.tfevents*"

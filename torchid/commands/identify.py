@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,14 +17,14 @@ from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, check_training, descent_settings, training_folder
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning
+from torchid.errors import NumericalWarning, warn
 from torchid.estimators import Conditions, Estimate, LeastSquares, violations
-from torchid.fitting.calibration import Calibration, warn_of_confounded, warn_of_disagreement
-from torchid.fitting.cross_validation import CrossValidation, Judge, Pair, RidgeChoice, chosen_ridge
-from torchid.fitting.experiment import Experiment, set_up
-from torchid.fitting.fit import Fit, assembled, fits_without_folds, fitted, stand_in, stated_conditions
-from torchid.fitting.noise import NoiseSummary, weighed
-from torchid.fitting.robust import RobustSummary, loss_of, robust_fit
+from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
+from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
+from torchid.fitting.experiment import Experiment, set_up, with_noise
+from torchid.fitting.fit import Fit, LogFitter
+from torchid.fitting.noise import NoiseSummary
+from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.identifiability.rank import StateReport, check_base, state_reports
 from torchid.parameters import PER_BODY, Array
@@ -77,7 +76,7 @@ class _Prepared:
     excluded: Mapping[str, int]
     states: list[StateReport]
     noise: NoiseSummary
-    builder: RowBuilder
+    fitter: LogFitter
     blocks: list[Samples]
     parts: list[Part]
     ridge: RidgeChoice | None
@@ -86,56 +85,65 @@ class _Prepared:
 def _prepare(config: ExperimentConfig, source: object, clock: _Clock, bars: Progress) -> _Prepared:
     with clock("read"):
         experiment = set_up(config, source)
-        conditions = stated_conditions(config.estimator, experiment.robot, source)
+        conditions = experiment.conditions()
         if config.estimator.name == "sgd":
             descent_settings(config, source)  # before any work
         reader = LogReader(experiment)
         logs = _read(reader, experiment, bars)
     with clock("noise"):
-        states = state_reports(logs["train"], _builder(experiment))
+        states = state_reports(logs["train"], experiment.builder(experiment.sensors))
         check_base(states, config.sensors.on_base_lost)
-        experiment, noise = weighed(experiment, logs["train"], source)
+        noise = experiment.estimate_noise(logs["train"], experiment.sensors)
+        experiment = with_noise(experiment, noise)
     with clock("compress"):
-        builder = _builder(experiment)
+        builder = experiment.builder(experiment.sensors)
         blocks = in_folds(logs["train"], builder)
         parts = _compressed(builder, blocks, bars)
     with clock("ridge"):
-        experiment, ridge = _with_ridge(experiment, parts, blocks, builder, bars, source)
-    return _Prepared(experiment, conditions, logs, reader.excluded, states, noise, builder, blocks, parts, ridge)
+        experiment, ridge = _with_ridge(experiment, parts, blocks, builder, conditions, bars)
+    return _Prepared(
+        experiment=experiment,
+        conditions=conditions,
+        logs=logs,
+        excluded=reader.excluded,
+        states=states,
+        noise=noise,
+        fitter=experiment.fitter(builder, conditions),
+        blocks=blocks,
+        parts=parts,
+        ridge=ridge,
+    )
 
 
 def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identification:
     clock = _Clock()
     with progress_bars() as bars:
         ready = _prepare(config, source, clock, bars)
-        experiment, builder, logs, blocks = ready.experiment, ready.builder, ready.logs, ready.blocks
-        evaluation = Evaluation(experiment.robot, experiment.contacts, config.device, experiment.terms)
-        training = None
+        experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
+        evaluation, builder = experiment.evaluation(), fitter.builder
+        training, solve = None, None
         with clock("solve"):
-            settings = experiment.config.estimator
-            instead = stand_in(settings, ready.conditions).solve
-            solve: Callable[[LinearProblem], Estimate] = instead
-            if settings.name == "sgd":
-                check_plausible(fitted(ready.parts, experiment, builder, instead, source), experiment, source)
-                training = Training(experiment.config, experiment.robot, source)
+            if experiment.config.estimator.name == "sgd":
+                check_plausible(fitter.fit(ready.parts), experiment)
+                training = Training(experiment)
                 evaluate = partial(_identified_metrics, evaluation, logs)
                 solve = partial(training.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
-            fit = fitted(ready.parts, experiment, builder, solve, source)
-            fit, robust = _robust(fit, experiment, builder, solve, blocks, bars, source)
+            fit = fitter.fit(ready.parts, solve)
+            fit, robust = _robust(fit, experiment, fitter, blocks, bars)
             ready.parts = []
             estimate, problem = fit.estimate, fit.assembly.problem
-            mass = check_plausible(fit, experiment, source)
+            mass = check_plausible(fit, experiment)
             warn_of_confounded(fit.extras, source)
-            warn_of_disagreement(fit, experiment, builder, source)
+            warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
             whole = folds_together(fit.parts, builder)
-            alone = _by_state(experiment, builder, whole, source)
-            adds = _contributions(experiment, builder, whole, logs["train"], problem, bars)
+            alone = _by_state(fitter, whole)
+            added = _contributions(experiment, builder, whole, logs["train"], problem, bars)
         with clock("evaluate"):
-            left_out = fits_without_folds(fit.parts, experiment, builder, instead, source)
-            both, *without = (_calibrations(experiment, one) for one in (fit, *left_out))
-            judge, of_blocks = Judge(evaluation, builder), states_together(fit.parts, builder)
-            metrics, validation = _metrics(judge, logs["test"], blocks, of_blocks, (both, without), bars)
+            fits = (fit, *fitter.fit_without_folds(fit.parts))
+            compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
+            scorer, of_blocks = Scorer(evaluation, builder), states_together(fit.parts, builder)
+            metrics, validation = _metrics(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
         run = Identification(
             experiment=experiment,
@@ -145,7 +153,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             robust=robust,
             states=ready.states,
             by_state=alone,
-            adds=adds,
+            contributions=added,
             metrics=metrics,
             violations=broken,
             seconds=clock.seconds,
@@ -155,9 +163,9 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             validation=validation,
             ridge=ready.ridge,
         )
-        check_not_worse(run.worse, experiment, source)
+        check_not_worse(run.worse, experiment)
         bars.add_task("writing", total=None)
-        write_run(run, evaluation, (logs["test"] or logs["train"])[0], both, training)
+        write_run(run, evaluation, (logs["test"] or logs["train"])[0], compared, training)
     return run
 
 
@@ -166,15 +174,15 @@ def _with_ridge(
     parts: Sequence[Part],
     blocks: Sequence[Samples],
     builder: RowBuilder,
+    conditions: Conditions,
     bars: Progress,
-    source: object,
 ) -> tuple[Experiment, RidgeChoice | None]:
     """The experiment with a ridge that is a number, and how it was chosen, if it was."""
     config = experiment.config
     if not config.estimator.chooses_ridge:
         return experiment, None
     bar = bars.add_task("choosing the ridge", total=None)
-    choice = chosen_ridge(parts, blocks, experiment, experiment.sensors, builder, source)
+    choice = experiment.choose_ridge(parts, blocks, experiment.fitter(builder, conditions), conditions)
     bars.update(bar, total=1, completed=1)
     chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
     return replace(experiment, config=chosen), choice
@@ -192,62 +200,40 @@ def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str
     }
 
 
-def _builder(experiment: Experiment) -> RowBuilder:
-    scene = experiment.robot, experiment.contacts, experiment.sensors, experiment.terms
-    return RowBuilder(*scene).to(experiment.config.device)
-
-
 def _compressed(builder: RowBuilder, train: Sequence[Samples], bars: Progress) -> list[Part]:
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
     return compress_parts(train, builder, progress=lambda n: bars.advance(streaming, n))
 
 
 def _robust(
-    fit: Fit,
-    experiment: Experiment,
-    builder: RowBuilder,
-    solve: Callable[[LinearProblem], Estimate],
-    train: Sequence[Samples],
-    bars: Progress,
-    source: object,
+    fit: Fit, experiment: Experiment, fitter: LogFitter, train: Sequence[Samples], bars: Progress
 ) -> tuple[Fit, RobustSummary | None]:
-    """The fit with outliers weighed down, if that is asked for.
+    """The fit with outliers weighed down, if the settings say so; only batch estimators can.
 
     Warns:
         NumericalWarning: the passes were too few.
     """
-    settings = experiment.config.estimator.robust
-    if settings is None:
+    loss = experiment.loss
+    if loss is None:
         return fit, None
-    bar = bars.add_task("weighing outliers down", total=settings.passes * sum(map(len, train)))
-    better, found = robust_fit(
-        fit,
-        loss_of(settings.loss, settings.tuning),
-        settings.passes,
-        train,
-        builder,
-        lambda parts: fitted(parts, experiment, builder, solve, source),
-        lambda n: bars.advance(bar, n),
-    )
+    bar = bars.add_task("weighing outliers down", total=loss.passes * sum(map(len, train)))
+    found = fit_robustly(train, fitter, loss, first=fit, progress=lambda n: bars.advance(bar, n))
     bars.update(bar, total=1, completed=1)
-    if not found.converged:
-        message = f"{source}: estimator.robust: not settled after {found.passes} passes; accepted: more passes"
-        warnings.warn(message, NumericalWarning, stacklevel=3)
-    return better, found
+    if not found.summary.converged:
+        settled = f"estimator.robust: not settled after {found.summary.passes} passes; accepted: more passes"
+        warn(f"{experiment.source}: {settled}", NumericalWarning)
+    return found.fit, found.summary
 
 
-def _by_state(
-    experiment: Experiment, builder: RowBuilder, parts: Sequence[Part], source: object
-) -> dict[str, Estimate]:
+def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
     """What each contact state determines on its own, by least squares, most frequent first."""
-    settings, samples = experiment.config.estimator, Counter[State]()
+    samples = Counter[State]()
     for part in parts:
         samples[part.state] += part.samples
-    estimator, out = LeastSquares(settings.pull, settings.rank_tolerance), {}
+    estimator, out = LeastSquares(fitter.estimator.ridge, rank_tolerance=fitter.estimator.rank_tolerance), {}
     for state, _ in samples.most_common():
-        of_state = [part for part in parts if part.state == state]
-        problem = assembled(of_state, builder, experiment.robot, settings, source).problem
-        out[state_name(builder.contacts, state)] = estimator.solve(problem)
+        problem = fitter.assemble([part for part in parts if part.state == state]).problem
+        out[state_name(fitter.builder.contacts, state)] = estimator.solve(problem)
     return out
 
 
@@ -267,30 +253,26 @@ def _contributions(
     return found
 
 
-def _calibrations(experiment: Experiment, fit: Fit) -> tuple[Calibration, Calibration]:
-    return Calibration.both(experiment, experiment.sensors, fit.estimate.phi, fit.extras)
-
-
 def _metrics(
-    judge: Judge,
+    scorer: Scorer,
     test: Sequence[Samples],
     blocks: Sequence[Samples],
     parts: Sequence[Part],
-    calibrations: tuple[tuple[Calibration, Calibration], Sequence[tuple[Calibration, Calibration]]],
+    compared: Comparison[Calibration],
+    without_folds: Sequence[Comparison[Calibration]],
     bars: Progress,
-) -> tuple[dict[str, Pair], CrossValidation | None]:
-    """Nominal and identified metrics by set of logs, and of fits without a fold each on that fold.
-
-    `parts`: of the blocks of the training logs; `calibrations`: of the fit, and of the fits without a fold.
-    """
-    both, left_out = calibrations
+) -> tuple[dict[str, Comparison[Metrics]], CrossValidation | None]:
+    """Metrics by set of logs, and of fits without a fold each on that fold; `parts`: of the training logs' blocks."""
     bar = bars.add_task("evaluating", total=sum(map(len, [*blocks, *test])))
 
     def done(samples: int) -> None:
         bars.advance(bar, samples)
 
-    train, validation = judge.training_errors(blocks, parts, both, left_out, done)
-    return {"train": train} | ({"test": judge.errors(test, both, done)} if test else {}), validation
+    train = scorer.score_training(blocks, parts, compared, without_folds, done)
+    metrics = {"train": train.metrics}
+    if test:
+        metrics["test"] = scorer.score_logs(test, compared, done)
+    return metrics, train.cross_validation
 
 
 def _identified_metrics(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
 from torchid import parameters
 from torchid.commands.check import log_to_check
-from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError
+from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.identifiability.confounding import TotalMass, total_mass
@@ -21,6 +20,7 @@ from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 from torchid.problem.metrics import ADVICE, Worse, verdict
 from torchid.robot import Robot
+from torchid.rounding import is_significant
 
 OFF = 10.0
 """Factor that no model of a robot is off by: units are by a thousand, a gear by 50 to 160."""
@@ -73,7 +73,7 @@ def force_gain(problem: LinearProblem) -> float | None:
     free, fixed = ~chosen & problem.free, ~chosen & ~problem.free
     measured = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
     U, values, _ = np.linalg.svd(problem.A[:, free] * problem.scale[free], full_matrices=False)
-    friction = U[:, values > 1e-10 * values.max(initial=0.0)]
+    friction = U[:, is_significant(values)]
     needed, measured = (x - friction @ (friction.T @ x) for x in (needed, measured))
     size = np.linalg.norm(needed) * np.sqrt(measured @ measured + problem.residual)
     if not size > 0.0 or abs(needed @ measured) < _CLEAR * size:
@@ -116,7 +116,7 @@ _USUAL = (
 )
 
 
-def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
+def check_plausible(fit: Fit, scene: Scene) -> TotalMass:
     """Stop at a fit that no robot can have left, and warn of one that leaves much more than the stated noise.
 
     Returns:
@@ -132,7 +132,9 @@ def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
     """
     estimate = fit.estimate
     if not estimate.rank:
-        raise SensorError(source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
+        raise SensorError(
+            scene.source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs"
+        )
     mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance)
     absurd = implausible(fit.assembly.problem, estimate.phi, mass, scene.robot)
     unexplained = _unexplained(fit)
@@ -142,17 +144,19 @@ def check_plausible(fit: Fit, scene: Scene, source: object) -> TotalMass:
     if finding is not None and (absurd is not None or finding.condemns_all):
         told = f"{log}: {finding.field}: {finding.found}"
         raise ImplausibleFitError(
-            source, "logs", f"{absurd or unexplained}; torchid check finds in {told}", finding.advice
+            scene.source, "logs", f"{absurd or unexplained}; torchid check finds in {told}", finding.advice
         )
     if absurd is not None:
-        raise ImplausibleFitError(source, "logs", absurd, f"data and URDF that fit each other; usual reasons: {_USUAL}")
+        raise ImplausibleFitError(
+            scene.source, "logs", absurd, f"data and URDF that fit each other; usual reasons: {_USUAL}"
+        )
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
-    warnings.warn(f"{source}: {unexplained}{named}; {advice}", NumericalWarning, stacklevel=3)
+    warn(f"{scene.source}: {unexplained}{named}; {advice}", NumericalWarning)
     return mass
 
 
-def check_not_worse(found: list[Worse], scene: Scene, source: object) -> None:
+def check_not_worse(found: list[Worse], scene: Scene) -> None:
     """Stop where the URDF's parameters predict better and the checks condemn a training log; else say so.
 
     Raises:
@@ -168,8 +172,8 @@ def check_not_worse(found: list[Worse], scene: Scene, source: object) -> None:
     if finding is not None:
         told, advice = f"{told}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
         if finding.condemns_all:
-            raise ImplausibleFitError(source, "logs", told, advice)
-    warnings.warn(f"{source}: {told}; {advice}", NumericalWarning, stacklevel=3)
+            raise ImplausibleFitError(scene.source, "logs", told, advice)
+    warn(f"{scene.source}: {told}; {advice}", NumericalWarning)
 
 
 def _unexplained(fit: Fit) -> str | None:

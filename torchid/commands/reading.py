@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchid.config.experiment import PreprocessingConfig
-from torchid.errors import LogError
+from torchid.errors import LogError, about_file
 from torchid.fitting.experiment import Scene
 from torchid.log_checks import Checked, without_condemned
 from torchid.log_checks.check import check
@@ -74,10 +74,10 @@ class LargeLog:
         Warns:
             TorchidWarning: as `preprocess` would.
         """
-        with open_blocks(self.path, self.folder) as blocks:
+        with about_file(self.path), open_blocks(self.path, self.folder) as blocks:
             first, settings = blocks.read(slice(0, min(len(blocks), 2))), self.settings
             derived = differentiates(first)
-            timeline = timeline_of(blocks.source, blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
+            timeline = timeline_of(blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
             coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
             time = blocks.time if timeline is None else blocks.time[0] + timeline.at
             contacts = self._contacts(blocks, first)

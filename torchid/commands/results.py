@@ -15,7 +15,7 @@ from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import ExperimentConfig, dump_config
 from torchid.errors import during
 from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
-from torchid.fitting.calibration import Calibration
+from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.noise import NoiseSummary
@@ -49,14 +49,27 @@ LEFT_OUT = "blocks left out of the fit"
 """How tables call the training samples that cross-validation predicts."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Identification:
-    """A finished run: the fit, nominal and identified metrics by set of logs ("train", "test"), conditions broken.
+    """A finished run.
 
-    `extras`: unknowns beside the bodies' parameters. `noise`: what rows were weighed with. `robust`: how outliers were
-    weighed down, if so. `mass`: how well the total mass is known. `excluded`: condemned samples left out, by log.
-    `adds`: what each training log, contact state and sensor adds. `validation`: None where the samples are too few to
-    leave some out. `ridge`: how it was chosen, if it was.
+    Attributes:
+        experiment: robot, contacts, sensors and settings, with the noise and the ridge that were used.
+        estimate: the fit.
+        extras: offsets, scales and actuator terms.
+        noise: that rows were weighed with.
+        robust: how outliers were weighed down, if so.
+        states: contact states of the training logs.
+        by_state: what each of them determines on its own.
+        contributions: what each training log, contact state and sensor adds.
+        metrics: errors by set of logs, "train" and "test".
+        violations: conditions that the identified parameters break.
+        seconds: by step of the run.
+        samples: number of training samples.
+        excluded: condemned samples left out, by log.
+        mass: the total mass and how well it is known.
+        validation: errors on held-out blocks, None where the samples are too few to leave some out.
+        ridge: how it was chosen, if it was.
     """
 
     experiment: Experiment
@@ -66,8 +79,8 @@ class Identification:
     robust: RobustSummary | None
     states: list[StateReport]
     by_state: dict[str, Estimate]
-    adds: Contributions
-    metrics: dict[str, tuple[Metrics, Metrics]]
+    contributions: Contributions
+    metrics: dict[str, Comparison[Metrics]]
     violations: list[Violation]
     seconds: dict[str, float]
     samples: int
@@ -89,8 +102,8 @@ class Identification:
 
     def state_entries(self) -> list[dict[str, object]]:
         """Contact states, with what each of them adds."""
-        adds = {state.name: asdict(state) for state in self.adds.states}
-        return [asdict(state) | adds[state.name] for state in self.states]
+        contributions = {state.name: asdict(state) for state in self.contributions.states}
+        return [asdict(state) | contributions[state.name] for state in self.states]
 
     @property
     def phi(self) -> Array:
@@ -101,8 +114,8 @@ class Identification:
 def write_run(
     run: Identification,
     evaluation: Evaluation,
-    shown: Samples,
-    both: tuple[Calibration, Calibration],
+    plotted: Samples,
+    compared: Comparison[Calibration],
     training: Training | None,
 ) -> None:
     """Write the run folder.
@@ -110,19 +123,19 @@ def write_run(
     Args:
         run: what to write.
         evaluation: for the predicted forces.
-        shown: log of the figure of forces, as recorded.
-        both: nominal and identified parameters, with the unknowns that suit them.
+        plotted: log of the figure of forces, as recorded.
+        compared: parameters, with the extra parameters that suit them.
         training: whose curves go into the folder, and whose checkpoint is then no longer needed.
     """
     config, robot = run.experiment.config, run.experiment.robot
     figures = {
-        "forces": forces_of(evaluation, shown, both),
+        "forces": forces_of(evaluation, plotted, compared),
         "errors": error_figure(run.metrics),
         "parameters": parameter_figure(
             robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
         ),
         "identifiability": identifiability_figure(robot.body_names, run.estimate),
-        "contributions": contribution_figure(_bits(run.adds)),
+        "contributions": contribution_figure(_bits(run.contributions)),
     }
     if run.extras:
         figures["extras"] = extra_figure(run.extras)
@@ -140,13 +153,13 @@ def write_run(
         training.forget()
 
 
-def forces_of(evaluation: Evaluation, samples: Samples, both: tuple[Calibration, Calibration]) -> Figure:
+def forces_of(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> Figure:
     """The figure of forces of a log's first samples: nominal, identified, and measured as the latter calibrates it.
 
     Each prediction is as far from what was measured as from readings that are calibrated for it.
     """
     measured, predicted = [], []
-    for one in both:
+    for one in compared:
         (read,) = one.logs([samples])
         part = read[:_PLOTTED_SAMPLES]
         readings, (forces,) = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
@@ -163,9 +176,9 @@ def metrics_document(run: Identification) -> dict[str, object]:
     document: dict[str, object] = {}
     for name in SETS:
         pair = run.metrics.get(name)
-        document[name] = None if pair is None else pair[1].as_dict()
-        document[f"{name}_nominal"] = None if pair is None else pair[0].as_dict()
-    variation = {name: pair[1].base_force_of_variation for name, pair in run.metrics.items()}
+        document[name] = None if pair is None else pair.identified.as_dict()
+        document[f"{name}_nominal"] = None if pair is None else pair.nominal.as_dict()
+    variation = {name: pair.identified.base_force_of_variation for name, pair in run.metrics.items()}
     return document | {
         "base_force_rms_of_variation": variation,
         "rank": estimate.rank,
@@ -177,7 +190,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "residual_std": estimate.residual_std,
         "total_mass": run.mass.value if run.mass.determined else None,
         "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
-        "total_mass_told_from_offsets": run.mass.told_apart,
+        "total_mass_told_from_offsets": run.mass.separable,
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
         "noise": {"groups": [asdict(one) for one in run.noise.groups], "suggested": run.noise.suggested},
@@ -204,24 +217,24 @@ def _validation_document(run: Identification) -> dict[str, object] | None:
 
 def _identifiability_document(run: Identification) -> dict[str, object]:
     """What the data determine, and what each log and sensor adds; contact states have a list of their own."""
-    estimate, adds = run.estimate, run.adds
+    estimate, found = run.estimate, run.contributions
     return {
         "singular_values": estimate.singular_values.tolist(),
         "condition_number": estimate.condition_number if estimate.rank else None,
         "oversampling": estimate.oversampling,
-        **asdict(adds.known),
+        **asdict(found.known),
         "verdicts": estimate.verdict_counts(),
-        "logs": [asdict(log) for log in adds.logs],
-        "sensors": [asdict(sensor) for sensor in adds.sensors],
+        "logs": [asdict(log) for log in found.logs],
+        "sensors": [asdict(sensor) for sensor in found.sensors],
     }
 
 
-def _bits(adds: Contributions) -> dict[str, list[tuple[str, float]]]:
+def _bits(found: Contributions) -> dict[str, list[tuple[str, float]]]:
     """Names and bits, by kind."""
     return {
-        "logs": [(Path(log.name).name, log.bits) for log in adds.logs],
-        "contact states": [(state.name, state.bits) for state in adds.states],
-        "sensors": [(sensor.name, sensor.bits) for sensor in adds.sensors],
+        "logs": [(Path(log.name).name, log.bits) for log in found.logs],
+        "contact states": [(state.name, state.bits) for state in found.states],
+        "sensors": [(sensor.name, sensor.bits) for sensor in found.sensors],
     }
 
 
@@ -251,12 +264,14 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
             events.errors(last, {"left_out": run.validation.identified})
         events.verdict(last, verdict(run.worse) or "nowhere worse than the URDF's parameters")
         events.fit(last, estimate)
-        events.identifiability(last, estimate, run.adds.known, table_text(verdict_counts_table(run.by_state, estimate)))
+        events.identifiability(
+            last, estimate, run.contributions.known, table_text(verdict_counts_table(run.by_state, estimate))
+        )
         final = {
             f"{name}_{group}": value
             for name in reversed(SETS)  # unseen logs first: TensorBoard shows the first few
             if name in run.metrics
-            for group, value in run.metrics[name][1].relative.items()
+            for group, value in run.metrics[name].identified.relative.items()
             if value is not None
         }
         price = estimate.relative_price if isinstance(estimate, BoundEstimate) else 0.0
@@ -271,7 +286,7 @@ def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
     return {
         "sensors": config.sensors.set or "by name",
         "estimator": estimator.name,
-        "ridge": estimator.pull,
+        "ridge": estimator.numeric_ridge,
         "friction": estimator.friction,
         "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
         "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,

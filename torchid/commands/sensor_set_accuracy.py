@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rich.progress import Progress
 
 from torchid.commands.plausibility import check_plausible
-from torchid.errors import ImplausibleFitError, LogError, TorchidWarning
+from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration
-from torchid.fitting.cross_validation import chosen_ridge
+from torchid.fitting.estimator import batch_estimator
 from torchid.fitting.experiment import Scene
-from torchid.fitting.fit import batch_estimator, fitted, stated_conditions
 from torchid.identifiability.expected_error import error_directions, expected_errors
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
@@ -31,9 +29,8 @@ def accuracies(
     train: Sequence[Samples],
     test: Sequence[Samples],
     bars: Progress,
-    source: object = "experiment",
 ) -> dict[str, SetAccuracy]:
-    """Fit with every sensor set that the training logs recorded; a descent is stood in for by least squares.
+    """Fit with every sensor set that the training logs recorded, by least squares instead of a descent.
 
     What is measured is compared with readings calibrated for the parameters of each fit, by all sensors if the training
     logs have them, or else by the set's; what is expected counts offsets and the like as known in predictions.
@@ -42,18 +39,18 @@ def accuracies(
         TorchidWarning: the training logs lack a sensor of a set, or no robot can have left its fit; it is left out.
     """
     bar = bars.add_task("comparing sensor sets", total=len(sets))
-    evaluation = Evaluation(scene.robot, scene.contacts, scene.config.device, scene.terms)
+    evaluation = scene.evaluation()
     reference, out = _reference(scene, train), {}
     for name, sensors in sets.items():
         try:
             for samples in train:
                 check_forces(samples, scene.robot, scene.contacts, sensors)
-            out[name] = _accuracy(scene, sensors, train, test, evaluation, reference, source)
+            out[name] = _accuracy(scene, sensors, train, test, evaluation, reference)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'"
-            warnings.warn(message, TorchidWarning, stacklevel=2)
+            warn(message)
         except ImplausibleFitError as error:
-            warnings.warn(f"{error}; no accuracy of the sensors '{name}'", TorchidWarning, stacklevel=2)
+            warn(f"{error}; no accuracy of the sensors '{name}'")
         bars.advance(bar)
     return out
 
@@ -63,7 +60,7 @@ class _Reference:
     """Sensors that readings are compared with, and what the training logs say of their unknowns."""
 
     scene: Scene
-    sensors: SensorSet
+    builder: RowBuilder
     assembly: Assembly
 
     def calibration(self, phi: Array) -> Calibration:
@@ -74,7 +71,8 @@ class _Reference:
             for found, own in zip(assembly.eliminations, assembly.unknowns(phi), strict=True)
             for extra, value in zip(found.extras, own, strict=True)
         }
-        return Calibration(self.scene, self.sensors, phi, values)
+        robot, loss = self.scene.robot, self.scene.loss
+        return Calibration(robot=robot, builder=self.builder, phi=phi, values=values, loss=loss)
 
 
 def _reference(scene: Scene, train: Sequence[Samples]) -> _Reference | None:
@@ -82,7 +80,7 @@ def _reference(scene: Scene, train: Sequence[Samples]) -> _Reference | None:
     robot = scene.robot
     sensors = named_sensors("full", robot.n, len(scene.contacts), scene.noise, len(robot.ft_names))
     sensors = with_ft_sensors(sensors, robot, robot.ft_names)
-    builder = RowBuilder(robot, scene.contacts, sensors, scene.terms).to(scene.config.device)
+    builder = scene.builder(sensors)
     if not builder.extras:
         return None
     try:
@@ -90,7 +88,7 @@ def _reference(scene: Scene, train: Sequence[Samples]) -> _Reference | None:
             check_forces(samples, robot, scene.contacts, sensors)
     except LogError:
         return None
-    return _Reference(scene, sensors, assemble(compress_parts(train, builder), builder, robot))
+    return _Reference(scene, builder, assemble(compress_parts(train, builder), builder, robot))
 
 
 def _accuracy(
@@ -100,28 +98,27 @@ def _accuracy(
     test: Sequence[Samples],
     evaluation: Evaluation,
     reference: _Reference | None,
-    source: object,
 ) -> SetAccuracy:
     settings, robot = scene.config.estimator, scene.robot
-    builder = RowBuilder(robot, scene.contacts, sensors, scene.terms).to(scene.config.device)
+    builder, conditions = scene.builder(sensors), scene.conditions()
+    fitter = scene.fitter(builder, conditions)
     if settings.name == "sgd":
         settings = replace(settings, name="least_squares")
     blocks = in_folds(train, builder)
     parts = compress_parts(blocks, builder)
     if settings.chooses_ridge:
-        settings = replace(settings, ridge=chosen_ridge(parts, blocks, scene, sensors, builder, source).ridge)
-    estimator = batch_estimator(settings, stated_conditions(settings, robot, source))
-    fit = fitted(parts, scene, builder, estimator.solve, source)
-    check_plausible(fit, scene, source)
+        settings = replace(settings, ridge=scene.choose_ridge(parts, blocks, fitter, conditions).ridge)
+    fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
+    check_plausible(fit, scene)
     estimate, problem = fit.estimate, fit.assembly.problem
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling
     prior_error = scene.config.analysis.prior_error
-    directions = error_directions(problem, settings.pull, variance, prior_error, settings.rank_tolerance)
+    directions = error_directions(problem, settings.numeric_ridge, variance, prior_error, settings.rank_tolerance)
     found = scene.noise.times(noise)
     bodies = Evaluation(robot, scene.contacts, scene.config.device, ExtraTerms(sign_width=scene.terms.sign_width))
     expected = expected_errors(bodies.builder, test or train, directions, found)
-    calibration = (reference or _Reference(scene, sensors, fit.assembly)).calibration(estimate.phi)
+    calibration = (reference or _Reference(scene, builder, fit.assembly)).calibration(estimate.phi)
     phi = calibration.parameters(evaluation)
     measured = evaluation.metrics(calibration.logs(test), phi[None])[0] if test else None
     possible = measured_components(scene.contacts, sensors)

@@ -45,7 +45,7 @@ def simulate(config: SimulationConfig, source: object = "simulation") -> dict[st
     robot = load_robot(config.robot.urdf)
     simulation = set_up_simulation(config, source)
     for motion in config.motions:
-        simulation.motion(motion)
+        simulation.reference(motion)
     with new_folder(config.output, config.overwrite, SIMULATION) as folder, progress_bars() as bars:
         (folder / "logs").mkdir()
         (folder / "exact").mkdir()

@@ -35,8 +35,9 @@ from torchid.commands.folder import (
 from torchid.commands.manifest import Manifest, inspect, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
-from torchid.errors import ConfigError, InputError, SensorError, TorchidWarning
-from torchid.estimators import Epoch, PenaltyWeights, Sgd, SgdEstimate, Trainer
+from torchid.errors import ConfigError, InputError, SensorError, warn
+from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
+from torchid.fitting.experiment import Experiment
 from torchid.guards import MAX_STATE, check_regular
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Samples
@@ -194,7 +195,7 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
         if output.exists() and not config.overwrite:
             raise ConfigError(output, "--resume", "a finished run", "an unfinished one, or overwrite=true")
         message = f"{folder}: no checkpoint to go on from; training starts at the beginning"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
     elif waiting and not resume and not config.overwrite:
         raise ConfigError(folder, "output", "an unfinished training", "--resume, overwrite=true, or another output")
     if not waiting or not resume:
@@ -205,15 +206,16 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
 class Training:
     """The descent of one run, which leaves its state in a folder of its own until the run is done."""
 
-    def __init__(self, config: ExperimentConfig, robot: Robot, source: object = "experiment") -> None:
+    def __init__(self, experiment: Experiment) -> None:
         """Fix the settings.
 
         Raises:
             InputError: optimizer, schedule or a number that cannot be.
         """
-        self.config, self.robot, self.source = config, robot, source
+        config = experiment.config
+        self.config, self.robot, self.source = config, experiment.robot, experiment.source
         self.folder = training_folder(config.output)
-        self.settings = descent_settings(config, source)
+        self.settings = descent_settings(config, self.source)
         self._text, self._saved = dump_config(config), 0
 
     def run(
@@ -274,7 +276,7 @@ class Training:
             found.remove()
         if self.folder.exists():
             message = f"{self.folder}: stays: it holds what torchid did not write"
-            warnings.warn(message, TorchidWarning, stacklevel=3)
+            warn(message)
 
     def _train(self, trainer: Trainer, evaluate: Evaluate, events: RunEvents, progress: Callable[[str], None]) -> None:
         training = self.config.estimator.training
@@ -343,26 +345,12 @@ def descent_settings(config: ExperimentConfig, source: object = "experiment") ->
     Raises:
         InputError: an optimizer or schedule that torch does not have or that does not take its options.
     """
-    estimator, training = config.estimator, config.estimator.training
-    optimizer, schedule = dict(training.optimizer), dict(training.schedule or {})
+    settings = config.estimator.sgd
     try:
-        return Sgd(
-            ridge=estimator.pull,
-            rank_tolerance=estimator.rank_tolerance,
-            consistency=estimator.consistency,
-            margin=estimator.margin,
-            penalties=PenaltyWeights(**vars(estimator.penalties)),
-            optimizer=optimizer.pop("name"),
-            optimizer_options=optimizer,
-            schedule=schedule.pop("name", None),
-            schedule_options=schedule,
-            epochs=training.epochs,
-            patience=training.patience,
-            clip=training.clip,
-            damping=training.damping,
-        )
+        settings.try_out()
     except InputError as error:
         raise ConfigError(source, f"estimator.training.{error.field}", error.found, error.accepted) from error
+    return settings
 
 
 def body_eigenvalues(robot: Robot, phi: Array) -> dict[str, float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,18 +19,16 @@ from torchid.config.sensors import (
     Choice,
     Device,
     FileName,
-    NotNegative,
-    Positive,
-    Seed,
     Sensors,
     SensorsConfig,
     check_choice,
     spelled_out,
 )
-from torchid.errors import ConfigError, TorchidWarning
+from torchid.errors import ConfigError, warn
 from torchid.logs import Topics
 from torchid.logs.containers import bag_files
 from torchid.logs.ros.topics import check_topics
+from torchid.settings import NotNegative, Positive, Seed
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -295,7 +292,7 @@ def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
         both = sorted({*found[key]} & {*found["test"]})
         if both:
             message = f"{path}: logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion"
-            warnings.warn(message, TorchidWarning, stacklevel=3)
+            warn(message)
     both = sorted({*found["train"]} & {*found["validation"]})
     if both:
         raise ConfigError(path, "logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")

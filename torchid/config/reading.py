@@ -20,6 +20,7 @@ from pydantic import TypeAdapter, ValidationError
 from torchid.errors import ConfigError, UnknownNameError, during
 from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML, read_bytes
 from torchid.logs.containers import READABLE
+from torchid.settings import accepted_values
 from torchid.text import is_plain, shown
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -306,24 +307,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
     if first["type"] == "dataclass_type":
         accepted = f"a mapping with {', '.join(_keys_at(kind.settings, place))}"
     else:
-        count = first.get("ctx", {}).get("min_length", 1)
-        plain = {
-            "float_parsing": "a number",
-            "float_type": "a number",
-            "int_parsing": "a whole number",
-            "int_type": "a whole number",
-            "int_from_float": "a whole number",
-            "bool_parsing": "true or false",
-            "bool_type": "true or false",
-            "string_type": "a text",
-            "path_type": "a path",
-            "list_type": "a list",
-            "dict_type": "a mapping",
-            "too_short": f"at least {count} items",
-            "string_too_short": "a name",
-        }
-        described = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-        accepted = plain.get(first["type"], described)
+        accepted = accepted_values(first)
     if first["type"] in ("dataclass_type", "dict_type"):
         accepted = kind.accepted_at(place, accepted)
     return ConfigError(path, field, f"found {shown}", accepted)

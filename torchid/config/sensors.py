@@ -7,20 +7,14 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError
 from torchid.problem.extras import CHANNELS
+from torchid.settings import Positive
 
 STRICT = ConfigDict(extra="forbid")
-
-
-def no_flag(value: object) -> object:
-    """The value, unless it is true or false, which pydantic takes for 1 and 0."""
-    if isinstance(value, bool):
-        raise ValueError("a number")  # and not 1.0 for `true`
-    return value
 
 
 def _torch_device(value: str) -> str:
@@ -35,10 +29,6 @@ def _file_name(value: str) -> str:
     return value
 
 
-Number = Annotated[float, BeforeValidator(no_flag), Field(allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0.0)]
-NotNegative = Annotated[Number, Field(ge=0.0)]
-Seed = Annotated[int, BeforeValidator(no_flag), Field(ge=0)]
 FileName = Annotated[str, AfterValidator(_file_name)]
 Device = Annotated[str, AfterValidator(_torch_device)]
 

@@ -11,8 +11,9 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
-from torchid.config.sensors import STRICT, FileName, NotNegative, Number, Positive, Seed
+from torchid.config.sensors import STRICT, FileName
 from torchid.errors import ConfigError
+from torchid.settings import BelowOne, NotNegative, Number, Positive, Seed
 
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
@@ -141,7 +142,7 @@ class BoundsConfig:
 class NominalConfig:
     """The nominal robot: mass, centre of mass and inertia of every body off by up to `error`, as a share."""
 
-    error: Annotated[Number, Field(ge=0.0, lt=1.0)] = 0.2
+    error: BelowOne = 0.2
     seed: Seed = 0
 
 

@@ -5,7 +5,7 @@ from torchid.estimators.consistent import Consistent, ConsistentEstimate, projec
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
 from torchid.estimators.least_squares import BoundEstimate, Estimate, LeastSquares
 from torchid.estimators.residual import ResidualEffect, WeightChoice
-from torchid.estimators.sgd import PenaltyWeights, Sgd
+from torchid.estimators.sgd import PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.training import Epoch, SgdEstimate, Trainer
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "Sgd",
     "SgdEstimate",
     "Trainer",
+    "TrainingSettings",
     "Violation",
     "WeightChoice",
     "project",

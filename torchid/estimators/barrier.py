@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from torchid.errors import InputError, NumericalWarning
+from torchid.errors import InputError, NumericalWarning, warn
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
@@ -62,7 +61,7 @@ def _follow(problem: ConicProblem, tolerance: float) -> Solution:
         kappa *= _SHRINK
     if not best.gap <= max(_LOOSE, tolerance) * max(best.objective, problem.floor):
         message = f"estimator: the barrier method stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
-        warnings.warn(message, NumericalWarning, stacklevel=5)
+        warn(message, NumericalWarning)
     return best
 
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from torchid import parameters
 from torchid.parameters import PER_BODY, Array
+from torchid.settings import BelowOne, Positive, check_settings
+
+EnclosureKind = Literal["box", "ellipsoid"]
 
 _ROUNDING = 1e-6  # of matrices that users write down with six digits
 
@@ -21,15 +25,14 @@ class Enclosure:
     """
 
     body: int
-    kind: str
+    kind: EnclosureKind
     centre: Array
     axes: Array
     half: Array
 
     def __post_init__(self) -> None:
         """Check kind, place and size."""
-        if self.kind not in ("box", "ellipsoid"):
-            raise ValueError(f"kind: found {self.kind!r}; accepted: box, ellipsoid")
+        check_settings(self)
         if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
             raise ValueError(f"centre: found {_short(self.centre)}; accepted: three finite numbers")
         if np.shape(self.half) != (3,) or not (np.isfinite(self.half).all() and (self.half > 0.0).all()):
@@ -79,8 +82,8 @@ class Conditions:
         names: of the bodies, for messages; numbers if empty.
     """
 
-    margin: float = 1e-4
-    total_mass: float | None = None
+    margin: BelowOne = 1e-4
+    total_mass: Positive | None = None
     enclosures: tuple[Enclosure, ...] = ()
     mirrors: tuple[Mirror, ...] = ()
     lower: Array | None = None
@@ -88,11 +91,8 @@ class Conditions:
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
-        if not (np.isfinite(self.margin) and 0.0 <= self.margin < 1.0):
-            raise ValueError(f"margin: found {self.margin}; accepted: a number from 0 to 1, without 1")
-        if self.total_mass is not None and not (np.isfinite(self.total_mass) and self.total_mass > 0.0):
-            raise ValueError(f"total_mass: found {self.total_mass}; accepted: a positive number")
+        """Check the numbers; `bounds` checks those by body."""
+        check_settings(self)
 
     def called(self, body: int) -> str:
         """What messages call a body."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from torchid.errors import InputError
 from torchid.parameters import Array
+from torchid.rounding import is_significant
 
 SAME = 1e-9
 """Numbers closer than this share of their scale are one."""
@@ -175,7 +176,7 @@ def independent(rows: list[Row], count: int) -> tuple[Array, Array]:
     """
     E, e = np.array([row.row for row in rows]).reshape(len(rows), count), np.array([row.bound for row in rows])
     U, values, right = np.linalg.svd(E, full_matrices=False)
-    kept = values > 1e-10 * values.max(initial=0.0)
+    kept = is_significant(values)
     off = np.abs(e - U[:, kept] @ (U[:, kept].T @ e)) > SAME * (1.0 + np.abs(e).max(initial=0.0))
     if off.any():
         names = ", ".join(dict.fromkeys(row.name for row, wrong in zip(rows, off, strict=True) if wrong))

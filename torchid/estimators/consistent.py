@@ -14,7 +14,7 @@ from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, check_parameters
 from torchid.estimators.conic import ConicProblem, Solution
 from torchid.estimators.formulate import Prior, conic_problem
-from torchid.estimators.least_squares import BoundEstimate, LeastSquares, rounding_reported
+from torchid.estimators.least_squares import BoundEstimate, Regularized, rounding_reported
 from torchid.estimators.vanishing import Vanishing, vanishing_ridge
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
@@ -41,7 +41,7 @@ class ConsistentEstimate(BoundEstimate):
 
 
 @dataclass(frozen=True)
-class Consistent:
+class Consistent(Regularized):
     """min ||A phi - b||^2 / rows + ridge * prior(phi) over all phi that a physical robot can have.
 
     With `ridge` 0 the limit for ridge -> 0, the least prior among all minimizers: what data do not determine stays
@@ -51,35 +51,30 @@ class Consistent:
     them; "certified" meets them to the accuracy of its solver, mostly 1e-9 of the scale, and warns beyond 1e-7.
 
     Attributes:
-        ridge: weight of the prior against the mean square of the whitened residual.
         prior: "euclidean", ||(phi - nominal) / scale||^2; "pullback", sum of ||J_0^-1/2 (J - J_0) J_0^-1/2||^2 over
             the bodies' pseudo-inertias J (Lee, Wensing, Park 2020); "entropic", sum of the log-det divergences
             -log det(J_0^-1 J) + tr(J_0^-1 J) - 4 (Lee, Park 2018). Friction is pulled by the first in any case.
         conditions: on the parameters.
         method: "barrier", the fast path, or "certified", a semidefinite programme.
         certify: solve with the other method as well, and report the difference.
-        rank_tolerance: as in `LeastSquares`, for the statistics.
     """
 
-    ridge: float = 1e-4
     prior: Prior = "euclidean"
     conditions: Conditions = field(default_factory=Conditions)
     method: Method = "barrier"
     certify: bool = False
-    rank_tolerance: float = 1e-10
 
     def __post_init__(self) -> None:
-        """Check names and weights.
+        """Check the settings.
 
         Raises:
-            ValueError: one that cannot be.
+            ValueError: names the first that is not accepted.
             InputError: the certified method without CVXPY and Clarabel.
         """
-        _check_names(self.prior, self.method)
+        super().__post_init__()
         if (self.certify or self.method == "certified") and not (find_spec("cvxpy") and find_spec("clarabel")):
             found = "needs CVXPY and Clarabel, which are not installed"
             raise InputError("estimator", "certified", found, f"{install('certified')}, or barrier alone")
-        LeastSquares(self.ridge, self.rank_tolerance)
 
     @rounding_reported("consistent")
     def solve(self, problem: LinearProblem) -> ConsistentEstimate:
@@ -90,7 +85,7 @@ class Consistent:
         Raises:
             InputError: the conditions exclude each other, or a prior of matter starts from bodies that cannot exist.
         """
-        plain = LeastSquares(self.ridge, self.rank_tolerance).solve(problem)
+        plain = self.least_squares.solve(problem)
         data = conic_problem(problem, self.conditions, self.ridge, self.prior)
         chosen = Vanishing(data)
         if self.ridge == 0.0 and len(data.linear):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchid import parameters
+from torchid.estimators.conditions import Conditions
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
@@ -97,7 +98,7 @@ class LogCholeskyParameters(LearnableParameters):
     root: Tensor
     friction_start: Tensor
 
-    def __init__(self, problem: LinearProblem, margin: float = 1e-4) -> None:
+    def __init__(self, problem: LinearProblem, margin: float = Conditions.margin) -> None:
         """Start at the nominal parameters, or the nearest eigenvalues inside.
 
         Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from torchid.errors import InputError
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
+from torchid.settings import NotNegative, Tolerance, check_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
 UNSEEN, FIXED = "cannot be seen", "fixed"
@@ -129,29 +131,41 @@ def rounding_reported(estimator: str) -> Iterator[None]:
 
 
 _SEEN = 1e-12  # a finger's share in a sum with the trunk's mass is 1e-7, that of no row but rounding
-_HIDDEN = 1e-6  # far above rounding (1e-10 on a humanoid) and below any share found in a robot (1e-4)
 
 
 @dataclass(frozen=True)
-class LeastSquares:
-    """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
-
-    With `ridge` 0 the deviation from the nominal parameters of least scaled norm among all minimizers.
+class Regularized:
+    """The settings that all estimators have.
 
     Attributes:
-        ridge: weight of the pull to the nominal parameters against the mean square of the whitened residual.
+        ridge: weight of the prior, the squared deviation from the nominal parameters, against the mean squared whitened
+            residual.
         rank_tolerance: a singular value of the scaled problem below this share of the largest counts as zero.
     """
 
-    ridge: float = 0.0
-    rank_tolerance: float = 1e-10
+    ridge: NotNegative = 0.0
+    rank_tolerance: Tolerance = field(default=RANK_TOLERANCE, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check the weights."""
-        if not (np.isfinite(self.ridge) and self.ridge >= 0.0):
-            raise ValueError(f"ridge: found {self.ridge}; accepted: a finite number of at least 0")
-        if not 0.0 < self.rank_tolerance < 1.0:
-            raise ValueError(f"rank_tolerance: found {self.rank_tolerance}; accepted: a number between 0 and 1")
+        """Check the settings.
+
+        Raises:
+            ValueError: names the first that is not accepted.
+        """
+        check_settings(self)
+
+    @property
+    def least_squares(self) -> LeastSquares:
+        """Least squares with the same ridge and the same rank."""
+        return LeastSquares(self.ridge, rank_tolerance=self.rank_tolerance)
+
+
+@dataclass(frozen=True)
+class LeastSquares(Regularized):
+    """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
+
+    With `ridge` 0 the deviation from the nominal parameters of least scaled norm among all minimizers.
+    """
 
     @rounding_reported("least_squares")
     @one_thread()  # twice as fast as two on some hundred columns
@@ -180,7 +194,7 @@ class LeastSquares:
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         seen, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
-        seen[free], identifiable[free] = hidden**2 < 1.0 - _SEEN, hidden < _HIDDEN
+        seen[free], identifiable[free] = hidden**2 < 1.0 - _SEEN, hidden < UNOBSERVABLE_SHARE
         standard_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
         standard_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
         standard_error[~identifiable] = np.nan
@@ -204,6 +218,6 @@ class LeastSquares:
 def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:
     """Minimum-norm inverse, singular values and rank, from one call of `torch.linalg.lstsq`."""
     identity = torch.eye(A.shape[0], dtype=torch.float64)
-    rcond = max(tolerance, np.finfo(float).eps * max(A.shape))
+    rcond = relative_tolerance(tolerance, A.shape)
     solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
     return solved.solution.numpy(), solved.singular_values.numpy(), int(solved.rank)

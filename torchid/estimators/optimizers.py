@@ -68,13 +68,18 @@ def schedule_names() -> list[str]:
     return sorted(name for name, _ in _classes(lr_scheduler, LRScheduler))
 
 
-def make_optimizer(name: str, options: Mapping[str, Any], groups: Sequence[Group]) -> Optimizer:
-    """An optimizer of parameter groups; options that are not given are those of `METHODS`.
+def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimizer:
+    """An optimizer of parameter groups.
+
+    Args:
+        chosen: its name, and options; those that are not given are as in `METHODS`.
+        groups: of parameters, as torch takes them.
 
     Raises:
         UnknownNameError: no class of `torch.optim`, or one that is not supported.
         InputError: an option it does not take.
     """
+    name, options = _split(chosen)
     found = dict(_classes(torch.optim, Optimizer)).get(name)
     if found is not None and name not in METHODS:
         accepted = ", ".join(optimizer_names())
@@ -93,17 +98,21 @@ def make_optimizer(name: str, options: Mapping[str, Any], groups: Sequence[Group
         raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(found)) from error
 
 
-def make_schedule(
-    name: str | None, options: Mapping[str, Any], optimizer: Optimizer, epochs: int
-) -> LRScheduler | None:
-    """A schedule that is stepped once per epoch; `T_max` and `total_steps` are `epochs` unless given.
+def make_schedule(chosen: Mapping[str, Any] | None, optimizer: Optimizer, epochs: int) -> LRScheduler | None:
+    """A schedule that is stepped once per epoch.
+
+    Args:
+        chosen: its name, and options, of which `T_max` and `total_steps` are `epochs` unless given; None for none.
+        optimizer: whose learning rate it sets.
+        epochs: of the whole run.
 
     Raises:
         UnknownNameError: `torch.optim.lr_scheduler` has no such class.
         InputError: an option it does not take, or one that only code can give.
     """
-    if name is None:
+    if chosen is None:
         return None
+    name, options = _split(chosen)
     found = dict(_classes(lr_scheduler, LRScheduler)).get(name)
     if found is None:
         raise _unknown("schedule", name, schedule_names())
@@ -122,18 +131,18 @@ def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
         schedule.step()
 
 
-def try_out(
-    optimizer: str, options: Mapping[str, Any], schedule: str | None, schedule_options: Mapping[str, Any], epochs: int
-) -> None:
+def try_out(optimizer: Mapping[str, Any], schedule: Mapping[str, Any] | None, epochs: int) -> None:
     """Take two steps on a parabola and the schedule through all epochs, so that what does not work is known at once.
+
+    Arguments as of `make_optimizer` and `make_schedule`.
 
     Raises:
         UnknownNameError: a name that torch does not have.
         InputError: options, or a kind of optimizer, that do not work here.
     """
     x = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
-    tried = make_optimizer(optimizer, options, [{"params": [x]}])
-    schedule_of = make_schedule(schedule, schedule_options, tried, epochs)
+    tried = make_optimizer(optimizer, [{"params": [x]}])
+    schedule_of = make_schedule(schedule, tried, epochs)
 
     def loss() -> torch.Tensor:
         tried.zero_grad()
@@ -148,13 +157,19 @@ def try_out(
                 tried.step(loss)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
     except _FAILURES as error:
         found = f"cannot take a step: {_short(error)}"
-        raise InputError("estimator", f"optimizer {optimizer}", found, "other options") from error
+        raise InputError("estimator", f"optimizer {optimizer['name']}", found, "other options") from error
     try:
         for _ in range(epochs):
             step_schedule(schedule_of, 1.0)
     except _FAILURES as error:
-        found = f"does not last {epochs} epochs: {_short(error)}"
-        raise InputError("estimator", f"schedule {schedule}", found, "other options, or another schedule") from error
+        found, name = f"does not last {epochs} epochs: {_short(error)}", (schedule or {}).get("name")
+        raise InputError("estimator", f"schedule {name}", found, "other options, or another schedule") from error
+
+
+def _split(chosen: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The name of a class, and its options."""
+    options = dict(chosen)
+    return options.pop("name"), options
 
 
 def _defaults(method: Method, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
-from torchid.estimators.least_squares import BoundEstimate, LeastSquares, rounding_reported
+from torchid.estimators.least_squares import BoundEstimate, rounding_reported
 from torchid.estimators.optimizers import METHODS, make_optimizer, make_schedule, step_schedule
 from torchid.estimators.residual import WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
 from torchid.estimators.sgd import Loss, Sgd, Terms
@@ -99,11 +99,15 @@ class Trainer:
             problem: the compressed training logs: preconditioner, prior, and what to compare with.
             batches: of the training logs.
             held_out: of logs for early stopping.
-            residual: any module r(q, v, a) -> (B, nv) [N, N m], on the device of the batches, whose output adds to
+            residual: any module r(q, v, a) -> (B, n_rows) [N, N m], on the device of the batches, whose output adds to
                 K phi; arguments as in `Batch`.
+
+        Raises:
+            InputError: an optimizer or a schedule that does not work with its options.
         """
+        settings.try_out()
         self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out
-        self._least_squares = LeastSquares(settings.ridge, settings.rank_tolerance)
+        self._least_squares = settings.least_squares
         self.closed_form = self._least_squares.solve(problem)
         device = batches.columns.device
         self.loss = Loss(settings, problem, batches, _learnable(settings, problem).to(device), residual)
@@ -113,8 +117,8 @@ class Trainer:
         groups: list[dict[str, Any]] = [{"params": trained} for trained in self._trained]
         if residual is not None and settings.residual_lr is not None:
             groups[1]["lr"] = settings.residual_lr
-        self.optimizer = make_optimizer(settings.optimizer, settings.optimizer_options, groups)
-        self.schedule = make_schedule(settings.schedule, settings.schedule_options, self.optimizer, settings.epochs)
+        self.optimizer = make_optimizer(settings.optimizer, groups)
+        self.schedule = make_schedule(settings.schedule, self.optimizer, settings.epochs)
         if not any(self._trained[1:]):
             self.loss.residual_weight = settings.residual_weight or 0.0  # there is nothing to hold back
         self.weight_choice: WeightChoice | None = None
@@ -339,12 +343,14 @@ class Trainer:
     def _check(self, loss: float) -> None:
         if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
             rate = float(self.optimizer.param_groups[0]["lr"])
-            found = f"a loss of {loss:.3g} in epoch {self.epoch}, with {self.settings.optimizer} at lr {rate:.3g}"
+            found = (
+                f"a loss of {loss:.3g} in epoch {self.epoch}, with {self.settings.optimizer['name']} at lr {rate:.3g}"
+            )
             raise InputError("estimator", "training", found, _SMALLER)
 
     def _steps(self) -> Iterator[tuple[Callable[[], Iterable[Batch]], int]]:
         """The batches that each step of an epoch is taken on, with the number of their samples."""
-        if METHODS[self.settings.optimizer].whole:
+        if METHODS[self.settings.optimizer["name"]].whole:
             yield self.batches.chunks, self.batches.samples
         else:
             for batch in self.batches.epoch(self.epoch):
@@ -361,7 +367,7 @@ class Trainer:
                 part, share = self.loss(batch), len(batch) / samples
                 (share * part.total()).backward()
                 terms = terms.plus(part, share)
-            if not METHODS[self.settings.optimizer].whole:
+            if not METHODS[self.settings.optimizer["name"]].whole:
                 for group in self.optimizer.param_groups:
                     nn.utils.clip_grad_norm_(group["params"], self.settings.clip)
             found.append(terms)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchid.errors import InputError, NumericalWarning
+from torchid.errors import InputError, NumericalWarning, warn
 from torchid.estimators.barrier import interior, solve_barrier
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic import REACH, ConicProblem, Solution
@@ -193,7 +193,7 @@ class _Path:
         )
         message += f"beyond belief ({self.furthest(steps[-1]):.0f} scales); taken is the least prior at the misfit "
         message += f"expected of the true parameters, as with ridge {below.ridge:.1g}; accepted: a ridge"
-        warnings.warn(message, NumericalWarning, stacklevel=6)
+        warn(message, NumericalWarning)
         return below.vanishing
 
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import warnings
+import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from torchid.errors import ConfoundedWarning, LogError, TorchidWarning
+from torchid.errors import ConfoundedWarning, LogError, warn
 from torchid.estimators import LeastSquares
-from torchid.fitting.experiment import Scene
-from torchid.fitting.fit import Fit, assembled
-from torchid.fitting.robust import loss_of, robust_unknowns
+from torchid.fitting.fit import Fit, LogFitter
+from torchid.fitting.robust import RobustLoss, fit_extras_robustly
 from torchid.identifiability.confounding import ExtraEstimate, disagreements, estimate_extras
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
@@ -22,58 +23,61 @@ from torchid.problem.compression import Part
 from torchid.problem.extras import Extra
 from torchid.problem.predict import calibrated
 from torchid.problem.samples import check_forces
-from torchid.sensing import SensorSet
+from torchid.robot import Robot
 from torchid.text import listed
 
-_NAMED = 6  # sensors or bodies that a warning names
-
-Values = Mapping[tuple[str, str], float]
-"""Unknowns beside the bodies' parameters, by log, "" for those of all, and `Extra.label`."""
+T = TypeVar("T")
 
 
-@dataclass(frozen=True)
+class Comparison(NamedTuple, Generic[T]):
+    """The same thing of nominal and of identified parameters."""
+
+    nominal: T
+    identified: T
+
+
+ExtraValues = Mapping[tuple[str, str], float]
+"""Values of extra parameters, by log ("" for those of all logs) and `Extra.label`."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Parameters of the bodies, and the unknowns beside them that suit these.
+    """Parameters of the bodies with the extra parameters that suit them, known or fitted anew to every new log.
+
+    Readings of other logs of the same robot, as calibrated sensors would have recorded them::
+
+        calibration = torchid.calibrations(fit, robot, builder).identified
+        corrected = calibration.logs(new_logs)  # offsets of each log are fitted, scales of all logs are known
 
     Attributes:
-        scene: robot, contacts and settings.
-        sensors: whose unknowns are meant.
-        phi: (12 L,), that the unknowns of a new log are fitted with.
-        values: what is known.
+        robot: the robot.
+        builder: of the rows of the sensors and actuators whose extra parameters are meant.
+        phi: (12 L,), parameters of the bodies.
+        values: the extra parameters that are known.
+        loss: what residuals cost when those of a new log are fitted; None: their squares.
     """
 
-    scene: Scene
-    sensors: SensorSet
+    robot: Robot
+    builder: RowBuilder
     phi: Array
-    values: Values
+    values: ExtraValues
+    loss: RobustLoss | None = None
     _of_new_logs: dict[str, Array | float] = field(default_factory=dict, init=False)
-
-    @classmethod
-    def both(
-        cls, scene: Scene, sensors: SensorSet, phi: Array, found: Iterable[ExtraEstimate]
-    ) -> tuple[Calibration, Calibration]:
-        """Of nominal and identified parameters, from a fit."""
-        known = {(x.log, x.extra.label): (x.nominal_value, x.value) for x in found}
-        nominal, identified = ({key: pair[n] for key, pair in known.items()} for n in (0, 1))
-        return (
-            cls(scene, sensors, scene.robot.nominal.flatten(), nominal),
-            cls(scene, sensors, phi, identified),
-        )
 
     @property
     def changes_readings(self) -> bool:
         """Whether readings have offsets or scales."""
-        return bool(self.scene.config.sensors.offsets or self.scene.config.sensors.scales)
+        return any(extra.what in ("offset", "scale") for extra in self.builder.extras)
 
     def logs(self, logs: Sequence[Samples]) -> list[Samples]:
-        """The logs with calibrated readings; what is constant over a log is fitted on one that is new.
+        """The logs with calibrated readings; extra parameters of a new log are fitted to it first.
 
         Warns:
             TorchidWarning: a new log lacks sensors, so that its readings are taken as they are.
         """
         if not self.changes_readings:
             return list(logs)
-        extras, tree = self._builder.extras, self._builder.tree
+        extras, tree = self.builder.extras, self._on_cpu.tree
         return [calibrated(log, extras, self._values_for(log), tree) for log in logs]
 
     def parameters(self, evaluation: Evaluation) -> Array:
@@ -81,20 +85,21 @@ class Calibration:
         return np.append(self.phi, self._known(evaluation.builder.extras, ""))
 
     def columns(self, builder: RowBuilder, log: Samples) -> Tensor:
-        """Parameters in the columns of the rows of a log's sensors, (width,)."""
+        """Parameters in a builder's columns for the rows of a log, (width,)."""
         return builder.columns_of(np.append(self.phi, self._values_for(log))[None])[0]
 
     @cached_property
-    def _builder(self) -> RowBuilder:
-        scene = self.scene
-        return RowBuilder(scene.robot, scene.contacts, self.sensors, scene.terms)
+    def _on_cpu(self) -> RowBuilder:
+        """The builder where readings are."""
+        builder = self.builder
+        return builder if builder.device.type == "cpu" else copy.deepcopy(builder).to(torch.device("cpu"))
 
     def _known(self, extras: Sequence[Extra], log: str) -> Array:
-        """Values of some unknowns, those of a log and of all, 0 where none is known."""
+        """Values of extra parameters of a log and of all logs, 0 where none is known."""
         return np.array([self.values.get((log if x.per_log else "", x.label), 0.0) for x in extras])
 
     def _values_for(self, log: Samples) -> Array:
-        extras = self._builder.extras
+        extras = self.builder.extras
         values, own = self._known(extras, log.source), np.array([x.per_log for x in extras])
         if own.any() and not any(source == log.source for source, _ in self.values):
             if log.source not in self._of_new_logs:
@@ -103,18 +108,18 @@ class Calibration:
         return values
 
     def _fitted(self, log: Samples, shared: Array) -> Array | float:
-        """Unknowns of a log, with everything else known."""
-        scene = self.scene
+        """Extra parameters of a log, with everything else known."""
+        builder = self._on_cpu
         try:
-            check_forces(log, scene.robot, scene.contacts, self.sensors)
+            check_forces(log, self.robot, builder.contacts, builder.sensors)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
-            warnings.warn(message, TorchidWarning, stacklevel=2)
+            warn(message)
             return 0.0
-        builder, own = self._builder, np.array([x.per_log for x in self._builder.extras])
+        own = np.array([x.per_log for x in builder.extras])
 
         def solve(parts: list[Part]) -> Array:
-            elimination = assemble(parts, builder, scene.robot).eliminations[0]
+            elimination = assemble(parts, builder, self.robot).eliminations[0]
             return elimination.inverse @ (elimination.z - elimination.C @ np.append(self.phi, shared))
 
         def columns(values: Array) -> Tensor:
@@ -122,34 +127,64 @@ class Calibration:
             extras[own], extras[~own] = values, shared
             return builder.columns_of(np.append(self.phi, extras)[None])[0]
 
-        robust = scene.config.estimator.robust
-        if robust is None:
+        if self.loss is None:
             return solve(compress_parts([log], builder))
-        return robust_unknowns(log, builder, solve, columns, loss_of(robust.loss, robust.tuning), robust.passes)
+        return fit_extras_robustly(log, builder, solve, columns, self.loss)
 
 
-def warn_of_confounded(found: Sequence[ExtraEstimate], source: object) -> None:
-    """Name the sensors whose offset or scale the data cannot tell from other parameters, and these.
+def calibrations(
+    fit: Fit, robot: Robot, builder: RowBuilder, loss: RobustLoss | None = None
+) -> Comparison[Calibration]:
+    """Nominal and identified parameters, each with the extra parameters that the logs of a fit show for them.
+
+    Args:
+        fit: of compressed logs.
+        robot: the robot.
+        builder: of their rows.
+        loss: as in `Calibration`.
+    """
+    nominal = {(x.log, x.extra.label): x.nominal_value for x in fit.extras}
+    identified = {(x.log, x.extra.label): x.value for x in fit.extras}
+    return Comparison(
+        Calibration(robot=robot, builder=builder, phi=robot.nominal.flatten(), values=nominal, loss=loss),
+        Calibration(robot=robot, builder=builder, phi=fit.estimate.phi, values=identified, loss=loss),
+    )
+
+
+_NAMED = 6  # sensors or bodies that a warning names
+
+
+def warn_of_confounded(found: Sequence[ExtraEstimate], source: object = "logs") -> None:
+    """Name sensors whose offset or scale is confounded with other parameters, and these parameters.
+
+    Args:
+        found: extra parameters of a fit.
+        source: named in warnings of what all logs have in common.
 
     Warns:
         ConfoundedWarning: one for each log that has some.
     """
     for log in dict.fromkeys(x.log for x in found):
-        mixed = [x for x in found if x.log == log and not x.told_apart]
+        mixed = [x for x in found if x.log == log and not x.separable]
         if mixed:
             named = _grouped(x.extra.label for x in mixed)
-            others = _grouped(name for x in mixed for name in x.mixed_with if " of " not in name)
-            message = f"{log or source}: {named} cannot be told from {others or 'each other'}; do not trust either"
+            others = _grouped(name for x in mixed for name in x.confounded_with if " of " not in name)
+            message = f"{log or source}: {named} confounded with {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
-            warnings.warn(f"{message}; {advice}", ConfoundedWarning, stacklevel=3)
+            warn(f"{message}; {advice}", ConfoundedWarning)
 
 
-def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: object) -> None:
+def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
     """Name contact sensors whose readings in the air say nothing of their offsets, or contradict the rest of the data.
+
+    Args:
+        fit: of compressed logs.
+        fitter: that it comes from.
 
     Warns:
         TorchidWarning: one for each log that has some of the one or the other.
     """
+    builder, estimator = fitter.builder, fitter.estimator
     on_ground = [part for part in fit.parts if not part.unloaded]
     if len(on_ground) == len(fit.parts):
         return
@@ -159,11 +194,10 @@ def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: ob
             channels = (builder.extras[number] for number in sorted(gated))
             named = _grouped(f"{x.name} {x.component}" for x in channels)
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
-            warnings.warn(f"{message}, which says nothing of their offsets", TorchidWarning, stacklevel=3)
-    settings = scene.config.estimator
-    assembly = assembled(on_ground, builder, scene.robot, settings, source)
-    estimate = LeastSquares(settings.pull, settings.rank_tolerance).solve(assembly.problem)
-    extras = estimate_extras(assembly, estimate, scene.robot.body_names, settings.rank_tolerance)
+            warn(f"{message}, which says nothing of their offsets")
+    assembly = fitter.assemble(on_ground)
+    estimate = LeastSquares(estimator.ridge, rank_tolerance=estimator.rank_tolerance).solve(assembly.problem)
+    extras = estimate_extras(assembly, estimate, fitter.robot.body_names, estimator.rank_tolerance)
     noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
     found = disagreements(fit.parts, builder, extras, noise)
     for log in dict.fromkeys(x.log for x in found):
@@ -175,7 +209,7 @@ def warn_of_disagreement(fit: Fit, scene: Scene, builder: RowBuilder, source: ob
         )
         more = f"; and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
         advice = "look for drift, a gain, cross talk, wrong contact_active, or noise in the base's motion"
-        warnings.warn(f"{log}: {named}{more}; {advice}", TorchidWarning, stacklevel=3)
+        warn(f"{log}: {named}{more}; {advice}")
 
 
 def _grouped(labels: Iterable[str]) -> str:

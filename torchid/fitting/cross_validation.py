@@ -1,29 +1,27 @@
-"""How well parameters predict unseen blocks and whole logs, and the ridge that does so best."""
+"""Cross-validation on blocks of the training logs: how well a fit predicts what it has not seen, and the best ridge."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from torchid.errors import ConfigError, TorchidWarning
-from torchid.fitting.calibration import Calibration
-from torchid.fitting.experiment import Scene
-from torchid.fitting.fit import posed, solved, stand_in, stated_conditions
+from torchid.errors import LogError, TorchidWarning
+from torchid.fitting.calibration import Calibration, Comparison, calibrations
+from torchid.fitting.fit import BatchEstimator, Fit, LogFitter
+from torchid.fitting.robust import RobustLoss
 from torchid.parameters import Array
-from torchid.problem import Evaluation, Metrics, RowBuilder, Samples, compress_parts
-from torchid.problem.chunks import one_thread
-from torchid.problem.compression import Part, states_together
+from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples, compress_parts
+from torchid.problem.chunks import ProgressCallback, one_thread
+from torchid.problem.compression import Part, in_folds, states_together
 from torchid.problem.extras import read_components
 from torchid.problem.metrics import ForceSums
-from torchid.sensing import SensorSet
 
-Progress = Callable[[int], None]
-Pair = tuple[Metrics, Metrics]
-"""Of nominal and identified parameters."""
+RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
+"""Ridges that are tried, in decades: finer steps change predictions by less than their spread over the folds."""
 
 
 @dataclass(frozen=True)
@@ -38,70 +36,202 @@ class CrossValidation:
     identified: Metrics
 
 
-@dataclass
-class Residual:
-    """Sums of squares of whitened rows: of what is left, and of what was measured."""
+@dataclass(frozen=True)
+class RidgeChoice:
+    """A ridge, and the mean square of whitened residuals on held-out folds by ridge tried, with standard errors.
 
-    error: float = 0.0
-    measured: float = 0.0
-    rows: int = 0
+    The errors are those of the difference from the best.
+    """
+
+    ridge: float
+    tried: tuple[float, ...]
+    mean_square: tuple[float, ...]
+    standard_error: tuple[float, ...]
+
+
+def cross_validate(
+    logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms | None = None, loss: RobustLoss | None = None
+) -> CrossValidation:
+    """Errors of predicted forces on blocks of some logs, each block predicted by the fit of all others.
+
+    Blocks are contiguous in time, see `in_folds`: errors of successive samples are alike::
+
+        found = torchid.cross_validate(logs, fitter)
+        found.identified.rms["joint_torque"], found.nominal.rms["joint_torque"]  # [N m]
+
+    Args:
+        logs: bound logs.
+        fitter: of their rows.
+        terms: the extra terms of the fitter's builder.
+        loss: as in `Calibration`.
+
+    Raises:
+        LogError: too few samples to leave some out.
+    """
+    blocks = in_folds(logs, fitter.builder)
+    parts = compress_parts(blocks, fitter.builder)
+    fit = fitter.fit(parts)
+    without_folds = fitter.fit_without_folds(fit.parts)
+
+    def compared(one: Fit) -> Comparison[Calibration]:
+        return calibrations(one, fitter.robot, fitter.builder, loss)
+
+    evaluation = Evaluation(fitter.robot, fitter.builder.contacts, str(fitter.builder.device), terms)
+    scores = Scorer(evaluation, fitter.builder).score_training(
+        blocks, states_together(fit.parts, fitter.builder), compared(fit), [compared(one) for one in without_folds]
+    )
+    if scores.cross_validation is None:
+        raise _too_few(logs)
+    return scores.cross_validation
+
+
+def choose_ridge(
+    parts: Sequence[Part],
+    blocks: Sequence[Samples],
+    fitter: LogFitter,
+    estimators: Sequence[BatchEstimator],
+    loss: RobustLoss | None = None,
+    done: Callable[[int], None] | None = None,
+) -> RidgeChoice:
+    """The largest ridge whose error on held-out folds is within a standard error of the least.
+
+    Source: the one-standard-error rule, Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10; the
+    error is that of the difference between two ridges, fold by fold, which says whether they differ::
+
+        blocks = torchid.in_folds(logs, builder)
+        parts = torchid.compress_parts(blocks, builder)
+        estimators = [torchid.LeastSquares(ridge) for ridge in torchid.RIDGES]
+        torchid.choose_ridge(parts, blocks, fitter, estimators).ridge
+
+    Args:
+        parts: of the blocks, compressed.
+        blocks: training logs, as `in_folds` cuts them.
+        fitter: of their rows.
+        estimators: one for each ridge to try, ascending.
+        loss: as in `Calibration`.
+        done: called with the number of fits done.
+
+    Raises:
+        LogError: too few samples to leave some out.
+    """
+    folds = sorted({part.fold for part in parts})
+    if len(folds) < 2:
+        raise _too_few(blocks)
+    together = states_together(parts, fitter.builder)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
+        squares = np.array(
+            [_held_out_squares(fold, together, blocks, fitter, estimators, loss, done) for fold in folds]
+        )
+    means = squares.mean(axis=0)
+    apart = squares - squares[:, [int(means.argmin())]]
+    error = apart.std(axis=0, ddof=1) / np.sqrt(len(folds))
+    within = np.flatnonzero(apart.mean(axis=0) <= error)
+    ridges = tuple(float(estimator.ridge) for estimator in estimators)
+    return RidgeChoice(
+        ridge=ridges[within[-1]],
+        tried=ridges,
+        mean_square=tuple(means.tolist()),
+        standard_error=tuple(error.tolist()),
+    )
+
+
+def _held_out_squares(
+    fold: int,
+    parts: Sequence[Part],
+    blocks: Sequence[Samples],
+    fitter: LogFitter,
+    estimators: Sequence[BatchEstimator],
+    loss: RobustLoss | None,
+    done: Callable[[int], None] | None,
+) -> Array:
+    """Mean squares on a fold of what each estimator fits without it."""
+    problem = fitter.build_problem([part for part in parts if part.fold != fold])
+    logs, own = [x for x in blocks if x.fold == fold], [x for x in parts if x.fold == fold]
+    out = []
+    for estimator in estimators:
+        fit = fitter.solve_problem(problem, estimator.solve)
+        identified = calibrations(fit, fitter.robot, fitter.builder, loss).identified
+        (left,) = sum_residuals(fitter.builder, logs, own, [identified])
+        out.append(left.error / max(left.rows, 1))
+        if done is not None:
+            done(1)
+    return np.array(out)
+
+
+def _too_few(logs: Sequence[Samples]) -> LogError:
+    found = "the training samples are too few to leave blocks of them out"
+    return LogError(logs[0].source if logs else "logs", "samples", found, "longer logs")
 
 
 @dataclass(frozen=True)
-class Judge:
-    """What errors are worked out with: `evaluation` of forces, `builder` of the rows that a fit sees."""
+class TrainingScore:
+    """Errors of a fit on its training logs, and of cross-validation, None where there is only one fold."""
+
+    metrics: Comparison[Metrics]
+    cross_validation: CrossValidation | None
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """Errors of parameters on logs: `evaluation` predicts forces, `builder` makes the rows of a fit."""
 
     evaluation: Evaluation
     builder: RowBuilder
 
-    def errors(self, logs: Sequence[Samples], both: Sequence[Calibration], progress: Progress | None = None) -> Pair:
-        """Of nominal and identified parameters on logs as recorded, each with the unknowns that suit them.
+    def score_logs(
+        self, logs: Sequence[Samples], compared: Comparison[Calibration], progress: ProgressCallback | None = None
+    ) -> Comparison[Metrics]:
+        """Errors on logs as recorded, each with the extra parameters that suit the bodies' parameters.
 
-        Rows that a fit would see count where a log has all their sensors.
+        Rows of the fit's sensors count where a log has all their readings.
         """
-        parts = [part for log in logs for part in compress_parts([complete(log, self.builder)], self.builder)]
-        return _pair(self._metrics([self._sums(logs, parts, both, progress)]))
+        builder = self.builder
+        parts = [part for log in logs for part in compress_parts([with_all_readings(log, builder)], builder)]
+        return _comparison(self._metrics([self._sums(logs, parts, compared, progress)]))
 
-    def training_errors(
+    def score_training(
         self,
         logs: Sequence[Samples],
         parts: Sequence[Part],
-        both: tuple[Calibration, Calibration],
-        left_out: Sequence[tuple[Calibration, Calibration]],
-        progress: Progress | None = None,
-    ) -> tuple[Pair, CrossValidation | None]:
-        """Of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
+        compared: Comparison[Calibration],
+        without_folds: Sequence[Comparison[Calibration]],
+        progress: ProgressCallback | None = None,
+    ) -> TrainingScore:
+        """Errors of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
 
         Args:
             logs: as `in_folds` has cut them.
             parts: compressed, with the weights of a robust fit.
-            both: nominal and identified parameters.
-            left_out: those of a fit without each fold, by its number; none without cross-validation.
+            compared: parameters of the fit.
+            without_folds: those of a fit without each fold, by its number; none without cross-validation.
             progress: called with the number of samples done.
         """
-        alike = 0 if self.builder.extras else 1  # nominal parameters of all fits, as far as no unknowns come with them
+        alike = 0 if self.builder.extras else 1  # nominal parameters of all fits, unless extra ones belong to them
         sums = []
         for fold in sorted({log.fold for log in logs}):
             of_fold = [log for log in logs if log.fold == fold]
             own = [part for part in parts if part.fold == fold]
-            sums.append(self._sums(of_fold, own, [*both, *(left_out[fold][alike:] if left_out else ())], progress))
+            others = without_folds[fold][alike:] if without_folds else ()
+            sums.append(self._sums(of_fold, own, [*compared, *others], progress))
         metrics = self._metrics(sums)
-        if not left_out:
-            return _pair(metrics), None
-        return _pair(metrics), CrossValidation(len(left_out), metrics[0 if alike else 2], metrics[-1])
+        held_out = None
+        if without_folds:
+            held_out = CrossValidation(len(without_folds), metrics[0 if alike else 2], metrics[-1])
+        return TrainingScore(_comparison(metrics), held_out)
 
     def _sums(
         self,
         logs: Sequence[Samples],
         parts: Sequence[Part],
         calibrations: Sequence[Calibration],
-        progress: Progress | None,
+        progress: ProgressCallback | None,
     ) -> list[tuple[ForceSums, ForceSums]]:
         """Of the measured forces and of the errors, for each calibration."""
         phi = np.stack([one.parameters(self.evaluation) for one in calibrations])
         if not calibrations[0].changes_readings:
             measured, *errors = self.evaluation.sums(logs, phi, progress)
-            pairs = [(_copied(measured), error) for error in errors]
+            pairs = [(ForceSums.total([measured]), error) for error in errors]
         else:
             pairs = []
             for number, one in enumerate(calibrations):
@@ -111,9 +241,10 @@ class Judge:
                     readings = one.logs(logs)
                 measured, error = self.evaluation.sums(readings, phi[number : number + 1], progress if number else None)
                 pairs.append((measured, error))
-        for (measured, error), squares in zip(pairs, residuals(self.builder, logs, parts, calibrations), strict=True):
-            for sums, found in ((measured, squares.measured), (error, squares.error)):
-                sums.whitened.add_squares(found, squares.rows)
+        squares = sum_residuals(self.builder, logs, parts, calibrations)
+        for (measured, error), own in zip(pairs, squares, strict=True):
+            for sums, square in ((measured, own.measured), (error, own.error)):
+                sums.whitened.add_squares(square, own.rows)
         return pairs
 
     def _metrics(self, sums: Sequence[Sequence[tuple[ForceSums, ForceSums]]]) -> list[Metrics]:
@@ -124,32 +255,40 @@ class Judge:
         ]
 
 
+@dataclass
+class ResidualSquares:
+    """Sums of squares of whitened rows: of their residuals, and of what was measured."""
+
+    error: float = 0.0
+    measured: float = 0.0
+    rows: int = 0
+
+
 @one_thread()
-def residuals(
+def sum_residuals(
     builder: RowBuilder, logs: Sequence[Samples], parts: Sequence[Part], calibrations: Sequence[Calibration]
-) -> list[Residual]:
-    """What compressed rows of some logs leave at the parameters of each calibration."""
+) -> list[ResidualSquares]:
+    """Squares of the residuals of compressed rows at the parameters of each calibration.
+
+    Args:
+        builder: of the rows.
+        logs: bound logs.
+        parts: of these, compressed.
+        calibrations: parameters.
+    """
     by_source = {log.source: log for log in reversed(logs)}
-    out = [Residual() for _ in calibrations]
+    out = [ResidualSquares() for _ in calibrations]
     for part in parts:
         R = part.factor.triangle()
-        for one, found in zip(calibrations, out, strict=True):
-            left = R[:, :-1] @ one.columns(builder, by_source[part.source]).cpu() - R[:, -1]
-            found.error += float(left @ left)
-            found.measured += float(R[:, -1] @ R[:, -1])
-            found.rows += part.factor.rows
+        for one, squares in zip(calibrations, out, strict=True):
+            residual = R[:, :-1] @ one.columns(builder, by_source[part.source]).cpu() - R[:, -1]
+            squares.error += float(residual @ residual)
+            squares.measured += float(R[:, -1] @ R[:, -1])
+            squares.rows += part.factor.rows
     return out
 
 
-def _pair(metrics: Sequence[Metrics]) -> Pair:
-    return metrics[0], metrics[1]
-
-
-def _copied(sums: ForceSums) -> ForceSums:
-    return ForceSums.total([sums])
-
-
-def complete(log: Samples, builder: RowBuilder) -> Samples:
+def with_all_readings(log: Samples, builder: RowBuilder) -> Samples:
     """The samples of a log that have every reading of the builder's sensors."""
     sensors, known = builder.sensors, torch.ones(len(log), dtype=torch.bool)
     if sensors.torque.any():
@@ -161,86 +300,5 @@ def complete(log: Samples, builder: RowBuilder) -> Samples:
     return log if bool(known.all()) else log[known]
 
 
-GRID = tuple(float(f"1e{power}") for power in range(-7, 2))
-"""Ridges that are tried, in decades: finer steps change predictions by less than their spread over the folds."""
-
-
-@dataclass(frozen=True)
-class RidgeChoice:
-    """A ridge, and the mean square of whitened residuals on left-out folds by ridge tried, with standard errors.
-
-    The errors are those of the difference from the best.
-    """
-
-    ridge: float
-    tried: tuple[float, ...]
-    mean_square: tuple[float, ...]
-    standard_error: tuple[float, ...]
-
-
-def chosen_ridge(
-    parts: Sequence[Part],
-    blocks: Sequence[Samples],
-    scene: Scene,
-    sensors: SensorSet,
-    builder: RowBuilder,
-    source: object = "experiment",
-    done: Callable[[int], None] | None = None,
-) -> RidgeChoice:
-    """The largest ridge whose error on left-out folds is within a standard error of the least.
-
-    Source: the one-standard-error rule, Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10; the
-    error is that of the difference between two ridges, fold by fold, which says whether they differ.
-
-    Args:
-        parts: of the blocks, compressed.
-        blocks: training logs, as `in_folds` cuts them.
-        scene: robot, contacts and settings.
-        sensors: of the fit.
-        builder: of the rows.
-        source: named in errors.
-        done: called with the number of fits done.
-
-    Raises:
-        ConfigError: too few samples to leave some out.
-    """
-    folds = sorted({part.fold for part in parts})
-    if len(folds) < 2:
-        found = "auto, but the training samples are too few to leave blocks of them out"
-        raise ConfigError(source, "estimator.ridge", found, "a number, or longer logs")
-    together = states_together(parts, builder)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
-        squares = np.array([_left_out(fold, together, blocks, scene, sensors, builder, source, done) for fold in folds])
-    means = squares.mean(axis=0)
-    apart = squares - squares[:, [int(means.argmin())]]
-    error = apart.std(axis=0, ddof=1) / np.sqrt(len(folds))
-    within = np.flatnonzero(apart.mean(axis=0) <= error)
-    return RidgeChoice(float(GRID[within[-1]]), GRID, tuple(means.tolist()), tuple(error.tolist()))
-
-
-def _left_out(
-    fold: int,
-    parts: Sequence[Part],
-    blocks: Sequence[Samples],
-    scene: Scene,
-    sensors: SensorSet,
-    builder: RowBuilder,
-    source: object,
-    done: Callable[[int], None] | None,
-) -> Array:
-    """Mean squares on a fold of what is fitted without it, one for each ridge tried."""
-    settings, robot = scene.config.estimator, scene.robot
-    rest = [part for part in parts if part.fold != fold]
-    rest, assembly = posed(rest, scene, builder, source)
-    conditions = stated_conditions(settings, robot, source)
-    logs, own = [x for x in blocks if x.fold == fold], [x for x in parts if x.fold == fold]
-    out = []
-    for ridge in GRID:
-        fit = solved(rest, assembly, scene, stand_in(replace(settings, ridge=ridge), conditions).solve)
-        _, identified = Calibration.both(scene, sensors, fit.estimate.phi, fit.extras)
-        (left,) = residuals(builder, logs, own, [identified])
-        out.append(left.error / max(left.rows, 1))
-        if done is not None:
-            done(1)
-    return np.array(out)
+def _comparison(metrics: Sequence[Metrics]) -> Comparison[Metrics]:
+    return Comparison(metrics[0], metrics[1])

@@ -1,23 +1,28 @@
-"""Robot, contacts, sensors and conditions of an experiment file, which all commands share."""
+"""An experiment file brought to life: robot, contacts, sensors, and what fits its logs; shared by all commands."""
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
-from torchid import parameters
 from torchid.config import AnalyzeConfig, ExperimentConfig
-from torchid.config.estimator import EstimatorConfig
-from torchid.config.sensors import ChoiceConfig
-from torchid.errors import ConfigError, TorchidWarning, UnknownNameError
-from torchid.estimators import Conditions, Enclosure, Mirror
-from torchid.parameters import PARAMETERS, Array
-from torchid.problem import ExtraTerms
+from torchid.config.sensors import ChoiceConfig, NoiseConfig
+from torchid.errors import ConfigError, LogError, UnknownNameError
+from torchid.estimators import Conditions
+from torchid.fitting.calibration import Calibration, Comparison, calibrations
+from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
+from torchid.fitting.estimator import batch_estimator, conditions_from
+from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
+from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
+from torchid.fitting.robust import RobustLoss
+from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
+from torchid.problem.compression import Part
 from torchid.problem.extras import CHANNELS, measured_channels
-from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
+from torchid.robot import Robot, load_robot
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import (
     Contact,
@@ -29,148 +34,42 @@ from torchid.sensing import (
     with_ft_sensors,
 )
 
-_FRICTION = PARAMETERS[parameters.FRICTION]
-_POSITIVE = ("m", "Ixx", "Iyy", "Izz")
 
-
-def conditions_from(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> Conditions:
-    """Conditions on the parameters (L, 12) of a robot's bodies, as an experiment file says.
-
-    `com_inside` leaves out bodies that are frozen, have no mass, or whose shapes are not known. Two frozen bodies need
-    not be mirror images.
-
-    Args:
-        settings: of the estimator.
-        robot: for its bodies, shapes and symmetry.
-        source: named in errors.
-
-    Raises:
-        ConfigError: a bound that nothing can meet or that has nothing to bound; shapes nowhere; bodies that are not
-            mirrored (see `mirror_pairs`).
-        UnknownNameError: a body or parameter that there is not.
-        UrdfError: a shape that is not described by numbers.
-
-    Warns:
-        TorchidWarning: bodies without known shapes, or whose centre of mass in the URDF is outside theirs.
-    """
-    lower, upper = _bounds(settings, robot, source)
-    return Conditions(
-        margin=settings.margin,
-        total_mass=settings.total_mass,
-        enclosures=_enclosures(settings, robot, source),
-        mirrors=_mirrors(settings, robot, source),
-        lower=lower,
-        upper=upper,
-        names=robot.body_names,
-    )
-
-
-def _enclosures(settings: EstimatorConfig, robot: Robot, source: object) -> tuple[Enclosure, ...]:
-    if settings.com_inside is None:
-        if settings.com_shapes != EstimatorConfig.com_shapes:
-            found = f"{settings.com_shapes}, without com_inside"
-            raise ConfigError(source, "estimator.com_shapes", found, "com_inside: box or ellipsoid as well")
-        return ()
-    bodies = [i for i, body in enumerate(robot.bodies) if not body.massless and body.name not in settings.frozen]
-    extents = body_extents(robot, settings.com_shapes, bodies)
-    if not extents:
-        found = f"{settings.com_inside}, but {robot.path.name} says of no body that is fitted what shape it has"
-        raise ConfigError(source, "estimator.com_inside", found, "null, or a URDF with shapes")
-    out, outside = [], []
-    for body, extent in extents.items():
-        half = extent.half if settings.com_inside == "box" else extent.semi_axes
-        out.append(Enclosure(body, settings.com_inside, extent.centre, extent.axes, half))
-        _, com, _ = parameters.mass_com_inertia(robot.nominal[body])
-        local = np.abs(extent.axes.T @ (com - extent.centre)) / half
-        if (local.max() if settings.com_inside == "box" else np.linalg.norm(local)) > 1.0:
-            outside.append(robot.body_names[body])
-    if outside:
-        message = f"the URDF's own centre of mass is outside the {settings.com_inside} at {', '.join(outside)}"
-        advice = "are the shapes where the matter is? (estimator.com_shapes)"
-        warnings.warn(f"{source}: estimator.com_inside: {message}; {advice}", TorchidWarning, stacklevel=4)
-    return tuple(out)
-
-
-def _mirrors(settings: EstimatorConfig, robot: Robot, source: object) -> tuple[Mirror, ...]:
-    symmetry = settings.symmetry
-    if symmetry is None:
-        return ()
-    pairs = mirror_pairs(
-        robot, symmetry.left, symmetry.right, symmetry.normal, source, "estimator.symmetry", settings.frozen
-    )
-    return tuple(
-        Mirror(pair.body, pair.image, pair.reflection) for pair in pairs if not robot.bodies[pair.body].massless
-    )
-
-
-def _bounds(settings: EstimatorConfig, robot: Robot, source: object) -> tuple[Array | None, Array | None]:
-    """Lower and upper bounds, (L, 12), None if the file has none."""
-    if not settings.bounds:
-        return None, None
-    lower, upper = np.full(robot.nominal.shape, -np.inf), np.full(robot.nominal.shape, np.inf)
-    for name, intervals in settings.bounds.items():
-        if name not in robot.body_names:
-            raise UnknownNameError(source, "estimator.bounds", name, robot.body_names)
-        body = robot.body_names.index(name)
-        for parameter, (low, high) in intervals.items():
-            field = f"estimator.bounds.{name}"
-            if parameter not in PARAMETERS:
-                raise UnknownNameError(source, field, parameter, PARAMETERS)
-            number, field = PARAMETERS.index(parameter), f"{field}.{parameter}"
-            _check_fitted(settings, robot, body, parameter, source, field)
-            _check_interval(parameter, low, high, source, field)
-            lower[body, number] = -np.inf if low is None else low
-            upper[body, number] = np.inf if high is None else high
-    return lower, upper
-
-
-def _check_fitted(
-    settings: EstimatorConfig, robot: Robot, body: int, parameter: str, source: object, field: str
-) -> None:
-    """Refuse a bound on what stays as it is in the URDF."""
-    name, friction = robot.body_names[body], parameter in _FRICTION
-    if name in settings.frozen:
-        raise ConfigError(source, field, "a bound on a body that is frozen", "one of the two")
-    if friction and robot.bodies[body].joint is None:
-        raise ConfigError(source, field, f"a bound on friction, but {name} is the base", "a body that a joint moves")
-    if friction and not settings.friction:
-        raise ConfigError(source, field, "a bound on friction, which is not fitted", "friction: true")
-    if not friction and robot.bodies[body].massless:
-        raise ConfigError(source, field, f"a bound, but {name} has no mass in the URDF", "a body that has")
-
-
-def _check_interval(parameter: str, low: float | None, high: float | None, source: object, field: str) -> None:
-    """Refuse what no number, or no body, is within."""
-    if low is not None and high is not None and low > high:
-        raise ConfigError(source, field, f"{low:g} above {high:g}", "[lower, upper], null for an open side")
-    negative = min(x for x in (low, high, 0.0) if x is not None) < 0.0
-    if parameter in _FRICTION and negative:
-        raise ConfigError(source, field, f"[{low}, {high}]", "bounds of at least 0: friction resists")
-    if parameter in _POSITIVE and high is not None and high <= 0.0:
-        raise ConfigError(source, field, f"at most {high:g}", "an upper bound above 0")
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Robot and contacts of an experiment file, and what is chosen by their names."""
+    """Robot and contacts of an experiment file, and what its settings say of them.
+
+    Attributes:
+        config: the settings.
+        robot: the robot.
+        contacts: the contacts in use.
+        source: the file, named in errors.
+    """
 
     config: ExperimentConfig | AnalyzeConfig
     robot: Robot
     contacts: tuple[Contact, ...]
+    source: object = "experiment"
 
     @property
     def noise(self) -> SensorNoise:
         """Of the sensors, as stated; a guess where it is not."""
-        return SensorNoise(**{name: x for name, x in vars(self.config.sensors.noise).items() if x is not None})
+        return SensorNoise(**_stated(self.config.sensors.noise))
 
     @property
     def terms(self) -> ExtraTerms:
-        """Unknowns beside the bodies' parameters."""
+        """Extra parameters of sensors and actuators."""
         sensors = self.config.sensors
         offsets, scales = ({str(channel): x for channel, x in s.items()} for s in (sensors.offsets, sensors.scales))
         return ExtraTerms(offsets, scales, **vars(self.config.actuators))
 
-    def sensors_of(self, choice: ChoiceConfig, source: object = "experiment") -> SensorSet:
+    @property
+    def loss(self) -> RobustLoss | None:
+        """What residuals of a robust fit cost, None for one that is not."""
+        robust = self.config.estimator.robust
+        return None if robust is None else RobustLoss.named(robust.loss, robust.tuning, robust.passes)
+
+    def sensors_of(self, choice: ChoiceConfig) -> SensorSet:
         """The sensors of a choice.
 
         Raises:
@@ -181,20 +80,119 @@ class Scene:
             sensors = named_sensors(choice.set, robot.n, len(contacts), noise, ft)
         else:
             by_name = choice.joint_torques, choice.contact_wrenches
-            sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, source, ft)
-        return with_ft_sensors(sensors, robot, choice.ft_sensors, source)
+            sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, self.source, ft)
+        return with_ft_sensors(sensors, robot, choice.ft_sensors, self.source)
+
+    def builder(self, sensors: SensorSet) -> RowBuilder:
+        """Of the rows of some sensors, on the device of the settings."""
+        return RowBuilder(self.robot, self.contacts, sensors, self.terms).to(self.config.device)
+
+    def evaluation(self) -> Evaluation:
+        """Of predicted forces."""
+        return Evaluation(self.robot, self.contacts, self.config.device, self.terms)
+
+    def conditions(self) -> Conditions:
+        """On the parameters.
+
+        Raises:
+            InputError: as `conditions_from`.
+
+        Warns:
+            TorchidWarning: as `conditions_from`.
+        """
+        return conditions_from(self.config.estimator, self.robot, self.source)
+
+    def frozen(self) -> np.ndarray:
+        """Parameters of frozen bodies, (12 L,) bool.
+
+        Raises:
+            UnknownNameError: a frozen body that the robot does not have.
+        """
+        return frozen_parameters(self.robot, self.config.estimator.frozen, self.source, "estimator.frozen")
+
+    def fitter(self, builder: RowBuilder, conditions: Conditions) -> LogFitter:
+        """Fits logs as the settings say; with the batch estimator that a descent approaches, instead of that.
+
+        Raises:
+            InputError: a frozen body that the robot does not have, or an estimator that is not installed.
+        """
+        settings = self.config.estimator
+        return LogFitter(
+            robot=self.robot,
+            builder=builder,
+            estimator=batch_estimator(settings, conditions),
+            friction=settings.friction,
+            frozen=self.frozen(),
+        )
+
+    def calibrations(self, fit: Fit, builder: RowBuilder) -> Comparison[Calibration]:
+        """Nominal and identified parameters of a fit, with the extra parameters that suit them."""
+        return calibrations(fit, self.robot, builder, self.loss)
+
+    def estimate_noise(self, logs: Sequence[Samples], sensors: SensorSet | None = None) -> NoiseSummary:
+        """The noise that bound logs show of some sensors, or of all that they have; what is stated is kept."""
+        if sensors is None:
+            sensors = recorded_sensors(self.robot, self.contacts, logs, self.noise)
+        # without conditions: of the estimator, only the ridge and the rank tolerance matter
+        fitter = self.fitter(self.builder(sensors), Conditions(names=self.robot.body_names))
+        return estimate_noise(logs, fitter, _stated(self.config.sensors.noise).keys())
+
+    def choose_ridge(
+        self, parts: Sequence[Part], blocks: Sequence[Samples], fitter: LogFitter, conditions: Conditions
+    ) -> RidgeChoice:
+        """The ridge that predicts held-out folds best, for the estimator of the settings.
+
+        Args:
+            parts: of the blocks, compressed.
+            blocks: training logs, as `in_folds` cuts them.
+            fitter: of their rows.
+            conditions: on the parameters.
+
+        Raises:
+            ConfigError: too few samples to leave some out.
+        """
+        settings = self.config.estimator
+        estimators = [batch_estimator(replace(settings, ridge=ridge), conditions) for ridge in RIDGES]
+        try:
+            return choose_ridge(parts, blocks, fitter, estimators, self.loss)
+        except LogError as error:
+            accepted = "a number, or longer logs"
+            raise ConfigError(self.source, "estimator.ridge", f"auto, but {error.found}", accepted) from error
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Experiment(Scene):
-    """An experiment file brought to life."""
+    """A scene with the sensors of its fit."""
 
     config: ExperimentConfig
     sensors: SensorSet
 
 
+S = TypeVar("S", bound=Scene)
+
+
+def with_noise(scene: S, summary: NoiseSummary) -> S:
+    """The scene with estimated noise stated in its settings, so that whatever reads them weighs alike."""
+    config = scene.config
+    keys = {one.group.partition(".")[0] for one in summary.groups}
+    estimated = {name: x for name, x in vars(summary.noise).items() if name in keys}
+    noise = NoiseConfig(**estimated | _stated(config.sensors.noise))
+    stated = replace(scene, config=replace(config, sensors=replace(config.sensors, noise=noise)))
+    if isinstance(stated, Experiment):
+        return replace(stated, sensors=replace(stated.sensors, noise=summary.noise))
+    return stated
+
+
+def _stated(noise: NoiseConfig) -> dict[str, Any]:
+    return {name: x for name, x in vars(noise).items() if x is not None}
+
+
 def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "experiment") -> Scene:
     """Load the robot and look its contacts up.
+
+    Args:
+        config: the experiment file.
+        source: its path, named in errors.
 
     Raises:
         InputError: whatever in the file does not fit the robot.
@@ -215,7 +213,21 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "exp
     if not robot.nv:
         raise ConfigError(source, "robot", "a bolted base without a joint, which never moves", "a robot that can move")
     contacts = check_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
-    return Scene(config, robot, contacts)
+    return Scene(config=config, robot=robot, contacts=contacts, source=source)
+
+
+def set_up(config: ExperimentConfig, source: object = "experiment") -> Experiment:
+    """As `set_up_scene`, with sensors resolved by name.
+
+    Raises:
+        InputError: whatever in the file does not fit the robot, or extra parameters of sensors that are not among the
+            measured.
+    """
+    scene = set_up_scene(config, source)
+    sensors = scene.sensors_of(config.sensors)
+    experiment = Experiment(config=config, robot=scene.robot, contacts=scene.contacts, source=source, sensors=sensors)
+    _check_terms(experiment)
+    return experiment
 
 
 def _ft_joints(config: ExperimentConfig | AnalyzeConfig) -> list[str]:
@@ -232,28 +244,17 @@ def _ft_field(config: ExperimentConfig | AnalyzeConfig, name: str) -> str:
     return next(named, "analysis.candidates.ft_sensors")
 
 
-def set_up(config: ExperimentConfig, source: object = "experiment") -> Experiment:
-    """As `set_up_scene`, with sensors resolved by name.
-
-    Raises:
-        InputError: whatever in the file does not fit the robot, or unknowns of sensors that are not among the measured.
-    """
-    scene = set_up_scene(config, source)
-    experiment = Experiment(config, scene.robot, scene.contacts, scene.sensors_of(config.sensors, source))
-    _check_terms(experiment, source)
-    return experiment
-
-
-def _check_terms(experiment: Experiment, source: object) -> None:
-    """Refuse unknowns of kinds of channels that nothing measures; all kinds together mean those that are measured."""
+def _check_terms(experiment: Experiment) -> None:
+    """Refuse extra parameters of channels that nothing measures; all kinds of channels mean those that are measured."""
     terms = experiment.terms
     measured = measured_channels(experiment.robot, experiment.contacts, experiment.sensors)
     for field, scopes in (("offsets", terms.offsets), ("scales", terms.scales)):
         for channel in scopes:
             if channel not in measured and len(scopes) < len(CHANNELS):
                 accepted = f"{', '.join(measured)}, or log or all for every kind that is measured"
-                raise ConfigError(source, f"sensors.{field}.{channel}", "no such sensor is measured", accepted)
+                place = f"sensors.{field}.{channel}"
+                raise ConfigError(experiment.source, place, "no such sensor is measured", accepted)
     for name, wanted in vars(experiment.config.actuators).items():
         if wanted and "joint_torque" not in measured:
             accepted = "joint torques among the sensors, or no such key"
-            raise ConfigError(source, f"actuators.{name}", "set, but no joint torque is measured", accepted)
+            raise ConfigError(experiment.source, f"actuators.{name}", "set, but no joint torque is measured", accepted)

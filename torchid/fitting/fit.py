@@ -1,18 +1,17 @@
-"""A fit of compressed logs: the estimator that an experiment file names, the problem it solves, its solution."""
+"""Fits of compressed logs: the linear problem that they pose, its solution, and the extra parameters that suit it."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from torch import Tensor
 
-from torchid.config.estimator import EstimatorConfig
 from torchid.errors import TorchidWarning, UnknownNameError
-from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares
-from torchid.fitting.experiment import Scene, conditions_from
+from torchid.estimators import Estimate, LeastSquares
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
@@ -20,84 +19,36 @@ from torchid.problem.compression import Part, states_together
 from torchid.problem.elimination import Assembly
 from torchid.robot import Robot
 
-
-def assembled(
-    parts: Sequence[Part], builder: RowBuilder, robot: Robot, settings: EstimatorConfig, source: object = "experiment"
-) -> Assembly:
-    """The problem that parts of logs pose together, with what the settings leave free.
-
-    Raises:
-        UnknownNameError: a frozen body that the robot does not have.
-    """
-    assembly = assemble(parts, builder, robot, settings.friction)
-    problem, known = (with_frozen(x, settings, robot, source) for x in (assembly.problem, assembly.if_known))
-    return replace(assembly, problem=problem, if_known=known)
+Solve = Callable[[LinearProblem], Estimate]
+"""An estimator's `solve`."""
 
 
-def with_frozen(
-    problem: LinearProblem, settings: EstimatorConfig, robot: Robot, source: object = "experiment"
-) -> LinearProblem:
-    """The problem with the parameters of frozen bodies left as they are.
+class BatchEstimator(Protocol):
+    """What solves a compressed problem in one go: `LeastSquares`, `Consistent`, or anything of the same shape."""
 
-    Raises:
-        UnknownNameError: a frozen body that the robot does not have.
-    """
-    return replace(problem, free=problem.free & ~frozen_parameters(settings, robot, source))
+    @property
+    def ridge(self) -> float:
+        """Weight of the regularization towards the nominal parameters."""
 
+    @property
+    def rank_tolerance(self) -> float:
+        """Share of the largest singular value below which one counts as zero."""
 
-def frozen_parameters(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> np.ndarray:
-    """Parameters of frozen bodies, (12 L,) bool.
-
-    Raises:
-        UnknownNameError: a frozen body that the robot does not have.
-    """
-    frozen = np.zeros((len(robot.bodies), PER_BODY), dtype=bool)
-    for name in settings.frozen:
-        if name not in robot.body_names:
-            raise UnknownNameError(source, "estimator.frozen", name, robot.body_names)
-        frozen[robot.body_names.index(name)] = True
-    return frozen.flatten()
+    def solve(self, problem: LinearProblem) -> Estimate:
+        """Fit the free parameters."""
 
 
-def stated_conditions(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> Conditions:
-    """What parameters are to meet, as an experiment file says; least squares may break it.
+@dataclass(frozen=True)
+class LogProblem:
+    """Compressed logs, with the weights that they have, and the problem that they pose together."""
 
-    Raises:
-        ConfigError: conditions that do not fit the robot.
-    """
-    if settings.name == "consistent":
-        return conditions_from(settings, robot, source)
-    return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0, names=robot.body_names)
-
-
-def stand_in(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
-    """What solves the same problem in one go: for a descent, what it approaches with the same ridge.
-
-    Penalties that bodies pay for not existing are left out.
-    """
-    if settings.name != "sgd":
-        return batch_estimator(settings, conditions)
-    if settings.consistency == "penalties" or not settings.pull:
-        return LeastSquares(settings.pull, settings.rank_tolerance)
-    return Consistent(settings.pull, conditions=conditions, rank_tolerance=settings.rank_tolerance)
-
-
-def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
-    """What solves a compressed problem in one go, `least_squares` or `consistent`.
-
-    Raises:
-        InputError: the certified method without CVXPY and Clarabel.
-    """
-    if settings.name == "least_squares":
-        return LeastSquares(settings.pull, settings.rank_tolerance)
-    return Consistent(
-        settings.pull, settings.prior, conditions, settings.method, settings.certify, settings.rank_tolerance
-    )
+    parts: list[Part]
+    assembly: Assembly
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Compressed logs, what they pose, and its solution."""
+    """A solved `LogProblem`: parameters of the bodies, and the extra parameters of sensors and actuators."""
 
     parts: list[Part]
     assembly: Assembly
@@ -111,73 +62,103 @@ class Fit:
         return builder.columns_of(np.append(self.estimate.phi, extras)[None])[0]
 
 
-def fits_without_folds(
-    parts: Sequence[Part],
-    scene: Scene,
-    builder: RowBuilder,
-    solve: Callable[[LinearProblem], Estimate],
-    source: object = "experiment",
-) -> list[Fit]:
-    """For every fold, in order, the fit of all others; none where there is only one.
+@dataclass(frozen=True, kw_only=True)
+class LogFitter:
+    """Fits compressed logs of one robot.
+
+    Without a command line, from logs that `bind` has tied to a robot::
+
+        builder = torchid.RowBuilder(robot, contacts, sensors)
+        fitter = torchid.LogFitter(robot=robot, builder=builder, estimator=torchid.LeastSquares(ridge=1e-3))
+        fit = fitter.fit(torchid.compress_parts(logs, builder))
+        fit.estimate.phi  # (12 L,)
+
+    Attributes:
+        robot: with the nominal parameters.
+        builder: of the rows; it knows contacts, sensors with their noise, and extra parameters.
+        estimator: finds the parameters, unless a method is given another `solve`.
+        friction: whether friction is fitted.
+        frozen: (12 L,) bool, parameters that keep their nominal values, from `frozen_parameters`; None for none.
+    """
+
+    robot: Robot
+    builder: RowBuilder
+    estimator: BatchEstimator
+    friction: bool = True
+    frozen: np.ndarray | None = None
+
+    def fit(self, parts: Sequence[Part], solve: Solve | None = None) -> Fit:
+        """Build the problem of compressed logs and solve it.
+
+        Args:
+            parts: from `compress_parts`, of this builder.
+            solve: instead of the estimator's.
+        """
+        return self.solve_problem(self.build_problem(parts), solve)
+
+    def assemble(self, parts: Sequence[Part]) -> Assembly:
+        """The problem of compressed logs as they are, with extra parameters eliminated and frozen ones not free."""
+        assembly = assemble(parts, self.builder, self.robot, self.friction)
+        if self.frozen is None:
+            return assembly
+        problem, known = (replace(x, free=x.free & ~self.frozen) for x in (assembly.problem, assembly.if_known))
+        return replace(assembly, problem=problem, if_known=known)
+
+    def build_problem(self, parts: Sequence[Part]) -> LogProblem:
+        """The problem of compressed logs, readings of contact sensors in the air weighed by their own noise.
+
+        A first least-squares fit shows by how much all other rows miss the stated noise.
+        """
+        assembly = self.assemble(parts)
+        if not any(part.unloaded for part in parts):
+            return LogProblem(list(parts), assembly)
+        first = LeastSquares(self.estimator.ridge, rank_tolerance=self.estimator.rank_tolerance).solve(assembly.problem)
+        weighed = [_with_own_noise(part, first.residual_std) for part in parts]
+        return LogProblem(weighed, self.assemble(weighed))
+
+    def solve_problem(self, problem: LogProblem, solve: Solve | None = None) -> Fit:
+        """Solve what `build_problem` has built; `solve` instead of the estimator's."""
+        assembly = problem.assembly
+        estimate = (solve or self.estimator.solve)(assembly.problem)
+        extras = estimate_extras(assembly, estimate, self.robot.body_names, self.estimator.rank_tolerance)
+        return Fit(problem.parts, assembly, estimate, extras)
+
+    def fit_without_folds(self, parts: Sequence[Part]) -> list[Fit]:
+        """For every fold, in order, the fit of all others; none where there is only one fold.
+
+        Args:
+            parts: of a `Fit`, with the weights that they have in it.
+        """
+        folds = sorted({part.fold for part in parts})
+        if len(folds) < 2:
+            return []
+        blocks = states_together(parts, self.builder)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
+            rests = ([block for block in blocks if block.fold != fold] for fold in folds)
+            return [self.solve_problem(LogProblem(rest, self.assemble(rest))) for rest in rests]
+
+
+def frozen_parameters(
+    robot: Robot, bodies: Collection[str], source: object = "arguments", field: str = "frozen"
+) -> np.ndarray:
+    """Parameters of some bodies, (12 L,) bool, that are to keep their nominal values.
 
     Args:
-        parts: of a fit, with the weights that they have in it.
-        scene: as of `fitted`, with the others.
-        builder: of the rows.
-        solve: an estimator.
-        source: named in errors.
+        robot: the robot.
+        bodies: names of the bodies.
+        source: where they are named, for the error.
+        field: there.
+
+    Raises:
+        UnknownNameError: a body that the robot does not have.
     """
-    folds = sorted({part.fold for part in parts})
-    if len(folds) < 2:
-        return []
-    blocks = states_together(parts, builder)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
-        fits = []
-        for fold in folds:
-            rest = [block for block in blocks if block.fold != fold]
-            assembly = assembled(rest, builder, scene.robot, scene.config.estimator, source)
-            fits.append(solved(rest, assembly, scene, solve))
-        return fits
-
-
-def fitted(
-    parts: list[Part],
-    scene: Scene,
-    builder: RowBuilder,
-    solve: Callable[[LinearProblem], Estimate],
-    source: object = "experiment",
-) -> Fit:
-    """Fit the logs that have been compressed.
-
-    Args:
-        parts: of the logs.
-        scene: robot and settings.
-        builder: of the rows.
-        solve: an estimator.
-        source: named in errors.
-    """
-    return solved(*posed(parts, scene, builder, source), scene, solve)
-
-
-def posed(
-    parts: Sequence[Part], scene: Scene, builder: RowBuilder, source: object = "experiment"
-) -> tuple[list[Part], Assembly]:
-    """The problem that logs pose, and their parts with the weights that they have in it. Arguments as of `fitted`."""
-    settings = scene.config.estimator
-    assembly = assembled(parts, builder, scene.robot, settings, source)
-    if not any(part.unloaded for part in parts):
-        return list(parts), assembly
-    first = LeastSquares(settings.pull, settings.rank_tolerance).solve(assembly.problem)
-    weighed = [_with_own_noise(part, first.residual_std) for part in parts]
-    return weighed, assembled(weighed, builder, scene.robot, settings, source)
-
-
-def solved(parts: list[Part], assembly: Assembly, scene: Scene, solve: Callable[[LinearProblem], Estimate]) -> Fit:
-    """Solve what the logs pose. Arguments as of `fitted`."""
-    estimate = solve(assembly.problem)
-    extras = estimate_extras(assembly, estimate, scene.robot.body_names, scene.config.estimator.rank_tolerance)
-    return Fit(parts, assembly, estimate, extras)
+    frozen = np.zeros((len(robot.bodies), PER_BODY), dtype=bool)
+    for name in bodies:
+        if name not in robot.body_names:
+            raise UnknownNameError(source, field, name, robot.body_names)
+        frozen[robot.body_names.index(name)] = True
+    return frozen.flatten()
 
 
 def _with_own_noise(part: Part, residual_std: float) -> Part:

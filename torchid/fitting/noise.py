@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.config import AnalyzeConfig, ExperimentConfig
-from torchid.config.sensors import NoiseConfig
 from torchid.estimators import LeastSquares
-from torchid.fitting.experiment import Experiment, Scene
-from torchid.fitting.fit import fitted
+from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
-from torchid.problem import LinearProblem, RowBuilder, Samples
+from torchid.problem import LinearProblem, Samples
 from torchid.problem.noise import BASE, Components, SampledRows, VarianceComponents, by_group, of_groups
-from torchid.sensing import SensorNoise, SensorSet
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorNoise, SensorSet
 
 _SETTLED = 0.05  # change of the deviation along any group's directions: weights 10 % off cost 0.2 % of efficiency
 _PASSES = 6
 _DIGITS = 3
 _APART = 2.0  # where a standard deviation is half of what it should be, 95 % intervals hold the truth in 67 %
-
-C = TypeVar("C", bound=ExperimentConfig | AnalyzeConfig)
 
 
 @dataclass(frozen=True)
@@ -58,56 +53,57 @@ class NoiseSummary:
     passes: int
 
 
-def estimated_noise(
-    scene: Scene, sensors: SensorSet, logs: Sequence[Samples], source: object = "experiment"
-) -> NoiseSummary:
-    """The noise of some sensors, by fits of a sample of the logs that are weighed anew until the noise settles.
+def estimate_noise(logs: Sequence[Samples], fitter: LogFitter, stated: Collection[str] = ()) -> NoiseSummary:
+    """The noise of sensors, by fits of a sample of the logs that are weighed anew until the noise settles.
 
     Where some noise is stated and some not, the stated one counts as right but for a common factor: a filter leaves
-    less of it than was recorded. What is estimated is given in the same proportion.
+    less of it than was recorded. What is estimated is given in the same proportion::
+
+        found = torchid.estimate_noise(logs, fitter, stated=["joint_torque"])
+        found.noise  # a SensorNoise, [N m] and [N]
+
+    Source: variance components by iterated minimum norm estimation, see `torchid.problem.noise`.
 
     Args:
-        scene: robot and settings; noise that these state is kept.
-        sensors: whose noise is meant.
         logs: bound training logs.
-        source: named in errors.
+        fitter: of their rows; its sensors have the stated noise, and a guess where none is stated.
+        stated: fields of `SensorNoise` that are stated.
     """
-    stated = {name for name in by_group(scene.noise) if _stated(scene, name)}
-    builder = RowBuilder(scene.robot, scene.contacts, replace(sensors, noise=scene.noise), scene.terms)
-    rows = SampledRows(logs, builder.to(scene.config.device))
+    builder, guess = fitter.builder, fitter.builder.sensors.noise
+    rows = SampledRows(logs, builder)
     if not (rows.groups and rows.chunks):
-        return NoiseSummary(scene.noise, [], {}, 0)
-    tied = [name for name in rows.groups if name in stated]
+        return NoiseSummary(guess, [], {}, 0)
+    tied = [name for name in rows.groups if name.partition(".")[0] in stated]
     variance, columns, passes = np.ones(len(rows.groups)), None, 0
     estimator = VarianceComponents(rows, tied)
     while True:
-        columns, problem = _fitted(rows, variance, columns, scene, source)
+        columns, problem = _fit_rows(rows, variance, columns, fitter)
         passes += 1
         if len(tied) == len(rows.groups):
             break
-        found = estimator.estimate(variance, columns, problem)
-        variance = found.variance
-        if found.change < _SETTLED or passes == _PASSES:
+        components = estimator.estimate(variance, columns, problem)
+        variance = components.variance
+        if components.change < _SETTLED or passes == _PASSES:
             break
-    free = VarianceComponents(rows).estimate(variance, columns, problem) if tied else found
+    free = VarianceComponents(rows).estimate(variance, columns, problem) if tied else components
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
     used = np.where(np.isin(rows.groups, tied), rows.guess, _rounded(rows.guess * np.sqrt(variance / common)))
-    return _summary(scene.noise, rows, tied, used, free, passes)
+    return _summary(guess, rows, tied, used, free, passes)
 
 
-def weighed(
-    experiment: Experiment, logs: Sequence[Samples], source: object = "experiment"
-) -> tuple[Experiment, NoiseSummary]:
-    """The experiment with the noise that its training logs show, and what that is."""
-    found = estimated_noise(experiment, experiment.sensors, logs, source)
-    sensors = replace(experiment.sensors, noise=found.noise)
-    return replace(experiment, config=stating(experiment.config, found), sensors=sensors), found
+def recorded_sensors(
+    robot: Robot, contacts: Sequence[Contact], logs: Sequence[Samples], noise: SensorNoise | None = None
+) -> SensorSet:
+    """All sensors whose every value is in every log.
 
-
-def recorded_sensors(scene: Scene, logs: Sequence[Samples]) -> SensorSet:
-    """All sensors whose every value is in every log."""
-    torque = np.ones(scene.robot.dofs, dtype=bool)
-    wrench = np.ones((len(scene.contacts), 6), dtype=bool)
+    Args:
+        robot: the robot.
+        contacts: the contacts in use.
+        logs: bound logs.
+        noise: of the sensors.
+    """
+    torque = np.ones(robot.dofs, dtype=bool)
+    wrench = np.ones((len(contacts), 6), dtype=bool)
     for log in logs:
         torque &= log.torque is not None and log.torque.isfinite().all(0).numpy()
         if log.wrench is None:
@@ -116,27 +112,15 @@ def recorded_sensors(scene: Scene, logs: Sequence[Samples]) -> SensorSet:
             wrench &= (log.wrench.isfinite() | ~log.active[..., None]).all(0).numpy()
             if log.wrench_in_world:  # components along a frame's axes take whole vectors
                 wrench = np.repeat(wrench.reshape(-1, 2, 3).all(axis=2), 3, axis=1)
-    return SensorSet(torque, wrench, scene.noise)
+    return SensorSet(torque, wrench, noise or SensorNoise())
 
 
-def stating(config: C, found: NoiseSummary) -> C:
-    """Settings that state the noise which was estimated, so that whatever reads them weighs alike."""
-    stated = {name: x for name, x in vars(config.sensors.noise).items() if x is not None}
-    keys = {one.group.partition(".")[0] for one in found.groups}
-    noise = NoiseConfig(**{name: x for name, x in vars(found.noise).items() if name in keys} | stated)
-    return replace(config, sensors=replace(config.sensors, noise=noise))
-
-
-def _stated(scene: Scene, group: str) -> bool:
-    return getattr(scene.config.sensors.noise, group.partition(".")[0]) is not None
-
-
-def _fitted(
-    rows: SampledRows, variance: Array, before: Mapping[str, Tensor] | None, scene: Scene, source: object
+def _fit_rows(
+    rows: SampledRows, variance: Array, before: Mapping[str, Tensor] | None, fitter: LogFitter
 ) -> tuple[Mapping[str, Tensor], LinearProblem]:
     """Parameters by log in the builder's columns, and the problem, by least squares without regularization."""
-    estimator = LeastSquares(rank_tolerance=scene.config.estimator.rank_tolerance)
-    fit = fitted(rows.parts(variance, before), scene, rows.builder, estimator.solve, source)
+    estimator = LeastSquares(rank_tolerance=fitter.estimator.rank_tolerance)
+    fit = fitter.fit(rows.parts(variance, before), estimator.solve)
     columns = {chunk.log: fit.columns(rows.builder, chunk.log) for chunk in rows.chunks}
     return {log: x.to("cpu", torch.float64) for log, x in columns.items()}, fit.assembly.problem
 

@@ -1,4 +1,4 @@
-"""Robust fits: passes over the logs in which rows that fit badly count less."""
+"""Robust fits: iteratively re-weighted least squares, in which rows that fit badly count less."""
 
 from __future__ import annotations
 
@@ -12,26 +12,42 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchid.errors import UnknownNameError
 from torchid.estimators import BoundEstimate
-from torchid.fitting.fit import Fit
+from torchid.fitting.fit import Fit, LogFitter, Solve
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
+from torchid.problem.chunks import ProgressCallback
 from torchid.problem.compression import Part, merged
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
 """Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
 
-_DECADES, _BINS = (-12.0, 12.0), 4800  # of the histogram that the median of |residual| is read from: 1.2 % a bin
-_LEAST_SLOPE = 0.05  # mean of rho'' below which the loss is flat where the rows are: their spread says nothing
-_NORMAL = 0.6745  # median of |x| of standard normal x
-
 
 @dataclass(frozen=True)
 class RobustLoss:
-    """A loss rho(u) of residuals u in units of their scale, by `kind`: "huber" or "tukey" (its biweight)."""
+    """A loss rho(u) of residuals u in units of their scale, and how many passes over the logs it may take.
+
+    Attributes:
+        kind: "huber", or "tukey" for Tukey's biweight.
+        tuning: constant of the loss; `TUNING` has the usual ones.
+        passes: over the logs, at most.
+    """
 
     kind: str
     tuning: float
+    passes: int = 50
+
+    @classmethod
+    def named(cls, kind: str, tuning: float | None = None, passes: int = 50) -> RobustLoss:
+        """A loss by its name, with its usual tuning if none is given.
+
+        Raises:
+            UnknownNameError: a name not in `TUNING`.
+        """
+        if kind not in TUNING:
+            raise UnknownNameError("arguments", "loss", kind, TUNING)
+        return cls(kind, TUNING[kind] if tuning is None else tuning, passes)
 
     def weight(self, u: Tensor) -> Tensor:
         """rho'(u) / u."""
@@ -45,6 +61,113 @@ class RobustLoss:
             return (u.abs() <= self.tuning).to(u)
         x = (u / self.tuning).square()
         return torch.where(x < 1.0, (1.0 - x) * (1.0 - 5.0 * x), 0.0)
+
+
+@dataclass(frozen=True)
+class RobustSummary:
+    """How a robust fit went: `scale` of good residuals in stated noise, `mean_weight` of rows, whether it settled."""
+
+    loss: str
+    tuning: float
+    scale: float
+    mean_weight: float
+    passes: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class RobustFit:
+    """A fit in which outliers count less, and how it went."""
+
+    fit: Fit
+    summary: RobustSummary
+
+
+def fit_robustly(
+    logs: Sequence[Samples],
+    fitter: LogFitter,
+    loss: RobustLoss,
+    *,
+    first: Fit | None = None,
+    solve: Solve | None = None,
+    progress: ProgressCallback | None = None,
+) -> RobustFit:
+    """Iteratively re-weighted least squares, a pass over the logs each time, memory flat in their length.
+
+    Standard errors are those of the loss, not of the last weighted least squares::
+
+        robust = torchid.fit_robustly(logs, fitter, torchid.RobustLoss.named("huber"))
+        robust.fit.estimate.phi, robust.summary.mean_weight
+
+    Args:
+        logs: bound logs.
+        fitter: of their rows.
+        loss: what residuals cost.
+        first: the fit of all rows alike, if there is one already.
+        solve: instead of the fitter's estimator.
+        progress: called with the number of samples done.
+
+    Source:
+        Huber, "Robust Statistics", 1981, sections 7.6 (standard errors) and 7.8 (re-weighting).
+    """
+    builder = fitter.builder
+    fit = fitter.fit(compress_parts(logs, builder, progress=progress), solve) if first is None else first
+    scale, converged, done = fit.estimate.residual_std, False, 0
+    sources = {samples.source for samples in logs}
+    while done < loss.passes and not converged:
+        current = _loss_of_pass(loss, done)
+        by_log = {source: fit.columns(builder, source) for source in sources}
+        reweighting = Reweighting(current, by_log, max(scale, _TINY))
+        before, done = fit, done + 1
+        fit = fitter.fit(compress_parts(logs, builder, progress=progress, weigh=reweighting), solve)
+        converged = current == loss and _settled(fit, before, scale, reweighting.median_scale)
+        scale = reweighting.median_scale
+    summary = RobustSummary(
+        loss=loss.kind,
+        tuning=loss.tuning,
+        scale=scale,
+        mean_weight=reweighting.mean_weight,
+        passes=done,
+        converged=converged,
+    )
+    return RobustFit(_with_errors(fit, reweighting), summary)
+
+
+def fit_extras_robustly(
+    log: Samples,
+    builder: RowBuilder,
+    solve: Callable[[list[Part]], Array],
+    columns: Callable[[Array], Tensor],
+    loss: RobustLoss,
+) -> Array:
+    """Extra parameters of a log, (M,), with outliers weighed down and everything else known, as in `fit_robustly`.
+
+    Args:
+        log: a bound log.
+        builder: of its rows.
+        solve: the extra parameters that suit compressed parts of the log best.
+        columns: all parameters in the builder's columns for given extra parameters, (width,).
+        loss: what residuals cost.
+    """
+    parts = compress_parts([log], builder)
+    values = solve(parts)
+    factor = merged((part.factor for part in parts), builder)
+    misfit = factor.triangle() @ torch.cat([columns(values), torch.tensor([-1.0], dtype=torch.float64)])
+    scale = float(misfit.norm()) / np.sqrt(max(factor.rows, 1))
+    for done in range(loss.passes):
+        current = _loss_of_pass(loss, done)
+        reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
+        before, values = values, solve(compress_parts([log], builder, weigh=reweighting))
+        steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
+        scale = reweighting.median_scale
+        if current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME):
+            break
+    return values
+
+
+_DECADES, _BINS = (-12.0, 12.0), 4800  # of the histogram that the median of |residual| is read from: 1.2 % a bin
+_LEAST_SLOPE = 0.05  # mean of rho'' below which the loss is flat where the rows are: their spread says nothing
+_NORMAL = 0.6745  # median of |x| of standard normal x
 
 
 class Reweighting:
@@ -98,13 +221,13 @@ class Reweighting:
 
         Source: Huber 1981, section 7.6: var = K^2 scale^2 sum(rho'^2) / (rows - unknowns) / mean(rho'')^2 (X^T X)^-1
         with K = 1 + unknowns / rows var(rho'') / mean(rho'')^2; the weighted X^T X is about the mean weight times that
-        without. All rows are taken to be spoilt alike: where one sensor alone is, its own errors come out too small.
+        without. All rows count as equally contaminated: where one sensor alone is, its own errors come out too small.
 
         Args:
-            unknowns: fitted, times the rows that make one independent row.
+            unknowns: number of fitted parameters, times the rows that make one independent row.
 
         Returns:
-            NaN where that cannot be said.
+            NaN where the rows do not determine it.
         """
         rows = self._sums[0]
         weight, square, slope, steep = self._sums[1:] / max(rows, 1.0)
@@ -116,103 +239,21 @@ class Reweighting:
 
 _CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
 _STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
-_EXACT = 1e-11  # of the predicted rows: what is left below is rounding
+_EXACT = 1e-11  # of the predicted rows: less is rounding
 _TINY = float(np.finfo(float).tiny)
 _START = 3  # passes with Huber's loss before Tukey's
-_SAME = 1e-3  # change of the unknowns of one log
-
-
-@dataclass(frozen=True)
-class RobustSummary:
-    """How a robust fit went: `scale` of good residuals in stated noise, `mean_weight` of rows, whether it settled."""
-
-    loss: str
-    tuning: float
-    scale: float
-    mean_weight: float
-    passes: int
-    converged: bool
-
-
-def robust_fit(
-    first: Fit,
-    loss: RobustLoss,
-    passes: int,
-    logs: Sequence[Samples],
-    builder: RowBuilder,
-    solve: Callable[[list[Part]], Fit],
-    progress: Callable[[int], None] | None = None,
-) -> tuple[Fit, RobustSummary]:
-    """Iteratively re-weighted least squares, a pass over the logs each time, memory flat in their length.
-
-    Standard errors are those of the loss, not of the last weighted least squares.
-
-    Args:
-        first: the fit of all rows alike.
-        loss: what residuals cost.
-        passes: at most.
-        logs: bound logs.
-        builder: of their rows.
-        solve: fits compressed logs.
-        progress: called with the number of samples done.
-    """
-    fit, scale, converged, done = first, first.estimate.residual_std, False, 0
-    sources = {samples.source for samples in logs}
-    while done < passes and not converged:
-        current = _loss_of_pass(loss, done)
-        by_log = {source: fit.columns(builder, source) for source in sources}
-        reweighting = Reweighting(current, by_log, max(scale, _TINY))
-        before, done = fit, done + 1
-        fit = solve(compress_parts(logs, builder, progress=progress, weigh=reweighting))
-        converged = current == loss and _settled(fit, before, scale, reweighting.median_scale)
-        scale = reweighting.median_scale
-    found = RobustSummary(loss.kind, loss.tuning, scale, reweighting.mean_weight, done, converged)
-    return _with_errors(fit, reweighting), found
-
-
-def robust_unknowns(
-    log: Samples,
-    builder: RowBuilder,
-    solve: Callable[[list[Part]], Array],
-    columns: Callable[[Array], Tensor],
-    loss: RobustLoss,
-    passes: int,
-) -> Array:
-    """Unknowns of a log, (M,), with outliers weighed down and everything else known, as in `robust_fit`.
-
-    Args:
-        log: a bound log.
-        builder: of its rows.
-        solve: the unknowns that suit compressed parts of the log best.
-        columns: all parameters in the builder's columns for given unknowns, (width,).
-        loss: what residuals cost.
-        passes: at most.
-    """
-    parts = compress_parts([log], builder)
-    values = solve(parts)
-    factor = merged((part.factor for part in parts), builder)
-    left = factor.triangle() @ torch.cat([columns(values), torch.tensor([-1.0], dtype=torch.float64)])
-    scale = float(left.norm()) / np.sqrt(max(factor.rows, 1))
-    for done in range(passes):
-        current = _loss_of_pass(loss, done)
-        reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
-        before, values = values, solve(compress_parts([log], builder, weigh=reweighting))
-        steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
-        scale = reweighting.median_scale
-        if current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME):
-            break
-    return values
+_SAME = 1e-3  # change of the extra parameters of one log
 
 
 def _loss_of_pass(loss: RobustLoss, done: int) -> RobustLoss:
-    """Huber's, which is convex, at first."""
-    return loss if loss.kind == "huber" or done >= _START else RobustLoss("huber", TUNING["huber"])
+    """Huber's loss, which is convex, for the first passes."""
+    return loss if loss.kind == "huber" or done >= _START else replace(loss, kind="huber", tuning=TUNING["huber"])
 
 
 def _settled(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:
-    """Whether a pass has moved predicted rows, unknowns beside the parameters and the scale far less than their errors.
+    """Whether a pass has moved predicted rows, extra parameters and the scale far less than their errors.
 
-    So it has where nothing but rounding is left to be fitted.
+    So it has where nothing but rounding remains to be fitted.
     """
     problem, estimate = fit.assembly.problem, fit.estimate
     moved = problem.distance(estimate.phi, before.estimate.phi)
@@ -228,7 +269,7 @@ def _settled(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:
 
 
 def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
-    """The fit with standard errors of the loss: rows count as independent ones of the same errors."""
+    """The fit with standard errors of the loss, as if its rows were independent ones with these errors."""
     estimate, problem = fit.estimate, fit.assembly.problem
     factor = reweighting.deviation(problem.oversampling * estimate.rank) / max(estimate.residual_std, _TINY)
     if not (np.isfinite(factor) and factor > 0.0):
@@ -242,8 +283,3 @@ def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
     assembly = replace(fit.assembly, problem=replace(problem, residual=problem.residual + added))
     extras = [replace(x, standard_error=factor * x.standard_error) for x in fit.extras]
     return replace(fit, assembly=assembly, estimate=estimate, extras=extras)
-
-
-def loss_of(kind: str, tuning: float | None) -> RobustLoss:
-    """The loss of a name, with its usual tuning if none is given."""
-    return RobustLoss(kind, TUNING[kind] if tuning is None else tuning)

@@ -15,6 +15,7 @@ from torchid.identifiability.rank import RankGap, rank_and_gap, unit_columns
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.rounding import RANK_TOLERANCE
 
 _ROUNDING = 1e-9  # of a coefficient, columns having norm 1; joint angles written as 1.5707963 leave 1e-11
 _LEAST_PREFERENCE = 1e-2  # between 1e-1 and 1e-4 sums are shortest, and conditioning is the same
@@ -99,7 +100,7 @@ class BaseParameters(nn.Module):
 
 @one_thread()
 def base_parameters(
-    problem: LinearProblem, tolerance: float = 1e-10, preference: Array | None = None
+    problem: LinearProblem, tolerance: float = RANK_TOLERANCE, preference: Array | None = None
 ) -> BaseParameters:
     """Base parameters of a problem.
 

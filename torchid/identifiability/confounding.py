@@ -15,6 +15,7 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.compression import Part, merged
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, numerical_rank
 
 APART = 10.0
 """An unknown whose standard error grows more than this by not knowing all others cannot be told from them.
@@ -22,9 +23,6 @@ APART = 10.0
 It is a variance inflation of 100, ten times what is commonly taken for serious collinearity; source: Belsley, Kuh,
 Welsch, "Regression Diagnostics", 1980.
 """
-
-ROUNDING = 1e-6
-"""Share of a direction below which what no row sees of it is rounding."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +44,7 @@ class Known:
         """Of the rows of a problem; `rank_tolerance` as in `LeastSquares`."""
         scale = problem.scale[problem.free]
         _, values, Vt = np.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=True)
-        least = max(rank_tolerance, np.finfo(float).eps * max(problem.A.shape)) * values.max(initial=0.0)
-        rank = int((values > least).sum())
+        rank = numerical_rank(values, rank_tolerance, problem.A.shape)
         values = np.pad(values, (0, len(Vt) - len(values)))
         values[rank:] = 0.0
         return cls(Vt[:rank].T / values[:rank], Vt[rank:].T, values, scale, problem.free)
@@ -57,7 +54,7 @@ class Known:
 
         None is taken to be off by more than its scale: else the worst known would be named, however little it weighs.
         """
-        noise = max(noise, ROUNDING**2)  # of exact data, where the least known is to blame
+        noise = max(noise, UNOBSERVABLE_SHARE**2)  # of exact data, where the least known is to blame
         rank = self.root.shape[1]
         directions = np.hstack([self.root * self.values[:rank], self.hidden])
         along = directions.T @ sensitivity / (1.0 + (self.values / noise) ** 2)
@@ -73,21 +70,21 @@ class Known:
 class TotalMass:
     """The total mass and how well it is known [kg]: `standard_error`, infinite where the data do not determine it.
 
-    `told_apart`: whether they tell it from offsets and scales of sensors, as of `ExtraEstimate`. `nominal`: the URDF's.
+    `separable`: whether they tell it from offsets and scales of sensors, as of `ExtraEstimate`. `nominal`: the URDF's.
     """
 
     standard_error: float
-    told_apart: bool
+    separable: bool
     value: float
     nominal: float
 
     @property
     def determined(self) -> bool:
         """Whether the data say anything of it: a 95 % interval no wider than the URDF's mass on either side."""
-        return self.told_apart and 2.0 * self.standard_error <= self.nominal
+        return self.separable and 2.0 * self.standard_error <= self.nominal
 
 
-def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1e-10) -> TotalMass:
+def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = RANK_TOLERANCE) -> TotalMass:
     """Of the estimated parameters."""
     weights = np.zeros((len(estimate.phi) // parameters.PER_BODY, parameters.PER_BODY))
     weights[:, parameters.MASS] = 1.0
@@ -101,7 +98,7 @@ def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1
 
 @one_thread()
 def standard_error_of(
-    problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = 1e-10
+    problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = RANK_TOLERANCE
 ) -> float:
     """Standard error of a combination `weights @ phi`, (12 L,), without the pull to nominal parameters.
 
@@ -109,7 +106,7 @@ def standard_error_of(
     """
     known = Known.of(problem, rank_tolerance)
     along = known.reached(weights[None])
-    if np.linalg.norm(along @ known.hidden) > ROUNDING * np.linalg.norm(along):
+    if np.linalg.norm(along @ known.hidden) > UNOBSERVABLE_SHARE * np.linalg.norm(along):
         return float("inf")
     return float(np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ known.root))
 
@@ -130,7 +127,7 @@ class ExtraEstimate:
         nominal_value: the one that would fit best if the bodies' parameters were the nominal ones.
         standard_error: without the pull to nominal parameters, infinite where the data do not determine it.
         inflation: of the standard error by not knowing all other unknowns and parameters, at least 1.
-        mixed_with: what it cannot be told from, most first; empty if it can.
+        confounded_with: what it cannot be told from, most first; empty if it can.
     """
 
     extra: Extra
@@ -139,17 +136,17 @@ class ExtraEstimate:
     nominal_value: float
     standard_error: float
     inflation: float
-    mixed_with: tuple[str, ...]
+    confounded_with: tuple[str, ...]
 
     @property
-    def told_apart(self) -> bool:
+    def separable(self) -> bool:
         """Whether the data tell it from everything else."""
         return self.inflation <= APART
 
 
 @one_thread()
 def estimate_extras(
-    assembly: Assembly, estimate: Estimate, body_names: Sequence[str], rank_tolerance: float = 1e-10
+    assembly: Assembly, estimate: Estimate, body_names: Sequence[str], rank_tolerance: float = RANK_TOLERANCE
 ) -> list[ExtraEstimate]:
     """All unknowns that were eliminated, at the estimated parameters; those that no row has are left out.
 
@@ -190,10 +187,10 @@ def _found(
     G = known.reached(sensitivity)
     unseen = G @ known.hidden
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
-    lost = np.linalg.norm(unseen, axis=1) > ROUNDING * size
+    lost = np.linalg.norm(unseen, axis=1) > UNOBSERVABLE_SHARE * size
     through_parameters = ((G @ known.root) ** 2).sum(1)
     variance = sum((x**2).sum(1) for x in own) + through_parameters
-    undetermined = lost | ~found.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > ROUNDING)
+    undetermined = lost | ~found.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > UNOBSERVABLE_SHARE)
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
     for k, extra in enumerate(found.extras):
@@ -278,7 +275,7 @@ def _labels(found: Elimination) -> list[str]:
 def _largest(along: Array, names: Sequence[str]) -> tuple[str, ...]:
     """Names of the largest components of a direction, none that is small beside them."""
     order = np.argsort(-np.abs(along))[:_NAMED]
-    least = max(0.2 * np.abs(along).max(initial=0.0), ROUNDING)
+    least = max(0.2 * np.abs(along).max(initial=0.0), UNOBSERVABLE_SHARE)
     return tuple(names[k] for k in order if np.abs(along[k]) > least)
 
 

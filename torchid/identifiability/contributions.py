@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,10 +19,11 @@ from torchid.identifiability.information import (
 )
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread
+from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import state_name
 from torchid.problem.elimination import without
+from torchid.rounding import RANK_TOLERANCE, numerical_rank
 
 
 @dataclass(frozen=True)
@@ -134,8 +135,7 @@ def _without_each(factors: Sequence[Array]) -> Iterator[Array]:
 
 def _rank(values: Array, tolerance: float) -> int:
     """As `LeastSquares` counts it."""
-    least = max(tolerance, np.finfo(float).eps * len(values)) * values.max(initial=0.0)
-    return int((values > least).sum())
+    return numerical_rank(values, tolerance, values.shape)
 
 
 @dataclass(frozen=True)
@@ -162,8 +162,8 @@ def contributions(
     builder: RowBuilder,
     problem: LinearProblem,
     dof_names: Sequence[str],
-    rank_tolerance: float = 1e-10,
-    done: Callable[[int], None] | None = None,
+    rank_tolerance: float = RANK_TOLERANCE,
+    done: ProgressCallback | None = None,
 ) -> Contributions:
     """Leave every log, contact state and sensor out in turn.
 
@@ -195,7 +195,7 @@ def _sensor_information(
     builder: RowBuilder,
     directions: Array,
     unknowns: Unknowns,
-    done: Callable[[int], None] | None,
+    done: ProgressCallback | None,
 ) -> SensorInformation:
     """As `sensor_information` has it, in scaled columns, without what is unknown in each log."""
 

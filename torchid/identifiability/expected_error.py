@@ -17,12 +17,17 @@ from torchid.problem.chunks import one_thread, spread_by_state
 from torchid.problem.contact_state import State
 from torchid.problem.metrics import GROUPS, ForceSums, figure, projected
 from torchid.problem.predict import predicted_forces
+from torchid.rounding import RANK_TOLERANCE, is_significant
 from torchid.sensing import SensorNoise
 
 
 @one_thread()
 def error_directions(
-    problem: LinearProblem, ridge: float, noise_variance: float, prior_error: float, rank_tolerance: float = 1e-10
+    problem: LinearProblem,
+    ridge: float,
+    noise_variance: float,
+    prior_error: float,
+    rank_tolerance: float = RANK_TOLERANCE,
 ) -> Array:
     """Independent errors of least squares with a ridge, (M, P): their outer products sum up to the error's covariance.
 
@@ -40,7 +45,7 @@ def error_directions(
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, lapack_driver="gesvd")  # see `base_parameters`
     values = np.pad(values, (0, len(scale) - len(values)))
-    values[values <= rank_tolerance * values.max(initial=0.0)] = 0.0
+    values[~is_significant(values, rank_tolerance)] = 0.0
     pull = ridge * problem.rows
     with np.errstate(invalid="ignore", divide="ignore"):
         through = np.where(values > 0.0, values / (values**2 + pull), 0.0)
@@ -86,8 +91,8 @@ def expected_errors(
         noise: of the sensors that recorded these logs, with its floors of the base rows.
     """
     columns = torch.from_numpy(triangle(directions @ builder.columns.from_parameters().T)).to(builder.device)
-    base, nv = builder.tree.base_rows, builder.tree.base_rows + len(builder.columns.joint_rows)
-    model, sensors = ForceSums(nv), ForceSums(nv)
+    base, n_rows = builder.tree.base_rows, builder.tree.n_rows
+    model, sensors = ForceSums(n_rows), ForceSums(n_rows)
     for samples, state, weight in spread_by_state(logs, _SAMPLES):
         samples = samples.to(builder.device)
         terms = builder.terms(samples)
@@ -111,8 +116,8 @@ def _together(errors: Tensor) -> Tensor:
 
 
 def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:
-    """One standard deviation of each base row's floor and each torque sensor, as generalized forces (nv, B, nv)."""
-    n, base = len(builder.columns.joint_rows), builder.tree.base_rows
+    """Forces (n_rows, B, n_rows) of one standard deviation of each base row's floor and each torque sensor."""
+    n, base = builder.tree.dofs, builder.tree.base_rows
     std = np.append(noise.base[:base], noise.dofs(builder.tree.n, n))
     rows = torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
     axes = builder.noise_axes(samples.rotation_world_base) if noise.by_axis else None
@@ -124,7 +129,7 @@ def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Ten
 
 
 def _wrench_noise(builder: RowBuilder, samples: Samples, state: State, noise: SensorNoise) -> Tensor:
-    """Generalized forces that one standard deviation of each contact sensor makes, (6 C, B, nv)."""
+    """Generalized forces that one standard deviation of each contact sensor makes, (6 C, B, n_rows)."""
     std = samples.time.new_zeros(len(builder.contacts), 6)
     for contact, active in enumerate(state):
         if active:

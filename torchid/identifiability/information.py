@@ -12,13 +12,11 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import by_state, one_thread, spread_by_state
+from torchid.problem.chunks import ProgressCallback, by_state, one_thread, spread_by_state
 from torchid.problem.compression import unloaded_channels
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
-
-DEPENDENT = 1e-9
-"""What moves the whitened rows by less than this share of its size is rounding."""
+from torchid.rounding import KINEMATIC_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -64,16 +62,16 @@ def information_without(H: Array, unknown: Sequence[int], size: Array) -> Array:
     Args:
         H: (N, N).
         unknown: places of M columns.
-        size: (M,), squared norms of these; what is below the share `DEPENDENT` of them is rounding.
+        size: (M,), squared norms of these; what is below the share `KINEMATIC_TOLERANCE` of them is rounding.
     """
     if not unknown:
         return H
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
     crossed = np.delete(H[list(unknown)], unknown, axis=1) * scale[:, None]
     values, V = np.linalg.eigh(H[np.ix_(unknown, unknown)] * scale * scale[:, None])
-    along = V[:, values > DEPENDENT].T @ crossed
+    along = V[:, values > KINEMATIC_TOLERANCE].T @ crossed
     rest = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
-    return np.asarray(rest - along.T @ (along / values[values > DEPENDENT, None]))
+    return np.asarray(rest - along.T @ (along / values[values > KINEMATIC_TOLERANCE, None]))
 
 
 def information_in(rows: Tensor, weight: float) -> Tensor:
@@ -83,18 +81,18 @@ def information_in(rows: Tensor, weight: float) -> Tensor:
 
 
 def unit_readings(ways: Tensor, W: Tensor) -> Tensor:
-    """Rows `ways W`, (B, c, nv), of norm 1, or zero where they are rounding.
+    """Rows `ways W`, (B, c, n_rows), of norm 1, or zero where they are rounding.
 
     A sensor that enters the generalized force of a sample by `way^T` times its reading tells what the whitened rows
     `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
 
     Args:
-        ways: (B, c, nv) or (c, nv).
-        W: (B, nv, nv), from `RowBuilder.rows_by_sample`.
+        ways: (B, c, n_rows) or (c, n_rows).
+        W: (B, n_rows, n_rows), from `RowBuilder.rows_by_sample`.
     """
     readings = ways @ W
     size = torch.linalg.vector_norm(readings, dim=-1, keepdim=True)
-    least = DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
+    least = KINEMATIC_TOLERANCE * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
     return torch.where(size > least, readings / size, 0.0)
 
 
@@ -149,7 +147,7 @@ def sum_of(found: Sequence[SensorInformation]) -> SensorInformation:
 @one_thread()
 @torch.no_grad()
 def sensor_information(
-    logs: Sequence[Samples], builder: RowBuilder, most: int = SAMPLES, done: Callable[[int], None] | None = None
+    logs: Sequence[Samples], builder: RowBuilder, most: int = SAMPLES, done: ProgressCallback | None = None
 ) -> SensorInformation:
     """Information of some logs in the builder's columns, and what of it hangs on each sensor.
 
@@ -168,7 +166,7 @@ def sensor_information(
     components = measured_components(builder.contacts, builder.sensors)
     contacts = np.flatnonzero(components.any(axis=1)).tolist()
     count, first = builder.width, 1 + len(joints) + len(limbs)
-    units = torch.eye(base + len(builder.columns.joint_rows), dtype=torch.float64, device=builder.device)
+    units = torch.eye(builder.tree.n_rows, dtype=torch.float64, device=builder.device)
     torques = units[[base + joint for joint in joints]]
     total = torch.zeros(first + len(contacts), count, count, dtype=torch.float64, device=builder.device)
     for samples, state, stands_for in _spread(logs, most):
@@ -220,7 +218,7 @@ def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State
 
 
 def _span(C: Tensor, W: Tensor) -> Tensor:
-    """Orthonormal rows, (B, c, nv), that span those of `C W`, zeros for dependent ones."""
+    """Orthonormal rows, (B, c, n_rows), that span those of `C W`, zeros for dependent ones."""
     _, values, Vh = torch.linalg.svd(C @ W, full_matrices=False)
-    least = DEPENDENT * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
+    least = KINEMATIC_TOLERANCE * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
     return Vh * (values > least[:, None])[..., None]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,11 +13,12 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning
+from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, warn
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import by_state, one_thread, spread_by_state
 from torchid.problem.contact_state import State, state_name
+from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank
 from torchid.sensing.projection import base_rank, base_singular_values
 
 _CLEAR_GAP = 1e3  # a rank is told by a step of many decades (14 on exact motions), not by a slope
@@ -31,7 +31,7 @@ class RankGap(NamedTuple):
     gap: float
 
 
-def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
+def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
     """Rank of a matrix with columns of one size.
 
     What lies below rounding is not known: the gap takes it for `eps` times the largest value, and is 4.5e15 at most.
@@ -43,19 +43,19 @@ def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
     Warns:
         NumericalWarning: a gap below 1e3, so that another tolerance finds another rank.
     """
-    rank = int((values > tolerance * values[:1]).sum())
+    rank = numerical_rank(values, tolerance)
     if rank == 0:
         return RankGap(0, np.inf)
     dropped = max(float(values[rank]) if rank < len(values) else 0.0, np.finfo(float).eps * float(values[0]))
     gap = float(values[rank - 1]) / dropped
     if gap < _CLEAR_GAP:
         message = f"rank {rank}: the next singular value is only {gap:.3g} times smaller than the last that counts"
-        warnings.warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning, 2)
+        warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning)
     return RankGap(rank, gap)
 
 
 @one_thread()
-def structural_rank(problem: LinearProblem, tolerance: float = 1e-10) -> RankGap:
+def structural_rank(problem: LinearProblem, tolerance: float = RANK_TOLERANCE) -> RankGap:
     """Rank of a problem's free columns, scaled to norm 1.
 
     Args:
@@ -77,7 +77,7 @@ def unit_columns(problem: LinearProblem, tolerance: float) -> tuple[Array, Array
     scale = problem.scale[problem.free]
     columns = problem.A[:, problem.free] * scale
     norms = np.linalg.norm(columns, axis=0)
-    seen = norms > tolerance * norms.max(initial=0.0)
+    seen = is_significant(norms, tolerance)
     norms[~seen] = 1.0
     return np.where(seen, columns, 0.0) / norms, scale / norms
 
@@ -123,7 +123,7 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
     )
     for samples, state, weight in spread_by_state(logs, _CHECKED):
         for _, V in builder.bases(samples.to(builder.device), state):
-            rows[state] = max(rows[state], V.shape[2] + len(builder.plan(state).lone_joints))
+            rows[state] = max(rows[state], V.shape[2] + len(builder.layout(state).uncoupled_joints))
             if builder.tree.base_rows:
                 values[state].append(base_singular_values(V).cpu())
                 weights[state].append(torch.full((len(V),), weight))
@@ -167,7 +167,7 @@ def check_base(reports: Sequence[StateReport], on_base_lost: str = "error") -> N
     message = f"sensors: the base is lost, rank(S_b V_x) < 6, in contact with {where}"
     if on_base_lost == "error":
         raise BaseLostError(f"{message}; accepted: more sensors, other contacts, or sensors.on_base_lost: warn")
-    warnings.warn(f"{message}; parameters of some bodies are out of reach there", BaseLostWarning, stacklevel=2)
+    warn(f"{message}; parameters of some bodies are out of reach there", BaseLostWarning)
 
 
 def _described(report: StateReport) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchid.errors import LogError, TorchidWarning
+from torchid.errors import LogError, warn
 from torchid.log_checks.channels import channel_names, groups, median_step
 from torchid.log_checks.contacts import limb_sensors, standing, touching, without_offsets
 from torchid.log_checks.findings import CONDEMNED, SEVERITIES, Finding, Skipped
@@ -259,7 +258,7 @@ def without_condemned(samples: Samples, checked: Checked, cutoff_hz: float | Non
     if gone.all():
         raise LogError(source, "preprocessing.exclude_condemned", f"no sample left: {reasons}", "a longer log")
     message = f"{Path(source).name}: {gone.sum()} of {len(samples)} samples excluded: {reasons}"
-    warnings.warn(message, TorchidWarning, stacklevel=3)
+    warn(message)
     return samples[torch.from_numpy(np.flatnonzero(~gone))]
 
 

@@ -109,9 +109,9 @@ def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples])
 
 @torch.no_grad()
 def rows_of(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Whitened rows (N, nv, columns + 1), the bases W (N, nv, nv) that they stand in, and which rows are equations."""
-    nv = builder.tree.base_rows + len(builder.columns.joint_rows)
-    rows, W = np.zeros((len(samples), nv, builder.width + 1)), np.zeros((len(samples), nv, nv))
+    """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are equations."""
+    n_rows = builder.tree.n_rows
+    rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
     with one_thread():
         for state, index in by_state(samples):
             where = index if isinstance(index, slice) else index.numpy()
@@ -121,7 +121,7 @@ def rows_of(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArr
 
 
 def gathered(K: FloatArray, terms: FloatArray, equations: BoolArray) -> Terms:
-    """Products by blocks of samples (N, nv, P) and (N, nv, k)."""
+    """Products by blocks of samples (N, n_rows, P) and (N, n_rows, k)."""
     inside, across, own = [], [], []
     for part in np.array_split(np.arange(len(K)), BLOCKS):
         A, Y = K[part].reshape(-1, K.shape[2]), terms[part].reshape(-1, terms.shape[2])
@@ -280,9 +280,9 @@ def gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact])
 
 
 def _about(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> FloatArray:
-    """What wrenches about a point one unit off along each axis would add, (N, nv, 3)."""
-    nv = builder.tree.base_rows + len(builder.columns.joint_rows)
-    out = np.zeros((len(samples), nv, 3))
+    """What wrenches about a point one unit off along each axis would add, (N, n_rows, 3)."""
+    n_rows = builder.tree.n_rows
+    out = np.zeros((len(samples), n_rows, 3))
     if not _whole(measured):
         return out
     with torch.no_grad():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid.errors import FieldError, LogError, about_file
 from torchid.logs.containers import Container, Kind, kind_to_read, open_container, translated
 from torchid.logs.log import NAMES, SHAPES, FloatArray, Log, as_names, as_real, check_shape, check_time, shape_of
 from torchid.logs.read import check_fields_given, checked_log
@@ -34,13 +34,14 @@ def size_of(path: Path, limit: float) -> int:
         LogError: the file cannot be read.
     """
     kind = kind_to_read(path)
-    if kind is Kind.TABLE:
-        most = _SMALL * path.stat().st_size
-        return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
     if kind is Kind.BAG:
         return 0
-    with open_container(path, whole=False) as container:
-        return sum(container.sizes().values())
+    with about_file(path):
+        if kind is Kind.TABLE:
+            most = _SMALL * path.stat().st_size
+            return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
+        with open_container(path, whole=False) as container:
+            return sum(container.sizes().values())
 
 
 def counted_from(start: int, error: LogError) -> LogError:
@@ -82,20 +83,26 @@ class Blocks:
         Raises:
             LogError: a value that is none; the message counts samples from the beginning.
         """
+        with about_file(self.source):
+            raw = self._raw(samples, only)
+            try:
+                log = checked_log(raw)
+            except LogError as error:
+                raise counted_from(samples.start, error) from error
+        if log.base_quat_xyzw is not None:
+            self._continue_signs(log.base_quat_xyzw, samples)
+        return log
+
+    def _raw(self, samples: slice, only: tuple[str, ...] | None) -> dict[str, Any]:
+        """Fields of some samples as they are in the file."""
         raw: dict[str, Any] = dict(self.names) | {"time": self.time[samples]}
         if only is not None:
             raw["joint_position"] = np.zeros((len(raw["time"]), len(self.names["joint_names"])))
         for name, array in self.fields.items():
             if only is None or name in only:
-                with translated(self.source, name, _ACCEPTED):
+                with translated(name, _ACCEPTED):
                     raw[name] = np.asarray(array[samples])
-        try:
-            log = checked_log(self.source, raw)
-        except LogError as error:
-            raise counted_from(samples.start, error) from error
-        if log.base_quat_xyzw is not None:
-            self._continue_signs(log.base_quat_xyzw, samples)
-        return log
+        return raw
 
     def _continue_signs(self, quat: FloatArray, samples: slice) -> None:
         """Give quaternions (M, 4) of some samples the sign that goes with those before."""
@@ -116,22 +123,24 @@ def open_blocks(path: Path, folder: Path) -> Iterator[Blocks]:
         LogError: the file is not what it should be.
         SpillError: there is no room in the folder.
     """
-    source = str(path)
-    if kind_to_read(path) is Kind.TABLE:
-        yield _checked(source, *_of_table(path, folder))
-        return
-    with open_container(path, whole=False) as container:
-        yield _checked(source, *_of_container(source, container, folder))
+    with ExitStack() as stack:
+        with about_file(path):
+            if kind_to_read(path) is Kind.TABLE:
+                found = _of_table(path, folder)
+            else:
+                found = _of_container(stack.enter_context(open_container(path, whole=False)), folder)
+            blocks = _checked(str(path), *found)
+        yield blocks
 
 
-def _of_container(source: str, container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Sliced]]:
+def _of_container(container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Sliced]]:
     """Text and arrays of a container."""
     given = list(container.sizes())
-    check_fields_given(source, given)
+    check_fields_given(given)
     names: dict[str, NDArray[Any]] = {}
     fields: dict[str, Sliced] = {}
     for name in given:
-        with translated(source, name, _ACCEPTED):
+        with translated(name, _ACCEPTED):
             if _is_text(name):
                 names[name] = container.load(name)
             else:
@@ -145,16 +154,16 @@ def _of_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[s
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
     for number, block in enumerate(table_blocks(path)):
         if not number:
-            check_fields_given(str(path), block)
+            check_fields_given(block)
             continue
         for name, array in block.items():
             if not _is_text(name):
                 spills[name].append(array)
             elif names.setdefault(name, array).tolist() != array.tolist():
                 found = f"'{names[name]}' and '{array}'"
-                raise LogError(path, f"column '{name}'", found, "one name, the same in every row")
+                raise FieldError(f"column '{name}'", found, "one name, the same in every row")
     if not spills:
-        raise LogError(path, "time", "no samples", "at least one sample")
+        raise FieldError("time", "no samples", "at least one sample")
     return names, {name: spill.array() for name, spill in spills.items()}
 
 
@@ -165,15 +174,15 @@ def _is_text(name: str) -> bool:
 def _checked(source: str, names: dict[str, NDArray[Any]], fields: dict[str, Sliced]) -> Blocks:
     """The blocks, after checks of all that can be said before values are read."""
     time = fields.pop("time")
-    check_shape(source, "time", _empty(time), SHAPES["time"], {})
-    with translated(source, "time", _ACCEPTED):
-        stamps = as_real(source, "time", np.asarray(time[:]))
-    check_time(source, stamps)
+    check_shape("time", _empty(time), SHAPES["time"], {})
+    with translated("time", _ACCEPTED):
+        stamps = as_real("time", np.asarray(time[:]))
+    check_time(stamps)
     sizes = {"N": len(stamps)}
     for name, letter in NAMES.items():
-        sizes[letter] = len(as_names(source, name, names[name])) if name in names else 0
+        sizes[letter] = len(as_names(name, names[name])) if name in names else 0
     for name, array in fields.items():
-        check_shape(source, name, _empty(array), shape_of(name), sizes)
+        check_shape(name, _empty(array), shape_of(name), sizes)
     return Blocks(source, names, stamps, fields)
 
 

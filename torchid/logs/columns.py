@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid.errors import FieldError, current_file
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
 from torchid.logs.log import NAMES, SHAPES, VARIANTS, UnknownFieldError, is_quaternion, shape_of
@@ -67,7 +67,7 @@ class Layout:
         return out
 
 
-def layout_of(source: str, texts: Sequence[str]) -> Layout:
+def layout_of(texts: Sequence[str]) -> Layout:
     """Sort the columns of a table into fields.
 
     Joints, contacts and sensors are named by the columns of the first of their fields; the others have the same.
@@ -76,16 +76,16 @@ def layout_of(source: str, texts: Sequence[str]) -> Layout:
         LogError: a column that is unknown, given twice, missing or too many.
     """
     if len(texts) > MAX_COLUMNS:
-        raise LogError(source, "file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
+        raise FieldError("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
     given: dict[str, dict[str, Column]] = {}
     for text in texts:
         if len(text) > MAX_LETTERS or not is_plain(text):
             found = f"a name of {len(text)} characters: {shown(text)}"
-            raise LogError(source, "header", found, f"names of one line and at most {MAX_LETTERS} characters")
-        column = parse_column(source, text)
+            raise FieldError("header", found, f"names of one line and at most {MAX_LETTERS} characters")
+        column = parse_column(text)
         of_field = given.setdefault(column.field, {})
         if text in of_field:
-            raise LogError(source, f"column '{text}'", "given twice", "every column once")
+            raise FieldError(f"column '{text}'", "given twice", "every column once")
         of_field[text] = column
     names: dict[str, tuple[str, ...]] = {}
     for field in FIELDS:
@@ -94,22 +94,22 @@ def layout_of(source: str, texts: Sequence[str]) -> Layout:
             names[of] = tuple(dict.fromkeys(column.name for column in given[field].values()))
     columns = {field: columns_of(field, names) for field in given}
     for field, expected in columns.items():
-        _check_complete(source, field, expected, given[field])
+        _check_complete(field, expected, given[field])
     return Layout({"joint_names": (), **names}, columns)
 
 
-def _check_complete(source: str, field: str, expected: Sequence[str], given: Mapping[str, Column]) -> None:
+def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, Column]) -> None:
     missing = [text for text in expected if text not in given]
     if missing:
         accepted = f"every column of {spelled(field)}; a cell may be empty where nothing was measured"
-        raise LogError(source, f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
+        raise FieldError(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
     stray = list(given.keys() - set(expected))
     if stray:
         found = f"a {_KIND[_names_of(field)]} that the first field of its kind does not name"
-        raise LogError(source, f"column '{stray[0]}'", found, "the same names in all fields")
+        raise FieldError(f"column '{stray[0]}'", found, "the same names in all fields")
 
 
-def parse_column(source: str, text: str) -> Column:
+def parse_column(text: str) -> Column:
     """What the name of a column says: the field up to its first dot, a component after its last.
 
     Raises:
@@ -117,9 +117,9 @@ def parse_column(source: str, text: str) -> Column:
     """
     field, _, rest = text.partition(".")
     if _UNIT.search(text):
-        raise LogError(source, f"column '{text}'", "a unit in its name", "names without units, values in SI units")
+        raise FieldError(f"column '{text}'", "a unit in its name", "names without units, values in SI units")
     if field not in FIELDS:
-        raise UnknownFieldError(source, f"column '{text}'", field, FIELDS)
+        raise UnknownFieldError(current_file(), f"column '{text}'", field, FIELDS)
     components, of = components_of(field), _names_of(field)
     if of and components:
         name, _, component = rest.rpartition(".")
@@ -127,7 +127,7 @@ def parse_column(source: str, text: str) -> Column:
         name, component = (rest, "") if of else ("", rest)
     column = Column(field, name, component)
     if str(column) != text or bool(name) != bool(of) or (component not in components if components else component):
-        raise LogError(source, f"column '{text}'", "no such part of this field", spelled(field))
+        raise FieldError(f"column '{text}'", "no such part of this field", spelled(field))
     return column
 
 

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, TorchidError, during
+from torchid.errors import FieldError, LogError, TorchidError, during
 from torchid.guards import MAX_ARRAYS, check_fields, check_growth, check_names
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.spill import Sliced, Spill
@@ -129,7 +129,7 @@ class Container(Protocol):
 
 
 @contextlib.contextmanager
-def translated(source: str, field: str, accepted: str) -> Iterator[None]:
+def translated(field: str, accepted: str) -> Iterator[None]:
     """Turn whatever the readers raise on a damaged file, of which no list is ever complete, into one LogError."""
     try:
         yield
@@ -137,7 +137,7 @@ def translated(source: str, field: str, accepted: str) -> Iterator[None]:
         raise
     except Exception as error:
         text = shown(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
-        raise LogError(source, field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
+        raise FieldError(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
 
 
 def _suffix(path: Path) -> str:
@@ -161,7 +161,7 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
         raise LogError(path, "file", found, f"an existing log ({', '.join(SUFFIXES)})")
     kind = "a complete .npz (zip) archive" if suffix == ".npz" else "a complete HDF5 file"
     with contextlib.ExitStack() as stack:
-        with translated(str(path), "file", kind):
+        with translated("file", kind):
             container: Container
             if suffix == ".npz":
                 container = Npz(stack.enter_context(open_archive(path)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import InputError, LogError, TorchidWarning
+from torchid.errors import InputError, LogError, about_file, warn
 from torchid.logs.log import NAN_ALLOWED, WRENCHES, BoolArray, FloatArray, Log, check_finite, labels_of, place
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, sign_continuous
-from torchid.logs.timeline import JITTER, Timeline, plan
+from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline
 
 #: Channels that are filtered together: as many as make the copies of a long log small against it.
 GROUP = 4
@@ -79,7 +78,7 @@ def check_coverage(log: Log, name: str, coverage: Coverage) -> None:
     ]
     if broken:
         message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
 
 
 def coverage_of(log: Log, name: str) -> Coverage:
@@ -103,7 +102,7 @@ def carry_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage |
         coverage: of the field in the whole log; None where nothing is filtered or resampled.
     """
     values: FloatArray = getattr(log, name)
-    check_finite(log.source, name, values, allow_nan=True, labels=labels_of(name, log.names))
+    check_finite(name, values, allow_nan=True, labels=labels_of(name, log.names))
     if coverage is None:
         return values[timeline.kept]
     flags = log.contact_active if name in WRENCHES else None
@@ -241,7 +240,8 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     Warns:
         TorchidWarning: a torque or wrench channel is NaN in some samples, or time stamps nearly coincide.
     """
-    timeline = timeline_of(log.source, log.time, differentiates(log), cutoff_hz, sample_rate_hz)
+    with about_file(log.source):
+        timeline = timeline_of(log.time, differentiates(log), cutoff_hz, sample_rate_hz)
     if timeline is None:
         return log
     coverage = {name: coverage_of(log, name) for name in gapless_fields(log, timeline)}
@@ -251,12 +251,12 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
 
 
 def timeline_of(
-    source: str, time: FloatArray, differentiates: bool, cutoff_hz: float | None, sample_rate_hz: float | None
+    time: FloatArray, differentiates: bool, cutoff_hz: float | None, sample_rate_hz: float | None
 ) -> Timeline | None:
-    """How samples move in `preprocess`; None where nothing has to be done. Raises and warns as `plan`."""
+    """How samples move in `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
     if cutoff_hz is None and sample_rate_hz is None and not differentiates:
         return None
-    return plan(source, time, cutoff_hz, sample_rate_hz, differentiates)
+    return lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates)
 
 
 def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
@@ -274,6 +274,12 @@ def on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) 
         timeline: stamps of it and of the result.
         coverage: by field, of those that have to be gapless.
     """
+    with about_file(log.source):
+        return dataclasses.replace(log, **_fields_on_timeline(log, timeline, coverage))
+
+
+def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:
+    """All that differs in the preprocessed log."""
     fields: dict[str, Any] = {
         "time": log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.at,
     }
@@ -293,7 +299,7 @@ def on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) 
         fields["contact_unloaded"] = timeline.held(readings)
     if timeline.bandwidth_hz is not None:
         fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
-    return dataclasses.replace(log, **fields)
+    return fields
 
 
 def differentiates(log: Log) -> bool:
@@ -314,7 +320,7 @@ def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, Fl
         values = getattr(log, name)
         if values is None:
             continue
-        check_finite(log.source, name, values, labels=labels_of(name, log.names))
+        check_finite(name, values, labels=labels_of(name, log.names))
         missing = [name]
         while i + len(missing) < len(chain) and getattr(log, chain[i + len(missing)]) is None:
             missing.append(chain[i + len(missing)])
@@ -325,7 +331,7 @@ def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, Fl
 
 def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, FloatArray]:
     """The orientation at the output's stamps, and the angular rates that the log does not give."""
-    check_finite(log.source, "base_quat_xyzw", quat)
+    check_finite("base_quat_xyzw", quat)
     smoothed = timeline.smooth(quat)
     if log.base_angular_velocity_base is not None:
         orders = [0]

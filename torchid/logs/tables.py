@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, install
+from torchid.errors import FieldError, LogError, install
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_growth, check_names
 from torchid.logs.columns import TEXT, Layout, columns_of, layout_of
 from torchid.logs.containers import appearing_whole, translated
@@ -48,7 +48,7 @@ def read_table(path: Path) -> dict[str, NDArray[Any]]:
         (layout, _), *found = _batches(pa, path)
         batches = [batch for _, batch in found]
         del found
-        return _fields(pa, path, layout, batches)
+        return _fields(pa, layout, batches)
 
 
 def table_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
@@ -56,14 +56,14 @@ def table_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
     pa = _pyarrow(path)
     with _complete(path):
         for layout, batch in _batches(pa, path, whole=False):
-            yield _fields(pa, path, layout, [] if batch is None else [batch])
+            yield _fields(pa, layout, [] if batch is None else [batch])
 
 
 def _complete(path: Path) -> AbstractContextManager[None]:
-    return translated(str(path), "file", f"a complete {path.suffix.lower()} file")
+    return translated("file", f"a complete {path.suffix.lower()} file")
 
 
-def _fields(pa: Any, path: Path, layout: Layout, batches: list[Any]) -> dict[str, NDArray[Any]]:
+def _fields(pa: Any, layout: Layout, batches: list[Any]) -> dict[str, NDArray[Any]]:
     """The fields of some rows; forgets the batches."""
     table = pa.Table.from_batches(batches) if batches else None
     samples = 0 if table is None else table.num_rows
@@ -73,7 +73,7 @@ def _fields(pa: Any, path: Path, layout: Layout, batches: list[Any]) -> dict[str
 
     def take(column: str) -> NDArray[Any]:
         # popped, which frees the memory of what has been taken
-        return _values(pa, path, column, columns.pop(column)) if columns else np.zeros(0)
+        return _values(pa, column, columns.pop(column)) if columns else np.zeros(0)
 
     return layout.fields(samples, take)
 
@@ -85,7 +85,7 @@ def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         LogError: a name that no column can carry, or the file cannot be written.
     """
     pa = _pyarrow(path)
-    columns = _columns(path, arrays)
+    columns = _columns(arrays)
     with appearing_whole(path) as temporary:
         if path.suffix.lower() == ".parquet":
             import pyarrow.parquet
@@ -115,7 +115,7 @@ def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[Layout, Any]]:
     import pyarrow.csv
 
     texts, empty = _header(path)
-    layout = layout_of(str(path), texts)
+    layout = layout_of(texts)
     yield layout, None
     if empty:
         return
@@ -167,7 +167,7 @@ def _read_parquet(pa: Any, path: Path, whole: bool) -> Iterator[tuple[Layout, An
 
     with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
         texts = file.schema_arrow.names
-        layout = layout_of(str(path), texts)
+        layout = layout_of(texts)
     # as a dictionary, else one long text could fill the memory by being repeated
     with pyarrow.parquet.ParquetFile(path, read_dictionary=[TEXT] if TEXT in texts else None, **_PARQUET) as file:
         for field in file.schema_arrow:
@@ -222,7 +222,7 @@ def _is_text(column: str) -> bool:
     return column == TEXT or column.startswith("contact_active.")
 
 
-def _values(pa: Any, path: Path, column: str, values: Any) -> NDArray[Any]:
+def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
     """A column's values (N,), NaN where a cell is empty; of text the one word that all rows hold."""
     if not pa.types.is_dictionary(values.type):
         if pa.types.is_boolean(values.type) and values.null_count:
@@ -233,23 +233,23 @@ def _values(pa: Any, path: Path, column: str, values: Any) -> NDArray[Any]:
     if column == TEXT:
         if len(words) != 1 or words[0] is None:
             found = " and ".join("an empty cell" if word is None else f"'{shown(word)}'" for word in words[:2])
-            raise LogError(path, f"column '{column}'", found, "one name, the same in every row")
+            raise FieldError(f"column '{column}'", found, "one name, the same in every row")
         check_names([1], len(words[0]))
         return np.array(words[0].strip())
-    numbers = {word: np.nan if word is None else _number(path, column, word) for word in words}
+    numbers = {word: np.nan if word is None else _number(column, word) for word in words}
     coded = pa.array([numbers[word] for word in words])
     codes = pa.compute.index_in(values.cast(pa.string()), pa.array(words, pa.string()))
     return np.asarray(coded.take(codes.combine_chunks()).to_numpy(zero_copy_only=False))
 
 
-def _number(path: Path, column: str, word: str) -> float:
+def _number(column: str, word: str) -> float:
     try:
         return float(_FLAGS.get(word.strip().lower(), word))
     except ValueError as error:
-        raise LogError(path, f"column '{column}'", f"'{shown(word)}'", "true and false, or 1 and 0") from error
+        raise FieldError(f"column '{column}'", f"'{shown(word)}'", "true and false, or 1 and 0") from error
 
 
-def _columns(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """The columns of a log, by name."""
     names = {name: tuple(map(str, arrays[name])) for name in NAMES if name in arrays}
     columns: dict[str, NDArray[Any]] = {}
@@ -262,12 +262,12 @@ def _columns(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArra
         flat = array.reshape(len(array), -1)
         for j, text in enumerate(columns_of(field, names)):
             if text != text.strip():
-                raise LogError(path, f"column '{text}'", "a space at its end", "names without")
+                raise FieldError(f"column '{text}'", "a space at its end", "names without")
             columns[text] = flat[:, j]
-    layout = layout_of(str(path), list(columns))
+    layout = layout_of(list(columns))
     for name, given in names.items():
         if given and layout.names.get(name) != given:
-            raise LogError(path, name, "names without any values", "a .npz or .h5 file, or a field of them")
+            raise FieldError(name, "names without any values", "a .npz or .h5 file, or a field of them")
     return columns
 
 

@@ -23,9 +23,10 @@ class Batch:
     """Projected and whitened rows of B samples: `K @ (columns @ phi)` is to equal `f`.
 
     Attributes:
-        K: (B, nv, P'), `W^T K`, in the columns of the `MiniBatches` it came from; rows of zeros where there are fewer.
-        f: (B, nv), `W^T f`, in standard deviations of the sensor noise.
-        W: (B, nv, nv), takes any further generalized force (B, nv) [N, N m] to the rows: `W^T r`.
+        K: (B, n_rows, P'), `W^T K`, in the columns of the `MiniBatches` it came from; rows of zeros where a sample has
+            fewer.
+        f: (B, n_rows), `W^T f`, in standard deviations of the sensor noise.
+        W: (B, n_rows, n_rows), takes any further generalized force (B, n_rows) [N, N m] to the rows: `W^T r`.
         q, v, a: generalized coordinates as in `Samples.coordinates`.
     """
 
@@ -125,7 +126,7 @@ class MiniBatches:
 
     @torch.no_grad()
     def generalized_forces(self, phi: Array) -> Iterator[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
-        """Coordinates (q, v, a) of samples, log by log, with K phi, (B, nv) [N, N m], of parameters (12 L,)."""
+        """Coordinates (q, v, a) of samples, log by log, with K phi, (B, n_rows) [N, N m], of parameters (12 L,)."""
         columns = self.builder.columns_of(phi[None])[0]
         for log in self._logs:
             for start in range(0, len(log), _CHUNK):

@@ -76,7 +76,9 @@ def share_out(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], wo
 CHUNK = 2048
 """Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
 
-Progress = Callable[[int], None]
+ProgressCallback = Callable[[int], None]
+"""Called with the number of samples, or of other steps, done since the last call."""
+
 Result = TypeVar("Result")
 
 
@@ -115,13 +117,13 @@ def over_chunks(
     fold: Callable[[Iterator[tuple[Samples, State]]], Result],
     chunk: int = CHUNK,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> list[Result]:
     """What `fold` makes of the chunks of some logs, one result per worker.
 
     Args:
         logs: bound logs; each is moved to the builder's device chunk by chunk.
-        builder: whose plans and device are used.
+        builder: whose layouts and device are used.
         fold: given an iterator over some of the chunks and their contact states.
         chunk: samples per chunk.
         threads: workers, each with one intra-op thread (small arrays do not profit from more); by default one per
@@ -130,7 +132,7 @@ def over_chunks(
     """
     tasks = [(samples, state, index) for samples in logs for state, index in by_state(samples, chunk)]
     for _, state, _ in tasks:
-        builder.plan(state)
+        builder.layout(state)
     lock = threading.Lock()
 
     def run(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Result:

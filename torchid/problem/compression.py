@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.problem.chunks import CHUNK, Progress, by_state, one_thread, over_chunks, worker_count
+from torchid.problem.chunks import CHUNK, ProgressCallback, by_state, one_thread, over_chunks, worker_count
 from torchid.problem.contact_state import State
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder, Workspace
@@ -120,7 +120,7 @@ def compress(
     builder: RowBuilder,
     chunk: int = CHUNK,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> TriangularFactor:
     """Stream all samples of some logs into one triangular factor.
 
@@ -134,7 +134,7 @@ def compress_by_state(
     builder: RowBuilder,
     chunk: int = CHUNK,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
 ) -> dict[State, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
     found = over_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
@@ -146,7 +146,7 @@ def compress_parts(
     builder: RowBuilder,
     chunk: int = CHUNK,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: ProgressCallback | None = None,
     weigh: Weighing | None = None,
 ) -> list[Part]:
     """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.

@@ -14,9 +14,7 @@ from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
 from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
-
-_DEPENDENT = 1e-10  # a singular value of the unknowns' unit columns below this share of the largest is rounding
-_HIDDEN = 1e-6  # as in `LeastSquares`
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Elimination:
     @property
     def determined(self) -> np.ndarray:
         """Unknowns that the rows give if the bodies' parameters are known, (M,) bool."""
-        return np.asarray(np.isfinite(self.alone) & (np.linalg.norm(self.hidden, axis=1) < _HIDDEN))
+        return np.asarray(np.isfinite(self.alone) & (np.linalg.norm(self.hidden, axis=1) < UNOBSERVABLE_SHARE))
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ def _eliminate(
 
     `sizes`: (M,), norms of the columns before anything was eliminated.
     """
-    seen = sizes > _DEPENDENT * sizes.max(initial=0.0)
+    seen = is_significant(sizes)
     scale = np.where(seen, sizes, 1.0)
     U, values, V, left = _split(np.where(seen, columns / scale, 0.0), rest)
     top, count = U.T @ rest, builder.columns.count
@@ -140,7 +138,7 @@ def without(X: Array, unknown: Sequence[int]) -> Array:
 def _split(columns: Array, rest: Array) -> tuple[Array, Array, Array, Array]:
     """U, singular values and V of what columns of norm 1 or 0 span, and the rows of the rest that they do not reach."""
     U, values, Vt = np.linalg.svd(columns, full_matrices=True)
-    rank = int((values > _DEPENDENT).sum())
+    rank = int((values > RANK_TOLERANCE).sum())
     left = U[:, rank:].T @ rest
-    left[:, np.linalg.norm(left, axis=0) < _DEPENDENT * np.linalg.norm(rest, axis=0)] = 0.0  # nothing but rounding
+    left[:, np.linalg.norm(left, axis=0) < RANK_TOLERANCE * np.linalg.norm(rest, axis=0)] = 0.0  # nothing but rounding
     return U[:, :rank], values[:rank], Vt[:rank].T, left

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
 from torchid.parameters import Array
-from torchid.problem.chunks import over_chunks
+from torchid.problem.chunks import ProgressCallback, over_chunks
 from torchid.problem.contact_state import State
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.predict import forces
@@ -75,9 +75,9 @@ class ForceSums:
     `whitened`: of the rows that a fit sees, V_x^T f of its sensors in units of their noise.
     """
 
-    def __init__(self, nv: int) -> None:
+    def __init__(self, n_rows: int) -> None:
         """Start empty."""
-        self.rows, self.projected, self.whitened = Squares(nv), Squares(1), Squares(1)
+        self.rows, self.projected, self.whitened = Squares(n_rows), Squares(1), Squares(1)
 
     @classmethod
     def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
@@ -112,16 +112,16 @@ class ForceSums:
 
 
 def projected(builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor) -> Iterator[torch.Tensor]:
-    """V_x^T of generalized forces (M, B, nv), V_x the contacts' null space, in groups of one rank, (M, B', r).
+    """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
 
     Joints away from contacts pass unchanged.
     """
-    plan, base = builder.plan(state), builder.tree.base_rows
-    mixed = [*range(base), *(base + joint for joint in plan.mixed_joints)]
-    lone = [base + joint for joint in plan.lone_joints]
+    layout, base = builder.layout(state), builder.tree.base_rows
+    coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
+    uncoupled = [base + joint for joint in layout.uncoupled_joints]
     for index, V in builder.bases(samples, state):
         these = vectors[:, index]
-        yield torch.cat([(V.mT @ these[..., mixed, None])[..., 0], these[..., lone]], dim=2)
+        yield torch.cat([(V.mT @ these[..., coupled, None])[..., 0], these[..., uncoupled]], dim=2)
 
 
 def figure(x: float) -> float | None:
@@ -201,9 +201,7 @@ class Evaluation:
         sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
         self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
 
-    def metrics(
-        self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
-    ) -> list[Metrics]:
+    def metrics(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[Metrics]:
         """One `Metrics` per row of `phi`, as `RowBuilder.columns_of`, over all samples of the logs together.
 
         Without the whitened projected residual, which depends on sensors.
@@ -211,15 +209,13 @@ class Evaluation:
         measured, *errors = self.sums(logs, phi, progress)
         return [self.summary(measured, error) for error in errors]
 
-    def sums(
-        self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
-    ) -> list[ForceSums]:
+    def sums(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[ForceSums]:
         """Of the measured forces, then of the errors of each row of `phi`."""
         builder = self.builder
         columns = builder.columns_of(phi)
 
         def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
-            sums = [ForceSums(self.robot.base_rows + self.robot.dofs) for _ in range(len(phi) + 1)]
+            sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
                 found = forces(builder, samples, state, columns)
                 for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):

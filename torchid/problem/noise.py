@@ -25,6 +25,7 @@ from torchid.problem.extras import measured_components
 from torchid.problem.linear import LinearProblem, TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.rounding import is_significant
 from torchid.sensing import SensorNoise
 
 BASE = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
@@ -65,8 +66,8 @@ def of_groups(values: Mapping[str, float]) -> SensorNoise:
 class _Chunk:
     """Samples of one log in one contact state.
 
-    `rows`, (B, nv, width + 1), whitened with the noise of the builder; `sources`, (B, E, nv), one standard deviation of
-    each source of noise in these rows.
+    `rows`, (B, n_rows, width + 1), whitened with the noise of the builder; `sources`, (B, E, n_rows), one standard
+    deviation of each source of noise in these rows.
     """
 
     log: str
@@ -95,8 +96,8 @@ class SampledRows:
         self.group_of = np.array([self.groups.index(name) for name in names], dtype=int)
         guess = by_group(builder.sensors.noise)
         self._std = torch.tensor([guess[name] for name in names], dtype=torch.float64)
-        nv = builder.tree.base_rows + len(builder.columns.joint_rows)
-        most = min(_SAMPLES, _BYTES // (8 * max(nv, 1) * (builder.width + 1 + len(names))))
+        n_rows = builder.tree.n_rows
+        most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
         self.chunks = [self._chunk(part, state) for part, state in _some(logs, max(most, 1))]
 
     @property
@@ -117,10 +118,10 @@ class SampledRows:
         return _Chunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
 
     def _ways(self, samples: Samples) -> Tensor:
-        """Generalized force that a unit of each source makes, (B, E, nv)."""
+        """Generalized force that a unit of each source makes, (B, E, n_rows)."""
         builder, base = self.builder, self.builder.tree.base_rows
-        nv = base + len(builder.columns.joint_rows)
-        unit = torch.eye(nv, dtype=samples.time.dtype, device=samples.time.device)
+        n_rows = builder.tree.n_rows
+        unit = torch.eye(n_rows, dtype=samples.time.dtype, device=samples.time.device)
         ways = [unit[:base].expand(len(samples), -1, -1)]
         if base and (axes := builder.noise_axes(samples.rotation_world_base)) is not None:
             turned = ways[0].clone()
@@ -226,8 +227,8 @@ class Components:
 class _Residuals:
     """Rows' residuals r and sources U of the guess, by chunk, and what the fit took of each group.
 
-    `r`: (B, nv), `U`: (B, E, nv); `left`, (G,), share of the degrees of freedom that the fit left; `independent`, (G,),
-    number of independent readings.
+    `r`: (B, n_rows), `U`: (B, E, n_rows); `left`, (G,), share of the degrees of freedom that the fit left;
+    `independent`, (G,), number of independent readings.
     """
 
     r: list[Tensor]
@@ -308,7 +309,7 @@ class VarianceComponents:
             S = sources.mT @ sources
             S = S + torch.diag_embed((S.diagonal(dim1=1, dim2=2) == 0.0).to(S))
             L = torch.linalg.cholesky(S)
-            white = torch.linalg.solve_triangular(L, sources.mT, upper=False)  # (B, nv, E)
+            white = torch.linalg.solve_triangular(L, sources.mT, upper=False)  # (B, n_rows, E)
             y = torch.linalg.solve_triangular(L, r[..., None], upper=False)
             M += member.T @ (white.mT @ white).square().sum(0) @ member
             sizes.append(white.square().sum(1))
@@ -363,7 +364,7 @@ def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
     """G, (width, rank), so that `|x G|^2` is the leverage of a whitened row x; offsets and the like are few."""
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=False, lapack_driver="gesvd")
-    kept = values > 1e-10 * values.max(initial=0.0)
+    kept = is_significant(values)
     G = np.zeros((builder.width, int(kept.sum())))
     basis = scale[:, None] * Vh[kept].T / values[kept]
     G[: builder.columns.count] = builder.columns.from_parameters()[:, problem.free] @ basis

@@ -72,8 +72,8 @@ def _readings(samples: Samples, known: Sequence[tuple[Extra, float]], tree: Kine
 class Forces:
     """Generalized forces of some samples, rows as in K: base force, base moment, joints.
 
-    `measured`, (B, nv): S^T tau + J_C^T lambda, NaN where a force that enters was not measured. `torque`, (B, nv): the
-    part S^T tau. `predicted`, (M, B, nv): K phi for M parameter vectors.
+    `measured`, (B, n_rows): S^T tau + J_C^T lambda [N, N m], NaN where a force that enters was not measured. `torque`,
+    (B, n_rows): the part S^T tau. `predicted`, (M, B, n_rows): K phi for M parameter vectors.
     """
 
     measured: Tensor
@@ -82,12 +82,12 @@ class Forces:
 
 
 def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Tensor:
-    """K phi, (nv, B), for parameters in the builder's columns, (columns,), without extras.
+    """K phi, (n_rows, B), for parameters in the builder's columns, (columns,), without extras.
 
     Bodies' wrenches, summed over subtrees, work along screw axes: the rows of K are never formed.
     """
     tree, layout = builder.tree, builder.columns.layout
-    by_body = phi.new_zeros(tree.bodies, layout.count)
+    by_body = phi.new_zeros(tree.n_nodes, layout.count)
     for body, start in enumerate(layout.starts[:-1]):
         end = layout.starts[body + 1]
         by_body[body, start:end] = phi[start:end]
@@ -102,9 +102,9 @@ def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Ten
 
 
 def contact_forces(builder: RowBuilder, samples: Samples, state: State, terms: ChunkTerms) -> Tensor:
-    """J_C^T lambda, (nv, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
+    """J_C^T lambda, (n_rows, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
     tree = builder.tree
-    total = samples.time.new_zeros(tree.base_rows + len(builder.columns.joint_rows), len(samples))
+    total = samples.time.new_zeros(tree.n_rows, len(samples))
     for contact, active in enumerate(state):
         if active:
             body, T_joint_frame = builder.frames[contact]
@@ -136,10 +136,10 @@ def forces(builder: RowBuilder, samples: Samples, state: State, phi: Tensor) -> 
 
 
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
-    """Measured (N, nv) and predicted (M, N, nv) forces of a whole log in its own order, parameters as `columns_of`."""
+    """Measured (N, n_rows) and predicted (M, N, n_rows) forces of a log in its order, `phi` as for `columns_of`."""
     columns = builder.columns_of(phi)
-    nv = builder.tree.base_rows + len(builder.columns.joint_rows)
-    measured, predicted = np.empty((len(samples), nv)), np.empty((len(phi), len(samples), nv))
+    n_rows = builder.tree.n_rows
+    measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
     with torch.no_grad(), one_thread():
         for state, index in by_state(samples):
             found = forces(builder, samples[index].to(builder.device), state, columns)
@@ -150,15 +150,15 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
 
 
 def in_null_space(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
-    """V_x V_x^T f of generalized forces (M, N, nv): what is left of each row inside the builder's null space."""
+    """V_x V_x^T f of generalized forces (M, N, n_rows): what is left of each row inside the builder's null space."""
     out, base = forces.copy(), builder.tree.base_rows
     with torch.no_grad(), one_thread():
         for state, index in by_state(samples):
             where = np.arange(len(samples))[index if isinstance(index, slice) else index.numpy()]
-            mixed = [*range(base), *(base + joint for joint in builder.plan(state).mixed_joints)]
+            coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
             for part, V in builder.bases(samples[index].to(builder.device), state):
                 chosen = where[part if isinstance(part, slice) else part.cpu().numpy()]
-                place = np.ix_(np.arange(len(forces)), chosen, mixed)
+                place = np.ix_(np.arange(len(forces)), chosen, coupled)
                 inside = V @ (V.mT @ torch.from_numpy(forces[place]).to(V)[..., None])
                 out[place] = inside[..., 0].cpu().numpy()
     return out

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.regressor.kinematics import BodyStates, cross, rotate
+from torchid.regressor.kinematics import BodyStates, cross_product, rotate_vectors
 from torchid.regressor.tree import KinematicTree
 
 ALL_INERTIAL = tuple(range(parameters.INERTIAL.stop))
@@ -61,7 +61,8 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
     """
     inverse = states.rotation.transpose(0, 1)
     omega, alpha, force = (
-        rotate(inverse, x) for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
+        rotate_vectors(inverse, x)
+        for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
     )
     spinning = [column for column in columns if column >= parameters.INERTIA.start]
     pulling = len(columns) - len(spinning)
@@ -74,7 +75,7 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
             forces = torch.cat([states.specific_force[:, :, None], forces], 2)
             moments = torch.nn.functional.pad(moments, (0, 0, 1, 0))
         out[:3, :, :pulling] = forces
-        out[3:, :, :pulling] = moments + cross(states.position[:, :, None], forces)
+        out[3:, :, :pulling] = moments + cross_product(states.position[:, :, None], forces)
     if spinning:
         by_axes = _inertia_moments(omega, alpha)
         spins = [by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in spinning]
@@ -84,7 +85,7 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
 def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
     """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B)."""
     components = torch.stack([torch.stack([vector[axis] for vector in vectors], dim=1) for axis in range(3)])
-    return rotate(rotation.unsqueeze(3), components)
+    return rotate_vectors(rotation.unsqueeze(3), components)
 
 
 _REVOLUTE_KEPT = (1, 2, 4, 5, 6, 8, 9)  # mcx, mcy, Ixx, Ixy, Ixz, Iyz, Izz
@@ -117,7 +118,7 @@ class ColumnLayout:
 
 def full_layout(tree: KinematicTree) -> ColumnLayout:
     """All ten inertial columns of every body."""
-    return ColumnLayout((ALL_INERTIAL,) * tree.bodies)
+    return ColumnLayout((ALL_INERTIAL,) * tree.n_nodes)
 
 
 def reduced_layout(tree: KinematicTree) -> ColumnLayout:
@@ -135,12 +136,12 @@ def reduced_layout(tree: KinematicTree) -> ColumnLayout:
 def reduction_matrix(tree: KinematicTree) -> Array:
     """B, (columns of `reduced_layout`, 10 L) for L bodies, with `K = K_reduced @ B` for the inertial columns of K."""
     layout, width = reduced_layout(tree), parameters.INERTIAL.stop
-    effective = np.zeros((tree.bodies, width, width * tree.bodies))
-    for body in range(tree.bodies):
+    effective = np.zeros((tree.n_nodes, width, width * tree.n_nodes))
+    for body in range(tree.n_nodes):
         own = slice(width * body, width * (body + 1))
         effective[body][:, own] = parameters.change_of_frame(tree.T_joint_link[body])
-    rows = np.zeros((layout.count, width * tree.bodies))
-    for body in reversed(range(tree.bodies)):
+    rows = np.zeros((layout.count, width * tree.n_nodes))
+    for body in reversed(range(tree.n_nodes)):
         kept, gone = np.zeros((width, width)), np.eye(width)
         for column in layout.kept[body]:
             kept[column, column] = 1.0
@@ -152,5 +153,5 @@ def reduction_matrix(tree: KinematicTree) -> Array:
         if body > 0:
             X = parameters.change_of_frame(tree.T_parent_joint[body])
             effective[tree.parents[body]] += X @ gone @ effective[body]
-    own_columns = rows.reshape(layout.count, tree.bodies, width)[:, tree.node_of]
+    own_columns = rows.reshape(layout.count, tree.n_nodes, width)[:, tree.node_of]
     return np.asarray(own_columns.reshape(layout.count, -1))

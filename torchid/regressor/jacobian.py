@@ -9,7 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from torchid.parameters import Array
-from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross, joint_states, motion_from_state
+from torchid.regressor.kinematics import (
+    GRAVITY_WORLD,
+    BodyStates,
+    body_states,
+    cross_product,
+    joint_motion,
+    motion_from_state,
+)
 from torchid.regressor.regressor import joint_directions
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -19,7 +26,7 @@ def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor) -> Tensor:
     """Wrenches that are constant in a body's joint frame, (k, 6), at the base origin in base axes, (6, k, B)."""
     rotation, position = states.rotation[:, :, body], states.position[:, body]
     force = wrenches[:, :3] @ rotation
-    return torch.cat([force, wrenches[:, 3:] @ rotation + cross(position[:, None].expand_as(force), force)])
+    return torch.cat([force, wrenches[:, 3:] @ rotation + cross_product(position[:, None].expand_as(force), force)])
 
 
 def generalized_forces(
@@ -77,7 +84,7 @@ class FrameJacobian(nn.Module):
         tree = self.tree
         still = q.new_zeros(q.shape[0], tree.n + tree.base_rows)
         motion = motion_from_state(q, still, still, tree.n, not tree.base_rows, GRAVITY_WORLD)
-        states = body_states(tree, motion, joint_states(tree, motion))
+        states = body_states(tree, motion, joint_motion(tree, motion))
         wrenches = wrenches_at_base(states, self._body, self.get_buffer("unit_wrenches"))
         J = generalized_forces(tree, joint_directions(tree, states), self._body, wrenches, self._joints)
         return J.permute(2, 0, 1)

@@ -112,7 +112,7 @@ class BodyStates:
 
 
 @dataclass(frozen=True)
-class JointStates:
+class JointMotion:
     """Positions, velocities, accelerations of the base's and all L - 1 joints, (L, B); the base's row is 0."""
 
     position: Tensor
@@ -120,7 +120,7 @@ class JointStates:
     acceleration: Tensor
 
 
-def joint_states(tree: KinematicTree, motion: Motion) -> JointStates:
+def joint_motion(tree: KinematicTree, motion: Motion) -> JointMotion:
     """All joints, mimic joints included, from the independent ones.
 
     Raises:
@@ -131,22 +131,22 @@ def joint_states(tree: KinematicTree, motion: Motion) -> JointStates:
         raise TypeError(f"motion: found {found}; accepted: {own}, or the module moved with .to({found})")
     moving = tree.joint_map[:, : tree.n]
     position = moving @ motion.joint_position.T + tree.joint_constant
-    return JointStates(position, moving @ motion.joint_velocity.T, moving @ motion.joint_acceleration.T)
+    return JointMotion(position, moving @ motion.joint_velocity.T, moving @ motion.joint_acceleration.T)
 
 
-def cross(a: Tensor, b: Tensor) -> Tensor:
+def cross_product(a: Tensor, b: Tensor) -> Tensor:
     """Cross product along the first axis of two tensors (3, ...)."""
     (x, y, z), (u, v, w) = a.unbind(), b.unbind()
     products = ((y * w).addcmul_(z, v, value=-1), (z * u).addcmul_(x, w, value=-1), (x * v).addcmul_(y, u, value=-1))
     return torch.stack(products)  # 1.6 times as fast as three differences: half as many temporaries
 
 
-def rotate(rotation: Tensor, x: Tensor) -> Tensor:
+def rotate_vectors(rotation: Tensor, x: Tensor) -> Tensor:
     """Rotation (3, 3, ...) times vectors (3, ...)."""
     return (rotation[:, 0] * x[0]).addcmul_(rotation[:, 1], x[1]).addcmul_(rotation[:, 2], x[2])
 
 
-def poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Tensor]:
+def joint_frame_poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation (3, 3, L, B) and position (3, L, B) of all joint frames, for joint positions (L, B)."""
     position = position.index_select(0, tree.by_depth)
     angle = position * tree.revolute.index_select(0, tree.by_depth)
@@ -158,7 +158,7 @@ def poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Tensor]:
     for size in tree.level_sizes[1:]:
         level = slice(start, start + size)
         above = above.index_select(2, tree.place_above[level])
-        unmoved = rotate(above[:, :, None], tree.pose[:, None, :, level])
+        unmoved = rotate_vectors(above[:, :, None], tree.pose[:, None, :, level])
         c, s = cosine[level], sine[level]
         x, y, z, origin = unmoved.unbind(1)
         origin = origin + above[:, 3]
@@ -171,12 +171,12 @@ def poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Tensor]:
     return pose[:, :3], pose[:, 3]
 
 
-def body_states(tree: KinematicTree, motion: Motion, joints: JointStates) -> BodyStates:
+def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> BodyStates:
     """States of all joint frames.
 
     Twists and accelerations are sums over ancestors, taken with one product each by the 0/1 ancestor matrix.
     """
-    rotation, position = poses(tree, joints.position)
+    rotation, position = joint_frame_poses(tree, joints.position)
     axis = rotation[:, 2]
 
     def of_parent(x: Tensor) -> Tensor:
@@ -185,23 +185,23 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointStates) -> Bod
     spin = axis * (joints.velocity * tree.revolute)
     omega = motion.base_angular_velocity.T[:, None] + tree.ancestors @ spin
     parent_omega = of_parent(omega)
-    own = torch.addcmul(cross(parent_omega, spin), axis, joints.acceleration * tree.revolute)
+    own = torch.addcmul(cross_product(parent_omega, spin), axis, joints.acceleration * tree.revolute)
     alpha = motion.base_angular_acceleration.T[:, None] + tree.ancestors @ own
     step = position - of_parent(position)
-    carried = cross(of_parent(alpha), step) + cross(parent_omega, cross(parent_omega, step))
+    carried = cross_product(of_parent(alpha), step) + cross_product(parent_omega, cross_product(parent_omega, step))
     if any(tree.slides):
         slide = axis * tree.prismatic
-        carried = carried + slide * joints.acceleration + 2.0 * cross(parent_omega, slide * joints.velocity)
+        carried = carried + slide * joints.acceleration + 2.0 * cross_product(parent_omega, slide * joints.velocity)
     force = motion.base_specific_force.T[:, None] + tree.ancestors @ carried
     return BodyStates(rotation, position, omega, alpha, force)
 
 
 def link_states(tree: KinematicTree, states: BodyStates) -> BodyStates:
     """States of the bodies' link frames, from those of their joint frames."""
-    rotation = torch.stack([rotate(states.rotation, tree.link_rotation[:, k]) for k in range(3)], dim=1)
+    rotation = torch.stack([rotate_vectors(states.rotation, tree.link_rotation[:, k]) for k in range(3)], dim=1)
     if not tree.link_offset.any():
         return BodyStates(rotation, *list(vars(states).values())[1:])
-    arm = rotate(states.rotation, tree.link_offset)
+    arm = rotate_vectors(states.rotation, tree.link_offset)
     omega, alpha = states.angular_velocity, states.angular_acceleration
-    force = states.specific_force + cross(alpha, arm) + cross(omega, cross(omega, arm))
+    force = states.specific_force + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
     return BodyStates(rotation, states.position + arm, omega, alpha, force)

@@ -12,11 +12,11 @@ from torchid.regressor.columns import ColumnLayout, full_layout, wrench_columns
 from torchid.regressor.kinematics import (
     GRAVITY_WORLD,
     BodyStates,
-    JointStates,
+    JointMotion,
     Motion,
     body_states,
-    cross,
-    joint_states,
+    cross_product,
+    joint_motion,
     link_states,
     motion_from_state,
 )
@@ -51,7 +51,7 @@ def joint_rows(tree: KinematicTree, layout: ColumnLayout) -> list[JointRow]:
 def joint_directions(tree: KinematicTree, states: BodyStates) -> Tensor:
     """Screw axes of all joints, (6, L, B): `direction . wrench at the base origin` is the torque about the joint."""
     axis = states.rotation[:, 2]
-    linear = cross(states.position, axis) * tree.revolute + axis * tree.prismatic
+    linear = cross_product(states.position, axis) * tree.revolute + axis * tree.prismatic
     return torch.cat([linear, axis * tree.revolute])
 
 
@@ -85,7 +85,7 @@ def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, directio
     return total
 
 
-def friction_columns(row: JointRow, tree: KinematicTree, joints: JointStates) -> list[tuple[int, Tensor, Tensor]]:
+def friction_columns(row: JointRow, tree: KinematicTree, joints: JointMotion) -> list[tuple[int, Tensor, Tensor]]:
     """Friction entries of one joint's row: body, column of fc, column of fv, each (B,).
 
     Friction resists: it adds `fc sign(v) + fv v` to the torque the actuator must give.
@@ -110,6 +110,10 @@ class Regressor(nn.Module):
     Differentiable; `.to(device, dtype)` moves it. Columns: 12 per body, bodies in `robot.body_names`' order,
     parameters in `torchid.parameters`' order. Rows: base force, base moment (base frame, about the base origin), then
     `robot.dof_names`: joints, and the wrenches of force/torque sensors in limbs; a fixed base has no base rows.
+
+    With `FrameJacobian` and `torchid.Projection`, the plain way to the equations of a fit. Fits take
+    `torchid.RowBuilder`, which shares the functions of this package but never forms K, for speed
+    (`tests/test_rows_two_ways.py` compares both).
     """
 
     def __init__(
@@ -148,11 +152,11 @@ class Regressor(nn.Module):
     def from_motion(self, motion: Motion) -> Tensor:
         """As `forward`, from a `Motion` (which knows no base position, heading or linear velocity)."""
         tree, layout = self.tree, self._layout
-        joints = joint_states(tree, motion)
+        joints = joint_motion(tree, motion)
         states = body_states(tree, motion, joints)
         directions = joint_directions(tree, states)
         wrenches = all_wrench_columns(link_states(tree, states), layout)
-        K = wrenches.new_zeros(tree.base_rows + len(self._rows), tree.bodies, parameters.PER_BODY, wrenches.shape[-1])
+        K = wrenches.new_zeros(tree.base_rows + len(self._rows), tree.n_nodes, parameters.PER_BODY, wrenches.shape[-1])
         inertial = K[:, :, parameters.INERTIAL]
         width = parameters.INERTIAL.stop
         if tree.base_rows:
@@ -163,6 +167,6 @@ class Regressor(nn.Module):
             for body, coulomb, viscous in friction_columns(row, tree, joints):
                 K[index, body, parameters.COULOMB] = coulomb
                 K[index, body, parameters.VISCOUS] = viscous
-        if len(tree.node_of) < tree.bodies:
+        if len(tree.node_of) < tree.n_nodes:
             K = K[:, tree.node_of]
         return K.flatten(1, 2).permute(2, 0, 1)

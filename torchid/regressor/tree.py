@@ -108,7 +108,7 @@ class KinematicTree(nn.Module):
         self.parents = [node.parent for node in nodes]
         self.slides = [node.slides for node in nodes]
         self.kinds = [node.kind for node in nodes]
-        self.base_rows, self.n = robot.base_rows, robot.n
+        self.base_rows, self.n, self.dofs, self.n_rows = robot.base_rows, robot.n, robot.dofs, robot.n_rows
         count = len(nodes)
         joint_frame = np.tile(np.eye(4), (count, 1, 1))
         for index, node in enumerate(nodes[1:], start=1):
@@ -152,8 +152,8 @@ class KinematicTree(nn.Module):
         self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)
 
     @property
-    def bodies(self) -> int:
-        """Number L of nodes."""
+    def n_nodes(self) -> int:
+        """Number of nodes: one for each body, and five more for every force/torque sensor in a limb."""
         return len(self.parents)
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:

@@ -19,9 +19,9 @@ from torchid.identifiability.expected_error import ExpectedErrors
 from torchid.problem import Metrics
 from torchid.problem.metrics import GROUPS, group_name
 from torchid.report.figures import STYLE
+from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.candidates import Candidate
 from torchid.sensor_planning.check import LostBase, PostureSummary, StateCheck
-from torchid.sensor_planning.demands import TOLERANCE
 from torchid.sensor_planning.planner import PartPlan, SensorPlan
 
 _WIDTH = 100
@@ -189,7 +189,7 @@ def check_lines(checks: Sequence[StateCheck]) -> list[str]:
         lines.append(
             f"warning: at some postures of the logs the base is all but lost (smallest singular value {least:.2g})"
         )
-    rare = sum(check.lost is None and check.generic.low < TOLERANCE for check in checks)
+    rare = sum(check.lost is None and check.generic.low < BASE_RANK_TOLERANCE for check in checks)
     if rare:
         where = f"{rare} of {len(checks)} contact states"
         lines.append(f"warning: in {where} the base is as good as lost at one random posture in twenty or more")

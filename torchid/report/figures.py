@@ -56,7 +56,7 @@ _MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
 
 @dataclass(frozen=True)
 class ForceSeries:
-    """Forces of one log for plotting: `measured` (N, nv), `nominal` and `identified` (N, nv), NaN where unknown."""
+    """Forces of one log for plotting: `measured`, `nominal`, `identified`, (N, n_rows) each, NaN where unknown."""
 
     source: str
     time: Array
@@ -210,7 +210,7 @@ def _draw_panel(axis: Axes, found: Sequence[ExtraEstimate], rows: Sequence[str],
         values, place = [x.value for x in points], [rows.index(x.extra.label) + below for x in points]
         error = [min(1.96 * x.standard_error, reach) if math.isfinite(x.standard_error) else reach for x in points]
         axis.errorbar(values, place, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
-        fill = [colors[log] if x.told_apart else "white" for x in points]
+        fill = [colors[log] if x.separable else "white" for x in points]
         axis.scatter(values, place, c=fill, edgecolors=colors[log], s=22, zorder=3)
     axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
     axis.set_yticks(range(len(rows)), rows, fontsize=8)

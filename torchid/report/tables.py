@@ -259,7 +259,7 @@ def extra_table(found: Sequence[ExtraEstimate]) -> Table:
 
 
 def _extra_cell(found: ExtraEstimate) -> str:
-    mark = "" if found.told_apart else " ?"
+    mark = "" if found.separable else " ?"
     if not math.isfinite(found.standard_error):
         return f"{found.value:.4g}{mark}"
     size = float(f"{found.standard_error:.1e}")  # rounded first: 0.0998 is 0.10, with as many decimals

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,7 +13,7 @@ import torch
 from yourdfpy.urdf import Inertial, Link
 
 from torchid import parameters
-from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError, during
+from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError, during, warn
 from torchid.parameters import COMPONENTS, Array
 from torchid.robot.chain import JointGeometry, build_chain, joint_geometry, link_poses
 from torchid.robot.tree import BodyJoint, BodyTree, build_tree
@@ -61,7 +60,7 @@ def _warn_if_unphysical(path: Path, link: str, inertial: Inertial) -> None:
         what = f"largest principal inertia {large:.3g} exceeds the sum of the others, {small + middle:.3g} kg m^2"
     else:
         return
-    warnings.warn(f"{path}: link '{link}': {what}; used as written", UnphysicalInertiaWarning, stacklevel=5)
+    warn(f"{path}: link '{link}': {what}; used as written", UnphysicalInertiaWarning)
 
 
 @dataclass(frozen=True)
@@ -127,8 +126,13 @@ class Robot:
 
     @property
     def nv(self) -> int:
-        """Number of generalized velocities."""
+        """Number of generalized velocities: n + 6, or n for a fixed base."""
         return self.n + self.base_rows
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of K: those of the base, then one for each of `dof_names`; nv + 6 F."""
+        return self.base_rows + self.dofs
 
     @property
     def body_names(self) -> tuple[str, ...]:
@@ -242,4 +246,4 @@ def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:
     for index, body in enumerate(bodies):
         if body.massless and index not in parents:
             message = f"{path}: link '{body.name}': no inertia at the end of a limb; its inertia stays out of the fit"
-            warnings.warn(message, MasslessBodyWarning, stacklevel=3)
+            warn(message, MasslessBodyWarning)

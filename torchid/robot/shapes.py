@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Inertial
 
-from torchid.errors import TorchidWarning, UrdfError
+from torchid.errors import UrdfError, warn
 from torchid.guards import MAX_AXES, MAX_NUMBER, MAX_POINTS, MAX_SHAPES
 from torchid.parameters import Array
 from torchid.robot.meshes import MeshError, mesh_content
@@ -118,7 +117,7 @@ def _warn(path: Path, what: str, bodies: list[str], reasons: list[str]) -> None:
     if bodies:
         reason = f" ({reasons[0]}{', ...' if len(reasons) > 1 else ''})" if reasons else ""
         message = f"{path}: {what} at {', '.join(bodies)}{reason}: where their matter lies is not known"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
 
 
 def _link_shapes(meshes: _Meshes, link: etree._Element, prefer: ShapeKind) -> list[_Shape]:

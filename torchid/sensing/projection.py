@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-RANK_TOLERANCE = 1e-9
-"""A singular value of A_x below this share of the largest counts as zero (more in single precision)."""
+from torchid.rounding import BASE_RANK_TOLERANCE, KINEMATIC_TOLERANCE, relative_tolerance
 
 _SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an SVD
 
@@ -45,7 +44,7 @@ def _differentiable(A: Tensor, V: Tensor) -> Tensor:
 
 
 def _tolerance(A: Tensor) -> float:
-    return max(RANK_TOLERANCE, max(A.shape[1:]) * torch.finfo(A.dtype).eps)
+    return relative_tolerance(KINEMATIC_TOLERANCE, A.shape[1:], torch.finfo(A.dtype).eps)
 
 
 def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
@@ -129,14 +128,11 @@ def _along(X: Tensor, axes: Tensor) -> Tensor:
     return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)
 
 
-_BASE_RANK_TOLERANCE = 1e-6  # V_x is orthonormal: singular values of S_b V_x are at most 1
-
-
 @dataclass(frozen=True)
 class ProjectedGroup:
     """Samples that share a contact state and a rank.
 
-    `index`, (B',), into the batch; `active`, (k,) bool, rows of J_C in contact; `V`, (B', nv, r); `K`, (B', r, P);
+    `index`, (B',), into the batch; `active`, (k,) bool, rows of J_C in contact; `V`, (B', n_rows, r); `K`, (B', r, P);
     `f`, (B', r); `base_rank`, (B',), rank(S_b V_x). `V` is whitened, no longer orthonormal, if a noise was given.
     """
 
@@ -149,14 +145,14 @@ class ProjectedGroup:
 
 
 def base_singular_values(V: Tensor) -> Tensor:
-    """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, nv, r) orthonormal."""
+    """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, n_rows, r) orthonormal."""
     values = torch.linalg.svdvals(V[:, :6])
     return nn.functional.pad(values, (0, 6 - values.shape[1]))
 
 
 def base_rank(singular_values: Tensor) -> Tensor:
     """rank(S_b V_x), (B,), from `base_singular_values`."""
-    tolerance = max(_BASE_RANK_TOLERANCE, 100.0 * torch.finfo(singular_values.dtype).eps)
+    tolerance = max(BASE_RANK_TOLERANCE, 100.0 * torch.finfo(singular_values.dtype).eps)
     return (singular_values > tolerance).sum(1)
 
 
@@ -170,6 +166,9 @@ class Projection(nn.Module):
     Gradients flow to all arguments, the Jacobian included: through `V_x` too, whose choice is arbitrary, so that only
     losses that do not depend on it (squares of projected forces, their sum over a batch) have one that means
     something. Where an active contact loses rank (a straight knee), the null space jumps and has no derivative.
+
+    Takes any K, dense and with any sensors, and is differentiable. Fits take `torchid.RowBuilder`, which uses the same
+    null spaces but multiplies V_x^T into the bodies' wrenches, for speed (`tests/test_rows_two_ways.py` compares both).
     """
 
     def __init__(
@@ -223,9 +222,9 @@ class Projection(nn.Module):
         """Project a batch.
 
         Args:
-            J_C: (B, k, nv), contact Jacobian with the rows of all contacts, active or not.
+            J_C: (B, k, n_rows), contact Jacobian with the rows of all contacts, active or not.
             active: (B, k) bool, rows whose contact touches the ground. The wrench of others is zero, whatever was read.
-            K: (B, nv, P), or any other matrix with the rows of the dynamics.
+            K: (B, n_rows, P), or any other matrix with the rows of the dynamics.
             torque: (B, n), read only where measured [N m].
             wrench: (B, k), by the rows of J_C, read only where measured and active [N, N m].
 

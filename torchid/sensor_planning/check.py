@@ -15,10 +15,11 @@ from torchid.problem import RowBuilder
 from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import State, state_name
 from torchid.robot import Robot
+from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values
 from torchid.sensor_planning.candidates import Candidate, candidates, chosen_from
-from torchid.sensor_planning.demands import TOLERANCE, Demand, demands, orthonormal
+from torchid.sensor_planning.demands import Demand, demands, orthonormal
 
 _ZERO = 1e-5  # of a unit vector
 _UNSEEN = 5e-3  # [m], less than what is printed
@@ -249,7 +250,7 @@ def _check(builder: RowBuilder, state: State, drawn: Array, recorded: Array | No
 def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> LostBase:
     [(_, V)] = builder.bases(at_rest(posture, state), state)
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
-    directions = U[:, (values > TOLERANCE).sum() :]
+    directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]
     short = cause.missing()
     groups = zip(cause.generic, short, strict=True)
     return LostBase(

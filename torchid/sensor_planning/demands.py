@@ -27,14 +27,9 @@ from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.contact_state import State
 from torchid.robot import Robot
+from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact
 from torchid.sensor_planning.candidates import Candidate, sensor_set
-
-TOLERANCE = 1e-6
-"""A share of unit vectors below this counts as zero, as in the rank of S_b V_x that this stands for.
-
-Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as independent in both.
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,18 +62,18 @@ class Demand:
 
     def unreached(self, basis: Array) -> Array:
         """Dimensions of the target outside the span of orthonormal (or zero) columns (..., k, r), int (...)."""
-        return np.asarray((np.linalg.svd(outside(self.target, basis), compute_uv=False) > TOLERANCE).sum(-1))
+        return np.asarray((np.linalg.svd(outside(self.target, basis), compute_uv=False) > BASE_RANK_TOLERANCE).sum(-1))
 
     def gains(self, basis: Array) -> dict[Candidate, int]:
         """Dimensions that each candidate adds to a span (k, r)."""
         values = ((c, np.linalg.svd(outside(x, basis), compute_uv=False)) for c, x in self.vectors.items())
-        return {candidate: int((s > TOLERANCE).sum()) for candidate, s in values}
+        return {candidate: int((s > BASE_RANK_TOLERANCE).sum()) for candidate, s in values}
 
 
 def orthonormal(vectors: Array) -> Array:
     """Orthonormal basis of the span of unit columns, (..., k, w) to (..., k, min(k, w)), padded with zero columns."""
     U, values, _ = np.linalg.svd(vectors, full_matrices=False)
-    return U * (values > TOLERANCE * values[..., :1])[..., None, :]
+    return U * (values > BASE_RANK_TOLERANCE * values[..., :1])[..., None, :]
 
 
 def outside(vectors: Array, basis: Array) -> Array:
@@ -89,7 +84,7 @@ def outside(vectors: Array, basis: Array) -> Array:
 def spanning(vectors: Array) -> Array:
     """Orthonormal basis (k, r) of the span of parts of unit vectors (k, w); small ones are none."""
     U, values, _ = np.linalg.svd(vectors, full_matrices=False)
-    return U[:, values > TOLERANCE]
+    return U[:, values > BASE_RANK_TOLERANCE]
 
 
 def demands(
@@ -147,7 +142,7 @@ def _demand(
     J: Array,
     candidates: Sequence[Candidate],
 ) -> Demand:
-    """What a group demands, from the Jacobians of all contacts, (C, 6, nv + 6 F)."""
+    """What a group demands, from the Jacobians of all contacts, (C, 6, n_rows)."""
     rows = [(place, k) for place in group for k in contacts[place].components]
     J_group = np.stack([J[row] for row in rows])
     J_group /= np.linalg.norm(J_group[:, :6])
@@ -156,8 +151,8 @@ def _demand(
         if candidate.dofs:
             x = J_group[:, [6 + dof for dof in candidate.dofs]]
             length = np.linalg.norm(x, axis=0)
-            if (length > TOLERANCE).any():
-                vectors[candidate] = x[:, length > TOLERANCE] / length[length > TOLERANCE]
+            if (length > BASE_RANK_TOLERANCE).any():
+                vectors[candidate] = x[:, length > BASE_RANK_TOLERANCE] / length[length > BASE_RANK_TOLERANCE]
         elif candidate.contact in group:
             read = [rows.index((candidate.contact, k)) for k in candidate.components]
             vectors[candidate] = np.eye(len(rows))[:, read]

@@ -96,7 +96,7 @@ def needs(robot: Robot, contacts: Sequence[Contact], states: Iterable[State], se
 
 
 CRITERIA = ("per_sample", "stack")
-Progress = Callable[[str, int, int], None]
+StepCallback = Callable[[str, int, int], None]
 """Called with what is going on, steps done and steps in all."""
 
 _EXACT = 1e-9
@@ -188,7 +188,7 @@ class SensorPlan:
     removals: tuple[Removal, ...]
 
 
-def plan_sensors(question: Question, progress: Progress | None = None) -> SensorPlan:
+def plan_sensors(question: Question, progress: StepCallback | None = None) -> SensorPlan:
     """The smallest sensor set for a scenario, the most informative of those.
 
     Raises:
@@ -237,7 +237,7 @@ def check(question: Question, sensors: SensorSet) -> list[StateCheck]:
 
 
 def _best_parts(
-    ask: Question, parts: Sequence[Component], least: CheapestSet, tell: Progress
+    ask: Question, parts: Sequence[Component], least: CheapestSet, tell: StepCallback
 ) -> tuple[tuple[PartPlan, ...], tuple[Candidate, ...]]:
     """Every part with its minimal sets, and the union of their most informative cheapest sets.
 
@@ -266,7 +266,7 @@ def _best_parts(
     return tuple(out), tuple(c for c in ask.candidates if c in chosen)
 
 
-def _removals(ask: Question, chosen: Sequence[Candidate], tell: Progress) -> Iterable[Removal]:
+def _removals(ask: Question, chosen: Sequence[Candidate], tell: StepCallback) -> Iterable[Removal]:
     step = _counted(tell, "leaving sensors out", len(chosen))
     for candidate in chosen:
         fewer = [c for c in chosen if c is not candidate]
@@ -283,7 +283,7 @@ def _base_rank(ask: Question, chosen: Sequence[Candidate]) -> int | None:
     return min(int(base_rank(base_values(builder, state, postures)).max()) for state in ask.states)
 
 
-def _counted(tell: Progress, what: str, steps: int) -> Callable[[], None]:
+def _counted(tell: StepCallback, what: str, steps: int) -> Callable[[], None]:
     """Tells one step more at every call."""
     numbers = count(1)
     return lambda: tell(what, next(numbers), steps)

@@ -22,11 +22,10 @@ from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import one_thread, share_out, spread_by_state, worker_count
 from torchid.problem.contact_state import State
 from torchid.robot import Robot
+from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensor_planning.candidates import Candidate, sensor_set
 from torchid.sensor_planning.search import Component
-
-_UNSEEN = 1e-9  # a share of the largest column in units of the scales, or of unit columns, that is rounding
 
 
 class MotionStack:
@@ -83,12 +82,12 @@ def _splits(robot: Robot) -> Array:
 
 def _rank_of(changes: Array, problem: LinearProblem) -> int:
     """Rank of what a problem's rows see of some changes of its parameters, (P, M), each of the size of one of them."""
-    least = _UNSEEN * np.linalg.norm(problem.A * problem.scale, axis=0).max(initial=0.0)
+    least = KINEMATIC_TOLERANCE * np.linalg.norm(problem.A * problem.scale, axis=0).max(initial=0.0)
     sizes = (np.abs(changes) / problem.scale[:, None]).max(axis=0, initial=0.0)
     columns = problem.A @ (changes / np.maximum(sizes, np.finfo(float).tiny))
     norms = np.linalg.norm(columns, axis=0)
     seen = columns[:, norms > least] / norms[norms > least]
-    return int(np.linalg.matrix_rank(seen, tol=_UNSEEN)) if seen.size else 0
+    return int(np.linalg.matrix_rank(seen, tol=KINEMATIC_TOLERANCE)) if seen.size else 0
 
 
 def sparse_set(
@@ -124,7 +123,7 @@ _ROUNDING = 1e-13
 
 @dataclass(frozen=True)
 class _StateRows:
-    """Of B samples with all sensors: rows that hang on each candidate, Q (B, c, nv) and Q R (B, c, P)."""
+    """Of B samples with all sensors: rows that hang on each candidate, Q (B, c, n_rows) and Q R (B, c, P)."""
 
     weight: float
     owners: list[int]
@@ -179,7 +178,7 @@ class SetRanking:
                 self._states.append(_StateRows(weight, owners, Q, Q @ R))
 
     def _ways(self, builder: RowBuilder, samples: Samples, state: State) -> tuple[list[int], Tensor]:
-        """How each channel of the candidates enters the generalized force, (B, c, nv), and whose channel it is."""
+        """How each channel of the candidates enters the generalized force, (B, c, n_rows), and whose it is."""
         J = builder.contact_jacobian(samples)
         base, owners, ways = builder.tree.base_rows, [], []
         for number, candidate in enumerate(self.candidates):

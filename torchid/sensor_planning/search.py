@@ -15,8 +15,9 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from torchid.errors import SensorError
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
+from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.candidates import Candidate, total_cost
-from torchid.sensor_planning.demands import TOLERANCE, Demand, connected, orthonormal, outside, spanning
+from torchid.sensor_planning.demands import Demand, connected, orthonormal, outside, spanning
 
 _DEVICES, _COMBINATIONS, _BATCH = 5, 100_000, 4096
 
@@ -55,11 +56,11 @@ def _least_of_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float
     d, length = target.shape[1], np.linalg.norm(vectors, axis=0)
     if d == 0:
         return 0.0, ()
-    places = np.flatnonzero(length > TOLERANCE)
+    places = np.flatnonzero(length > BASE_RANK_TOLERANCE)
     vectors, cost = vectors[:, places] / length[places], cost[places]
     rest = outside(vectors, target)
     length = np.linalg.norm(rest, axis=0)
-    inside = length <= TOLERANCE
+    inside = length <= BASE_RANK_TOLERANCE
     rest = (spanning(rest).T @ rest) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
     best, chosen, budget = math.inf, np.zeros(0, dtype=int), _COMBINATIONS
     for g in range(len(rest) + 1):
@@ -83,7 +84,7 @@ def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.n
     while some := list(islice(generators, _BATCH)):
         picked = np.array(some, dtype=int).reshape(len(some), g)
         basis = orthonormal(rest[:, picked].transpose(1, 0, 2))  # (some, dimensions, g)
-        member = (np.linalg.norm(outside(rest, basis), axis=1) <= TOLERANCE) | inside
+        member = (np.linalg.norm(outside(rest, basis), axis=1) <= BASE_RANK_TOLERANCE) | inside
         yield from np.unique(member[member.sum(1) >= least], axis=0)
 
 
@@ -93,7 +94,7 @@ def _cheapest_basis(vectors: Array, flat: np.ndarray) -> list[int]:
     for place in np.flatnonzero(flat).tolist():
         left = outside(vectors[:, [place]], basis)
         length = np.linalg.norm(left)
-        if length > TOLERANCE:
+        if length > BASE_RANK_TOLERANCE:
             basis = np.hstack([basis, left / length])
             chosen.append(place)
     return chosen

@@ -14,7 +14,7 @@ from torchid.logs import Log
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
 from torchid.simulation.controller import Controller, Stance, find_stance
-from torchid.simulation.motion import Motion
+from torchid.simulation.motion import ReferenceMotion
 from torchid.simulation.plant import Foot, Plant, can_hold, find_feet
 
 _REPORT_S = 0.25  # simulated seconds between two looks at how the robot stands
@@ -50,7 +50,7 @@ def record(
     plant: Plant,
     controller: Controller,
     stance: Stance,
-    motion: Motion,
+    motion: ReferenceMotion,
     config: SimulationConfig,
     source: object,
     progress: Callable[[float], None] | None = None,
@@ -238,7 +238,7 @@ class Simulation:
     feet: tuple[Foot, ...]
     stance: Stance
 
-    def motion(self, config: MotionConfig) -> Motion:
+    def reference(self, config: MotionConfig) -> ReferenceMotion:
         """The goals of a motion.
 
         Raises:
@@ -246,7 +246,9 @@ class Simulation:
             InputError: it is too short, or lifts feet that the robot cannot do without.
         """
         frames = self.plant.foot_frames
-        motion = Motion(config, self.stance, self.plant.joint_names, frames, self.config.control_hz, self.source)
+        motion = ReferenceMotion(
+            config, self.stance, self.plant.joint_names, frames, self.config.control_hz, self.source
+        )
         for support in motion.supports:
             self.check_support(support, f"motions.{config.name}.steps")
         return motion
@@ -276,7 +278,9 @@ class Simulation:
         """
         friction = self.config.friction.levels or (0.0, 0.0)
         controller = Controller(self.plant, self.feet, self.stance.rotations, friction)
-        recording = record(self.plant, controller, self.stance, self.motion(config), self.config, self.source, progress)
+        recording = record(
+            self.plant, controller, self.stance, self.reference(config), self.config, self.source, progress
+        )
         found = stability(
             recording, self.plant, self.stance, self.feet, self.config.sensors.contact_threshold, self.source
         )
