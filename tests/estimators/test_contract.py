@@ -163,7 +163,7 @@ class EstimatorContract(ABC):
 
     @pytest.mark.parametrize("ridge", [-1.0, np.nan, np.inf])
     def test_a_ridge_that_is_no_weight_is_refused(self, ridge: float) -> None:
-        with pytest.raises(ValueError, match="ridge: found .*; accepted: a finite number of at least 0"):
+        with pytest.raises(ValueError, match="ridge: found .*; accepted: "):
             self.solve(usual_problem(), ridge)
 
     def test_a_body_of_which_only_part_is_free_is_refused_where_bodies_count(self) -> None:
