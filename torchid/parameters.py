@@ -111,7 +111,7 @@ def least_eigenvalues(phi: Array, scale: Array) -> Array:
     return eigenvalues
 
 
-def perturbed(phi: Array, error: float, rng: np.random.Generator) -> Array:
+def perturb_parameters(phi: Array, error: float, rng: np.random.Generator) -> Array:
     """Parameters (L, 12) of bodies that differ from `phi` by up to a share `error`, yet could exist as well as those.
 
     Mass, each coordinate of the centre of mass, and the inertia about it are multiplied by factors from 1 - error to
@@ -125,4 +125,4 @@ def perturbed(phi: Array, error: float, rng: np.random.Generator) -> Array:
     return out
 
 
-COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
+WRENCH_COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")

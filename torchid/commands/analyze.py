@@ -21,9 +21,9 @@ from torchid.fitting.experiment import Scene, set_up_scene
 from torchid.fitting.fit import frozen_parameters
 from torchid.fitting.noise import estimated_noise, recorded_sensors, stating
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import by_state
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import free_parameters
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
@@ -106,7 +106,7 @@ def scenarios(scene: Scene, train: Sequence[Samples], source: object = "experime
     if wanted is None:
         seen: Counter[State] = Counter()
         for samples in train:
-            for state, index in by_state(samples):
+            for state, index in chunks_by_state(samples):
                 seen[state] += len(samples[index])
         most_first = tuple(state for state, _ in seen.most_common())
         return {"logs": most_first} if seen else {"all_contacts": ((True,) * len(frames),)}
@@ -204,7 +204,7 @@ def _picture(scene: Scene, scenario: Scenario) -> Figure:
     sensors = sensor_set(robot, scene.contacts, plan.chosen)
     used = [c for c, *active in zip(scene.contacts, *scenario.states, strict=True) if any(active)]
     wrenches = {
-        contact.frame: [COMPONENTS[k] for k in np.flatnonzero(row)]
+        contact.frame: [WRENCH_COMPONENTS[k] for k in np.flatnonzero(row)]
         for contact, row in zip(scene.contacts, sensors.wrench, strict=True)
     }
     measured = [name for name, taken in zip(robot.dof_names, sensors.torque, strict=True) if taken]
@@ -321,7 +321,7 @@ def same_sensors(a: SensorSet, b: SensorSet, contacts: Sequence[Contact]) -> boo
 def _compared(ask: Asked, found: Sequence[Scenario], train: Sequence[Samples]) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
     scene, sets = ask.scene, dict(ask.named)
-    recorded = {state for samples in train for state, _ in by_state(samples)}
+    recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
     for scenario in found:
         planned = sensor_set(scene.robot, scene.contacts, scenario.plan.chosen, scene.noise)
         if recorded & set(scenario.states) and not any(

@@ -20,8 +20,8 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import Part
 from torchid.problem.extras import Extra
-from torchid.problem.predict import calibrated
-from torchid.problem.samples import check_forces
+from torchid.problem.predict import calibrate_readings
+from torchid.problem.samples import require_forces
 from torchid.sensing import SensorSet
 from torchid.text import listed
 
@@ -74,7 +74,7 @@ class Calibration:
         if not self.changes_readings:
             return list(logs)
         extras, tree = self._builder.extras, self._builder.tree
-        return [calibrated(log, extras, self._values_for(log), tree) for log in logs]
+        return [calibrate_readings(log, extras, self._values_for(log), tree) for log in logs]
 
     def parameters(self, evaluation: Evaluation) -> Array:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""
@@ -82,7 +82,7 @@ class Calibration:
 
     def columns(self, builder: RowBuilder, log: Samples) -> Tensor:
         """Parameters in the columns of the rows of a log's sensors, (width,)."""
-        return builder.columns_of(np.append(self.phi, self._values_for(log))[None])[0]
+        return builder.to_columns(np.append(self.phi, self._values_for(log))[None])[0]
 
     @cached_property
     def _builder(self) -> RowBuilder:
@@ -106,7 +106,7 @@ class Calibration:
         """Unknowns of a log, with everything else known."""
         scene = self.scene
         try:
-            check_forces(log, scene.robot, scene.contacts, self.sensors)
+            require_forces(log, scene.robot, scene.contacts, self.sensors)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
             warnings.warn(message, TorchidWarning, stacklevel=2)
@@ -120,7 +120,7 @@ class Calibration:
         def columns(values: Array) -> Tensor:
             extras = np.empty(len(own))
             extras[own], extras[~own] = values, shared
-            return builder.columns_of(np.append(self.phi, extras)[None])[0]
+            return builder.to_columns(np.append(self.phi, extras)[None])[0]
 
         robust = scene.config.estimator.robust
         if robust is None:

@@ -16,8 +16,8 @@ from torchid.fitting.fit import posed, solved, stand_in, stated_conditions
 from torchid.parameters import Array
 from torchid.problem import Evaluation, Metrics, RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback, one_thread
-from torchid.problem.compression import Part, states_together
-from torchid.problem.extras import read_components
+from torchid.problem.compression import Part, merge_states
+from torchid.problem.extras import recorded_components
 from torchid.problem.metrics import ForceSums
 from torchid.sensing import SensorSet
 
@@ -154,8 +154,8 @@ def complete(log: Samples, builder: RowBuilder) -> Samples:
     """The samples of a log that have every reading of the builder's sensors."""
     sensors, known = builder.sensors, torch.ones(len(log), dtype=torch.bool)
     if sensors.torque.any():
-        known &= torch.isfinite(builder.torque(log)[:, torch.from_numpy(sensors.torque)]).all(1)
-    needed = torch.from_numpy(read_components(builder.contacts, sensors, log.wrench_in_world))
+        known &= torch.isfinite(builder.recorded_torque(log)[:, torch.from_numpy(sensors.torque)]).all(1)
+    needed = torch.from_numpy(recorded_components(builder.contacts, sensors, log.wrench_in_world))
     touched = log.active[..., None] & needed
     lost = touched if log.wrench is None else touched & ~torch.isfinite(log.wrench)
     known &= ~lost.flatten(1).any(1)
@@ -209,7 +209,7 @@ def chosen_ridge(
     if len(folds) < 2:
         found = "auto, but the training samples are too few to leave blocks of them out"
         raise ConfigError(source, "estimator.ridge", found, "a number, or longer logs")
-    together = states_together(parts, builder)
+    together = merge_states(parts, builder)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
         squares = np.array([_left_out(fold, together, blocks, scene, sensors, builder, source, done) for fold in folds])

@@ -23,9 +23,9 @@ from torchid.sensing import (
     Contact,
     SensorNoise,
     SensorSet,
-    check_contacts,
     chosen_sensors,
     named_sensors,
+    validate_contacts,
     with_ft_sensors,
 )
 
@@ -214,7 +214,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "exp
         raise UnknownNameError(source, field, error.name, error.valid, error.what) from error
     if not robot.nv:
         raise ConfigError(source, "robot", "a bolted base without a joint, which never moves", "a robot that can move")
-    contacts = check_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
+    contacts = validate_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
     return Scene(config, robot, contacts)
 
 

@@ -17,7 +17,14 @@ from torchid.fitting.experiment import Experiment, Scene
 from torchid.fitting.fit import fitted
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.noise import BASE, Components, SampledRows, VarianceComponents, by_group, of_groups
+from torchid.problem.noise import (
+    BASE_GROUPS,
+    GroupVariances,
+    SampledRows,
+    VarianceComponentEstimator,
+    noise_of_groups,
+    std_by_group,
+)
 from torchid.sensing import SensorNoise, SensorSet
 
 _SETTLED = 0.05  # change of the deviation along any group's directions: weights 10 % off cost 0.2 % of efficiency
@@ -72,14 +79,14 @@ def estimated_noise(
         logs: bound training logs.
         source: named in errors.
     """
-    stated = {name for name in by_group(scene.noise) if _stated(scene, name)}
+    stated = {name for name in std_by_group(scene.noise) if _stated(scene, name)}
     builder = RowBuilder(scene.robot, scene.contacts, replace(sensors, noise=scene.noise), scene.terms)
     rows = SampledRows(logs, builder.to(scene.config.device))
     if not (rows.groups and rows.chunks):
         return NoiseSummary(scene.noise, [], {}, 0)
     tied = [name for name in rows.groups if name in stated]
     variance, columns, passes = np.ones(len(rows.groups)), None, 0
-    estimator = VarianceComponents(rows, tied)
+    estimator = VarianceComponentEstimator(rows, tied)
     while True:
         columns, problem = _fitted(rows, variance, columns, scene, source)
         passes += 1
@@ -89,9 +96,11 @@ def estimated_noise(
         variance = found.variance
         if found.change < _SETTLED or passes == _PASSES:
             break
-    free = VarianceComponents(rows).estimate(variance, columns, problem) if tied else found
+    free = VarianceComponentEstimator(rows).estimate(variance, columns, problem) if tied else found
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
-    used = np.where(np.isin(rows.groups, tied), rows.guess, _rounded(rows.guess * np.sqrt(variance / common)))
+    used = np.where(
+        np.isin(rows.groups, tied), rows.reference_std, _rounded(rows.reference_std * np.sqrt(variance / common))
+    )
     return _summary(scene.noise, rows, tied, used, free, passes)
 
 
@@ -106,7 +115,7 @@ def weighed(
 
 def recorded_sensors(scene: Scene, logs: Sequence[Samples]) -> SensorSet:
     """All sensors whose every value is in every log."""
-    torque = np.ones(scene.robot.dofs, dtype=bool)
+    torque = np.ones(scene.robot.n_dofs, dtype=bool)
     wrench = np.ones((len(scene.contacts), 6), dtype=bool)
     for log in logs:
         torque &= log.torque is not None and log.torque.isfinite().all(0).numpy()
@@ -136,7 +145,7 @@ def _fitted(
 ) -> tuple[Mapping[str, Tensor], LinearProblem]:
     """Parameters by log in the builder's columns, and the problem, by least squares without regularization."""
     estimator = LeastSquares(rank_tolerance=scene.config.estimator.rank_tolerance)
-    fit = fitted(rows.parts(variance, before), scene, rows.builder, estimator.solve, source)
+    fit = fitted(rows.compress(variance, before), scene, rows.builder, estimator.solve, source)
     columns = {chunk.log: fit.columns(rows.builder, chunk.log) for chunk in rows.chunks}
     return {log: x.to("cpu", torch.float64) for log, x in columns.items()}, fit.assembly.problem
 
@@ -147,42 +156,44 @@ def _rounded(values: Array) -> Array:
 
 
 def _summary(
-    guess: SensorNoise, rows: SampledRows, tied: Sequence[str], used: Array, free: Components, passes: int
+    guess: SensorNoise, rows: SampledRows, tied: Sequence[str], used: Array, free: GroupVariances, passes: int
 ) -> NoiseSummary:
-    deviation = _rounded(rows.guess * np.sqrt(free.variance))
+    deviation = _rounded(rows.reference_std * np.sqrt(free.variance))
     groups = []
     for place, name in enumerate(rows.groups):
-        told = bool(free.told[place])
+        told = bool(free.estimated[place])
         origin = "stated" if name in tied else _origin(free, place)
         unit = "N" if "force" in name else "N m"
         groups.append(GroupNoise(name, unit, origin, float(used[place]), float(deviation[place]) if told else None))
-    noise = of_groups(by_group(guess) | {one.group: one.used for one in groups})
+    noise = noise_of_groups(std_by_group(guess) | {one.group: one.used for one in groups})
     known = {
         name: float(x)
-        for name, x, yes in zip(rows.groups, deviation, free.told & ~free.at_most & ~free.confounded, strict=True)
+        for name, x, yes in zip(
+            rows.groups, deviation, free.estimated & ~free.upper_bound & ~free.confounded, strict=True
+        )
         if yes
     }
     return NoiseSummary(noise, groups, _suggested(guess, tied, known), passes)
 
 
-def _origin(found: Components, place: int) -> str:
-    if not found.told[place]:
+def _origin(found: GroupVariances, place: int) -> str:
+    if not found.estimated[place]:
         return "assumed"
-    return "at most" if found.at_most[place] else "confounded" if found.confounded[place] else "estimated"
+    return "at most" if found.upper_bound[place] else "confounded" if found.confounded[place] else "estimated"
 
 
 def _suggested(
     stated: SensorNoise, tied: Sequence[str], known: Mapping[str, float]
 ) -> dict[str, float | tuple[float, float, float]]:
     """What residuals show of stated noise, if no common factor of at most 1 explains it to within a factor of two."""
-    before = by_group(stated)
+    before = std_by_group(stated)
     ratios = [known[name] / before[name] for name in tied if name in known]
     if not ratios or (max(ratios) <= _APART and max(ratios) <= _APART**2 * min(ratios)):
         return {}
     out: dict[str, float | tuple[float, float, float]] = {}
     for name in tied:
         key = name.partition(".")[0]
-        axes = [axis for axis in BASE if axis.partition(".")[0] == key]
+        axes = [axis for axis in BASE_GROUPS if axis.partition(".")[0] == key]
         if axes and all(axis in known for axis in axes):
             out[key] = (known[axes[0]], known[axes[1]], known[axes[2]])
         elif not axes and name in known:

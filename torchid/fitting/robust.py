@@ -17,7 +17,7 @@ from torchid.fitting.fit import Fit
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback
-from torchid.problem.compression import Part, merged
+from torchid.problem.compression import Part, merge_factors
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
 """Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
@@ -164,7 +164,7 @@ def robust_fit(
         by_log = {source: fit.columns(builder, source) for source in sources}
         reweighting = Reweighting(current, by_log, max(scale, _TINY))
         before, done = fit, done + 1
-        fit = solve(compress_parts(logs, builder, progress=progress, weigh=reweighting))
+        fit = solve(compress_parts(logs, builder, progress=progress, weight_rows=reweighting))
         converged = current == loss and _settled(fit, before, scale, reweighting.median_scale)
         scale = reweighting.median_scale
     found = RobustSummary(loss.kind, loss.tuning, scale, reweighting.mean_weight, done, converged)
@@ -179,7 +179,7 @@ def robust_unknowns(
     loss: RobustLoss,
     passes: int,
 ) -> Array:
-    """Unknowns of a log, (M,), with outliers weighed down and everything else known, as in `robust_fit`.
+    """Unknowns of a log, (M,), with outliers weighted down and everything else known, as in `robust_fit`.
 
     Args:
         log: a bound log.
@@ -191,13 +191,13 @@ def robust_unknowns(
     """
     parts = compress_parts([log], builder)
     values = solve(parts)
-    factor = merged((part.factor for part in parts), builder)
+    factor = merge_factors((part.factor for part in parts), builder)
     left = factor.triangle() @ torch.cat([columns(values), torch.tensor([-1.0], dtype=torch.float64)])
     scale = float(left.norm()) / np.sqrt(max(factor.rows, 1))
     for done in range(passes):
         current = _loss_of_pass(loss, done)
         reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
-        before, values = values, solve(compress_parts([log], builder, weigh=reweighting))
+        before, values = values, solve(compress_parts([log], builder, weight_rows=reweighting))
         steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
         scale = reweighting.median_scale
         if current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME):
@@ -216,8 +216,8 @@ def _settled(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:
     So it has where nothing but rounding is left to be fitted.
     """
     problem, estimate = fit.assembly.problem, fit.estimate
-    moved = problem.distance(estimate.phi, before.estimate.phi)
-    if max(moved, new_scale) <= _EXACT * problem.distance(estimate.phi, np.zeros_like(estimate.phi)):
+    moved = problem.prediction_distance(estimate.phi, before.estimate.phi)
+    if max(moved, new_scale) <= _EXACT * problem.prediction_distance(estimate.phi, np.zeros_like(estimate.phi)):
         return True
     rows = problem.rows / problem.oversampling
     if moved > _CONVERGED * scale * np.sqrt(estimate.rank / rows) or abs(new_scale - scale) > _STEADY * scale:

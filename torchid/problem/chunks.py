@@ -46,7 +46,7 @@ def worker_count(device: torch.device) -> int:
     return torch.get_num_threads() if device.type == "cpu" else 1
 
 
-def share_out(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
+def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
     """Results of `run`, one per worker, each called without gradients on every n-th task.
 
     A failure or an interrupt stops all workers at their next task.
@@ -82,7 +82,7 @@ ProgressCallback = Callable[[int], None]
 Result = TypeVar("Result")
 
 
-def by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slice | torch.Tensor]]:
+def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slice | torch.Tensor]]:
     """Chunks of samples that share a contact state: the state and an index into the samples."""
     active = samples.active.cpu().numpy()
     packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
@@ -97,12 +97,12 @@ def by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slic
             yield tuple(active[example].tolist()), piece
 
 
-def spread_by_state(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
+def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
     """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
     found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
     for samples in logs:
         every = torch.arange(len(samples))
-        for state, index in by_state(samples):
+        for state, index in chunks_by_state(samples):
             found.setdefault(state, []).append((samples, every[index]))
     for state, pieces in found.items():
         total = sum(len(index) for _, index in pieces)
@@ -111,7 +111,7 @@ def spread_by_state(logs: Sequence[Samples], count: int) -> Iterator[tuple[Sampl
             yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
 
 
-def over_chunks(
+def map_chunks(
     logs: Sequence[Samples],
     builder: RowBuilder,
     fold: Callable[[Iterator[tuple[Samples, State]]], Result],
@@ -130,7 +130,7 @@ def over_chunks(
             intra-op thread torch would use, one if the builder is on a GPU.
         progress: called with the number of samples done since the last call.
     """
-    tasks = [(samples, state, index) for samples in logs for state, index in by_state(samples, chunk)]
+    tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, chunk)]
     for _, state, _ in tasks:
         builder.layout(state)
     lock = threading.Lock()
@@ -146,4 +146,4 @@ def over_chunks(
                 with lock:
                     progress(len(piece))
 
-    return share_out(tasks, run, threads or worker_count(builder.device))
+    return run_in_workers(tasks, run, threads or worker_count(builder.device))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.problem.chunks import CHUNK, ProgressCallback, by_state, one_thread, over_chunks, worker_count
+from torchid.problem.chunks import CHUNK, ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import State
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder, Workspace
@@ -28,7 +28,7 @@ _NORMAL = 0.6745  # median of |x| of standard normal x
 
 
 @dataclass(frozen=True)
-class UnloadedChannel:
+class UnloadedOffsetEquation:
     """What some samples say of the unknown offset of a contact sensor's channel.
 
     Attributes:
@@ -59,12 +59,12 @@ class UnloadedChannel:
         return columns, torch.tensor([row], dtype=like.dtype, device=like.device) / self.deviation
 
 
-def unloaded_channels(builder: RowBuilder, samples: Samples) -> Iterator[UnloadedChannel]:
+def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator[UnloadedOffsetEquation]:
     """What the readings in the air among some samples of a log say of every offset that is unknown."""
     if samples.unloaded is None:
         return
     scales = {x.contact: number for number, x in enumerate(builder.extras) if x.what == "scale" and x.contact}
-    noise = builder.sensors.noise.wrench.tolist()
+    noise = builder.sensors.noise.wrench_std.tolist()
     for number, extra in enumerate(builder.extras):
         if extra.what != "offset" or extra.contact is None:
             continue
@@ -74,10 +74,10 @@ def unloaded_channels(builder: RowBuilder, samples: Samples) -> Iterator[Unloade
         if len(y) < _FEWEST:
             continue
         if _gated(y):
-            yield UnloadedChannel(number, None, gated=True)
+            yield UnloadedOffsetEquation(number, None, gated=True)
         else:
             mean, deviation = _mean(y, noise[axis], samples.oversampling)
-            yield UnloadedChannel(number, scales.get(extra.contact), False, mean, deviation)
+            yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)
 
 
 def _gated(y: Tensor) -> bool:
@@ -94,13 +94,13 @@ def _mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
     return float(y.mean()), max(noise**2 / len(y), seen) ** 0.5
 
 
-Weighing = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
+RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
 _Key = tuple[str, State, int, bool]
 
 
 @dataclass
 class Part:
-    """What is kept of the samples of one log, by its source, in one contact state and one fold (see `in_folds`).
+    """What is kept of the samples of one log, by its source, in one contact state and one fold.
 
     Equations of sensors whose contact is in the air are in a part of their own, `unloaded`, which counts no samples;
     `gated`: numbers, among the extras, of the offsets that have none because the readings there are exactly 0.
@@ -124,9 +124,9 @@ def compress(
 ) -> TriangularFactor:
     """Stream all samples of some logs into one triangular factor.
 
-    Args: as `over_chunks`.
+    Args: as `map_chunks`.
     """
-    return merged(compress_by_state(logs, builder, chunk, threads, progress).values(), builder)
+    return merge_factors(compress_by_state(logs, builder, chunk, threads, progress).values(), builder)
 
 
 def compress_by_state(
@@ -137,8 +137,8 @@ def compress_by_state(
     progress: ProgressCallback | None = None,
 ) -> dict[State, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
-    found = over_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
-    return {part.state: part.factor for part in _together(found)}
+    found = map_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
+    return {part.state: part.factor for part in _merge_parts(found)}
 
 
 def compress_parts(
@@ -147,22 +147,22 @@ def compress_parts(
     chunk: int = CHUNK,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
-    weigh: Weighing | None = None,
+    weight_rows: RowWeighting | None = None,
 ) -> list[Part]:
     """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
 
     Logs of one source count as one. Unknown offsets of contact sensors have further parts: readings in the air.
-    `weigh` may change other rows before they are added: called with the samples they come from, their columns and
+    `weight_rows` may change other rows before they are added: called with the samples they come from, their columns and
     themselves.
     """
-    fold = partial(_fold, builder, by_log=True, weigh=weigh)
-    parts = _together(over_chunks(logs, builder, fold, chunk, threads, progress))
+    fold = partial(_fold, builder, by_log=True, weight_rows=weight_rows)
+    parts = _merge_parts(map_chunks(logs, builder, fold, chunk, threads, progress))
     order = list(dict.fromkeys(samples.source for samples in logs))
     return sorted(parts, key=lambda part: order.index(part.source))
 
 
 def _fold(
-    builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weigh: Weighing | None = None
+    builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weight_rows: RowWeighting | None = None
 ) -> list[Part]:
     """Parts of some chunks, all logs together unless `by_log`."""
     parts: dict[_Key, Part] = {}
@@ -176,9 +176,9 @@ def _fold(
         own = part(samples, state, False)
         own.samples += len(samples)
         for support, rows in builder.rows(samples, state, workspace):
-            weighed = rows if weigh is None else weigh(samples, support, rows)
-            own.factor.add(support, weighed, samples.oversampling)
-        for channel in unloaded_channels(builder, samples):
+            weighted = rows if weight_rows is None else weight_rows(samples, support, rows)
+            own.factor.add(support, weighted, samples.oversampling)
+        for channel in unloaded_offset_equations(builder, samples):
             of_air = part(samples, state, True)
             if channel.gated:
                 of_air.gated.add(channel.offset)
@@ -188,7 +188,7 @@ def _fold(
 
 
 @one_thread()
-def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
+def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
     """The parts that workers have made of their chunks."""
     total: dict[_Key, Part] = {}
     for part in chain.from_iterable(of_workers):
@@ -201,7 +201,7 @@ def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
 
 
 @one_thread()
-def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
+def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
     """The factor of all that some factors have seen."""
     out = TriangularFactor(builder.width)
     for factor in factors:
@@ -229,10 +229,10 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     """
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
-    return posed(factor.triangle().numpy(), factor.rows, factor.oversampling, builder, robot, friction)
+    return problem_from_triangle(factor.triangle().numpy(), factor.rows, factor.oversampling, builder, robot, friction)
 
 
-def posed(
+def problem_from_triangle(
     R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool = True
 ) -> LinearProblem:
     """The problem of a triangular factor in the regrouped columns, right-hand side last.
@@ -247,7 +247,7 @@ def posed(
     """
     count = builder.columns.count
     return LinearProblem(
-        A=R[:count, :-1] @ builder.columns.from_parameters(),
+        A=R[:count, :-1] @ builder.columns.parameter_map(),
         b=R[:count, -1],
         residual=float(np.square(R[count:, -1]).sum()),
         rows=rows,
@@ -265,7 +265,7 @@ _LEAST = 20  # independent samples a block: what neighbours share through a filt
 _MEMORY = 2**30  # bytes of factors
 
 
-def in_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
+def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
     """The logs in order, cut into blocks contiguous in time that know their fold.
 
     Errors of successive samples are alike, so that samples drawn at random would judge a fit by what it has seen. A log
@@ -292,19 +292,19 @@ def in_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
 
 def _count(logs: Sequence[Samples], builder: RowBuilder) -> int:
     independent = sum(len(log) / log.oversampling for log in logs)
-    states: set[tuple[str, State]] = {(log.source, state) for log in logs for state, _ in by_state(log)}
+    states: set[tuple[str, State]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
     size = 8 * (builder.width + 1) ** 2 * max(len(states), 1) * worker_count(builder.device)
     return max(1, min(FOLDS, int(independent / _LEAST), _MEMORY // size))
 
 
 @one_thread()
-def states_together(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
     """One part for each log and fold, its contact states together; equations in the air stay apart."""
     return _folded(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
 
 
 @one_thread()
-def folds_together(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
     """One part for each log and contact state, its folds together; equations in the air stay apart."""
     return _folded(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
 

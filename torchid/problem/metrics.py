@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from torchid.parameters import Array
-from torchid.problem.chunks import ProgressCallback, over_chunks
+from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import State
 from torchid.problem.extras import ExtraTerms
-from torchid.problem.predict import forces
+from torchid.problem.predict import measured_and_predicted
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
@@ -111,7 +111,9 @@ class ForceSums:
         return float(force), float(moment)
 
 
-def projected(builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor) -> Iterator[torch.Tensor]:
+def null_space_components(
+    builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor
+) -> Iterator[torch.Tensor]:
     """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
 
     Joints away from contacts pass unchanged.
@@ -119,17 +121,17 @@ def projected(builder: RowBuilder, samples: Samples, state: State, vectors: torc
     layout, base = builder.layout(state), builder.tree.base_rows
     coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
     uncoupled = [base + joint for joint in layout.uncoupled_joints]
-    for index, V in builder.bases(samples, state):
+    for index, V in builder.null_space_bases(samples, state):
         these = vectors[:, index]
         yield torch.cat([(V.mT @ these[..., coupled, None])[..., 0], these[..., uncoupled]], dim=2)
 
 
-def figure(x: float) -> float | None:
+def finite_or_none(x: float) -> float | None:
     """A number, or None where there is none."""
     return float(x) if np.isfinite(x) else None
 
 
-GROUPS = {
+ROW_GROUPS = {
     "joint_torque": "joint torque [N m]",
     "base_force": "base force [N]",
     "base_moment": "base moment [N m]",
@@ -137,7 +139,7 @@ GROUPS = {
 }
 """Groups of rows that errors are given for, with a name and unit to show."""
 
-SHOWN = GROUPS | {WHITENED: "whitened [x noise]"}
+ERROR_GROUPS = ROW_GROUPS | {WHITENED: "whitened [x noise]"}
 """Those, and the whitened projected residual of a fit's own rows, which there is with any sensors."""
 
 LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
@@ -152,14 +154,14 @@ BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis
 
 def group_name(group: str) -> str:
     """Name of a group of rows, without its unit."""
-    return SHOWN[group].split(" [")[0]
+    return ERROR_GROUPS[group].split(" [")[0]
 
 
 @dataclass(frozen=True)
 class Metrics:
     """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
 
-    `rms` and `relative` by group of `SHOWN`, the last in units of the stated noise; `by_joint_rms` and
+    `rms` and `relative` by group of `ERROR_GROUPS`, the last in units of the stated noise; `by_joint_rms` and
     `by_joint_relative` by joint. Relative means rms of the error over
     rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
     the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
@@ -182,7 +184,7 @@ class Metrics:
             ("rms_relative", self.relative, self.by_joint_relative, self.limb_relative),
         ):
             out |= {f"{group}_{suffix}": x for group, x in limbs.items()}
-            for group in GROUPS:
+            for group in ROW_GROUPS:
                 out[f"{group}_{suffix}"] = groups[group]
                 if group == "joint_torque":
                     out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
@@ -202,7 +204,7 @@ class Evaluation:
         self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
 
     def metrics(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[Metrics]:
-        """One `Metrics` per row of `phi`, as `RowBuilder.columns_of`, over all samples of the logs together.
+        """One `Metrics` per row of `phi`, as `RowBuilder.to_columns`, over all samples of the logs together.
 
         Without the whitened projected residual, which depends on sensors.
         """
@@ -212,21 +214,21 @@ class Evaluation:
     def sums(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[ForceSums]:
         """Of the measured forces, then of the errors of each row of `phi`."""
         builder = self.builder
-        columns = builder.columns_of(phi)
+        columns = builder.to_columns(phi)
 
         def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
-                found = forces(builder, samples, state, columns)
+                found = measured_and_predicted(builder, samples, state, columns)
                 for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
                     total.rows.add(predicted - found.measured)
                 vectors = torch.cat([found.torque[None], found.predicted - found.torque])
-                for group in projected(builder, samples, state, vectors):
+                for group in null_space_components(builder, samples, state, vectors):
                     for total, inside in zip(sums, group, strict=True):
                         total.projected.add(inside.flatten()[:, None])
             return sums
 
-        parts = over_chunks(logs, builder, fold, progress=progress)
+        parts = map_chunks(logs, builder, fold, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
     def summary(self, measured: ForceSums, errors: ForceSums) -> Metrics:
@@ -235,15 +237,15 @@ class Evaluation:
         rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
         joints = slice(base, base + self.robot.n)
         by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
-        groups = SHOWN if errors.whitened.count.any() else GROUPS
+        groups = ERROR_GROUPS if errors.whitened.count.any() else ROW_GROUPS
         names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
         return Metrics(
-            {group: figure(rms[group]) for group in groups},
+            {group: finite_or_none(rms[group]) for group in groups},
             {group: _ratio(rms[group], size[group]) for group in groups},
-            {name: figure(x) for name, x in zip(names, by_joint, strict=True)},
+            {name: finite_or_none(x) for name, x in zip(names, by_joint, strict=True)},
             {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
             _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
-            {group: figure(rms[group]) for group in limbs},
+            {group: finite_or_none(rms[group]) for group in limbs},
             {group: _ratio(rms[group], size[group]) for group in limbs},
         )
 
@@ -252,7 +254,7 @@ def _ratio(x: float, y: float) -> float | None:
     return float(x / y) if np.isfinite(x) and y > 0.0 else None
 
 
-JUDGED = ("joint_torque", "base_force", "base_moment", WHITENED)
+DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", WHITENED)
 """Groups of rows that decide; what is projected without whitening repeats them."""
 
 _CLEARLY = 1.05  # ratio of errors: what is closer is as good
@@ -260,7 +262,7 @@ _MATTERS = 1e-3  # share of the measured: two models that leave less, as on data
 
 
 @dataclass(frozen=True)
-class Worse:
+class WorseThanNominal:
     """A group of rows on a set of logs in which the URDF's parameters predict better, with both errors."""
 
     logs: str
@@ -269,19 +271,19 @@ class Worse:
     identified: float
 
     def __str__(self) -> str:
-        return described(self.group, self.identified, self.nominal) or self.group
+        return describe_errors(self.group, self.identified, self.nominal) or self.group
 
 
-def described(group: str, identified: float | None, nominal: float | None) -> str | None:
+def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:
     """Both errors of a group of rows in words, None where it has none."""
     if identified is None or nominal is None:
         return None
-    unit = SHOWN[group].split("[")[1].rstrip("]")
+    unit = ERROR_GROUPS[group].split("[")[1].rstrip("]")
     name = "whitened projected residual" if group == WHITENED else group_name(group)
     return f"{name} {identified:.3g} against {nominal:.3g} {unit}"
 
 
-def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Worse]:
+def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[WorseThanNominal]:
     """Groups of rows where identified parameters are clearly worse than nominal ones.
 
     Args:
@@ -289,18 +291,18 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
     """
     found = []
     for logs, (nominal, identified) in sets.items():
-        for group in JUDGED:
+        for group in DECISIVE_GROUPS:
             before, after = nominal.rms.get(group), identified.rms.get(group)
             if before is None or after is None:
                 continue
             share = identified.relative.get(group)
             measured = after / share if share else 0.0
             if after > _CLEARLY * before and after - before > _MATTERS * measured:
-                found.append(Worse(logs, group, before, after))
+                found.append(WorseThanNominal(logs, group, before, after))
     return found
 
 
-def verdict(found: list[Worse]) -> str | None:
+def describe_worse(found: list[WorseThanNominal]) -> str | None:
     """One line of what is worse, None if nothing is."""
     if not found:
         return None

@@ -106,7 +106,7 @@ class BodyStates:
     angular_acceleration: Tensor
     specific_force: Tensor
 
-    def run(self, start: int, end: int) -> BodyStates:
+    def slice_bodies(self, start: int, end: int) -> BodyStates:
         """The states of consecutive bodies, a view."""
         return BodyStates(*(x[..., start:end, :] for x in vars(self).values()))
 

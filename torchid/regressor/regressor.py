@@ -48,7 +48,7 @@ def joint_rows(tree: KinematicTree, layout: ColumnLayout) -> list[JointRow]:
     return rows
 
 
-def joint_directions(tree: KinematicTree, states: BodyStates) -> Tensor:
+def joint_screw_axes(tree: KinematicTree, states: BodyStates) -> Tensor:
     """Screw axes of all joints, (6, L, B): `direction . wrench at the base origin` is the torque about the joint."""
     axis = states.rotation[:, 2]
     linear = cross_product(states.position, axis) * tree.revolute + axis * tree.prismatic
@@ -68,7 +68,7 @@ def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | N
     for kept, bodies in layout.runs():
         if kept:
             columns = out[:, layout.starts[bodies.start] : layout.starts[bodies.stop]]
-            wrench_columns(states.run(bodies.start, bodies.stop), kept, columns.unflatten(1, (-1, len(kept))))
+            wrench_columns(states.slice_bodies(bodies.start, bodies.stop), kept, columns.unflatten(1, (-1, len(kept))))
     return out
 
 
@@ -154,7 +154,7 @@ class Regressor(nn.Module):
         tree, layout = self.tree, self._layout
         joints = joint_motion(tree, motion)
         states = body_states(tree, motion, joints)
-        directions = joint_directions(tree, states)
+        directions = joint_screw_axes(tree, states)
         wrenches = all_wrench_columns(link_states(tree, states), layout)
         K = wrenches.new_zeros(tree.base_rows + len(self._rows), tree.n_nodes, parameters.PER_BODY, wrenches.shape[-1])
         inertial = K[:, :, parameters.INERTIAL]

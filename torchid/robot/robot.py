@@ -15,7 +15,7 @@ from yourdfpy.urdf import Inertial, Link
 
 from torchid import parameters
 from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError, during
-from torchid.parameters import COMPONENTS, Array
+from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.robot.chain import JointGeometry, build_chain, joint_geometry, link_poses
 from torchid.robot.tree import BodyJoint, BodyTree, build_tree
 from torchid.robot.urdf import read_urdf
@@ -108,10 +108,10 @@ class Robot:
 
         Such a sensor counts as six motionless degrees of freedom whose generalized force is measured.
         """
-        return (*self.joint_names, *(f"{name}.{k}" for name in self.ft_names for k in COMPONENTS))
+        return (*self.joint_names, *(f"{name}.{k}" for name in self.ft_names for k in WRENCH_COMPONENTS))
 
     @property
-    def dofs(self) -> int:
+    def n_dofs(self) -> int:
         """Number of `dof_names`, n + 6 F."""
         return len(self.dof_names)
 
@@ -133,7 +133,7 @@ class Robot:
     @property
     def n_rows(self) -> int:
         """Rows of K: those of the base, then one for each of `dof_names`; nv + 6 F."""
-        return self.base_rows + self.dofs
+        return self.base_rows + self.n_dofs
 
     @property
     def body_names(self) -> tuple[str, ...]:

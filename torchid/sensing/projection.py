@@ -79,20 +79,27 @@ def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
 
 
 def whitened_null_space(
-    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor
+    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor, axes: Tensor | None = None
 ) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Bases W of the null spaces of A under which the projected sensor noise is white, grouped by rank.
 
     Args:
-        A: (B, k, m).
-        row_std: (m,), > 0, noise of the generalized force itself (torque sensors, floor of the base rows).
+        A: (B, k, m), with `axes` the six base rows of the generalized force first.
+        row_std: (m,), > 0, noise of the generalized force itself (torque sensors, floor of the base rows) [N, N m].
         J_m: (B, k_m, m), rows of the contact Jacobian whose wrench component is measured.
-        wrench_std: (k_m,), noise of each measured wrench component.
+        wrench_std: (k_m,), noise of each measured wrench component [N, N m].
+        axes: (B, 3, 3), columns are the unit vectors in the base frame that the base rows of `row_std` are along; None:
+            the base's own axes.
 
     Yields:
         (index of the samples, W): W is (B', m, m - rank) with `A @ W = 0` and `W^T S W = I`, where S, the covariance of
         the generalized force, is `diag(row_std^2) + J_m^T diag(wrench_std^2) J_m`. Gradients as in `null_space`.
     """
+    if axes is not None:
+        axes = axes.detach()
+        for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std):
+            yield index, _along(W.mT, axes[index].mT).mT
+        return
     for index, V in null_space(A / row_std):
         W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
         if len(wrench_std):
@@ -101,26 +108,6 @@ def whitened_null_space(
             L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
             W = torch.linalg.solve_triangular(L, W.mT, upper=False).mT
         yield index, W
-
-
-def levelled_null_space(
-    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor, axes: Tensor | None
-) -> Iterator[tuple[Tensor | slice, Tensor]]:
-    """As `whitened_null_space`, with noise of the base rows along other axes than the base's.
-
-    Args:
-        A: (B, k, m), the six base rows of the generalized force first.
-        row_std: (m,), base rows along `axes`.
-        J_m: (B, k_m, m).
-        wrench_std: (k_m,).
-        axes: (B, 3, 3), columns are unit vectors in the base frame; None: the base's own.
-    """
-    if axes is None:
-        yield from whitened_null_space(A, row_std, J_m, wrench_std)
-        return
-    axes = axes.detach()
-    for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std):
-        yield index, _along(W.mT, axes[index].mT).mT
 
 
 def _along(X: Tensor, axes: Tensor) -> Tensor:

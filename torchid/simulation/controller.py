@@ -79,19 +79,19 @@ class Controller:
 
         turn = np.zeros((3, nv))
         turn[:, 3:6] = np.eye(3)
-        error = turn_between(np.eye(3), plant.base_rotation.T @ goal.base)
+        error = rotation_error(np.eye(3), plant.base_rotation.T @ goal.base)
         tasks.append((_TURN, turn, _servo(error, goal.base_rate[0] - velocity[3:6], goal.base_rate[1])))
 
         for i, foot in enumerate(feet):
             p, v, a = goal.feet[i]
-            off = np.concatenate([p - foot.position, turn_between(foot.rotation, self._rotations[i])])
+            off = np.concatenate([p - foot.position, rotation_error(foot.rotation, self._rotations[i])])
             if goal.load[i] > ALOFT:
                 off[2] = 0.0  # the floor gives way
                 weight, wanted = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
             else:
                 rate = np.concatenate([v, np.zeros(3)]) - foot.velocity
                 weight, wanted = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
-            rows = slice(self._feet[i].held)
+            rows = slice(self._feet[i].constrained)
             tasks.append((weight, foot.J[rows], (wanted - foot.bias)[rows]))
 
         joints = np.zeros((plant.n, nv))
@@ -127,7 +127,7 @@ class Controller:
         return J.T @ force
 
 
-def turn_between(start: Array, end: Array) -> Array:
+def rotation_error(start: Array, end: Array) -> Array:
     """The turn from one rotation to another, (3,): axis in the outer frame times the sine of the angle."""
     R = end @ start.T
     return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
@@ -211,18 +211,18 @@ def _tasks(plant: Plant, feet: Sequence[Foot], targets: Array, rotations: Array)
     jacobians, off = [], []
     for i, (foot, target, R) in enumerate(zip(feet, targets, rotations, strict=True)):
         now = plant.foot(i)
-        jacobians.append(now.J[: foot.held])
-        off.append(np.concatenate([target - now.position, turn_between(now.rotation, R)])[: foot.held])
+        jacobians.append(now.J[: foot.constrained])
+        off.append(np.concatenate([target - now.position, rotation_error(now.rotation, R)])[: foot.constrained])
     level = np.zeros((3, plant.nv))
     level[:, 3:6] = np.eye(3)
     A = np.vstack([*jacobians, plant.inertia[:2] / plant.mass, level])
     above = (targets.mean(axis=0) - plant.com)[:2]
-    return A, np.concatenate([*off, above, turn_between(plant.base_rotation, np.eye(3))])
+    return A, np.concatenate([*off, above, rotation_error(plant.base_rotation, np.eye(3))])
 
 
 def _flattened(R: Array, foot: Foot, source: object) -> Array:
     """The rotation nearest to R that puts all points of the foot at one height."""
-    if foot.held < 6:
+    if foot.constrained < 6:
         return R.copy()
     normal = np.linalg.svd(foot.arms @ R.T)[2][2]
     normal *= np.copysign(1.0, normal[2])

@@ -37,9 +37,9 @@ class Foot:
         return np.array(self.points) - self.middle
 
     @property
-    def held(self) -> int:
+    def constrained(self) -> int:
         """How many of its six velocities the floor can hold: the linear three, and the rest if it stands flat."""
-        return 6 if can_hold(np.array(self.points)) else 3
+        return 6 if form_polygon(np.array(self.points)) else 3
 
 
 def find_feet(settings: list[FootConfig], urdf: Path, source: object) -> tuple[Foot, ...]:
@@ -77,7 +77,7 @@ def find_feet(settings: list[FootConfig], urdf: Path, source: object) -> tuple[F
     return tuple(feet)
 
 
-def can_hold(points: Array) -> bool:
+def form_polygon(points: Array) -> bool:
     """Whether contact points, (k, 3) [m], do not all lie on a line."""
     return len(points) > 2 and float(np.linalg.svd(points - points.mean(axis=0))[1][1]) > _NARROWEST
 
