@@ -18,97 +18,13 @@ from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
 Task = TypeVar("Task")
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run the block with one intra-op thread, of torch and of NumPy's linear algebra.
-
-    These arrays are too small to split: on a busy two-core machine two threads made evaluation eight times slower, and
-    a consistent estimate three times.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with _pools().limit(limits=1, user_api="blas"):
-            yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@cache
-def _pools() -> ThreadpoolController:
-    return ThreadpoolController()
-
-
-def worker_count(device: torch.device) -> int:
-    """Workers that suit a device: one per thread torch would use on a CPU, one for a GPU."""
-    return torch.get_num_threads() if device.type == "cpu" else 1
-
-
-def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
-    """Results of `run`, one per worker, each called without gradients on every n-th task.
-
-    A failure or an interrupt stops all workers at their next task.
-    """
-    stop = threading.Event()
-
-    def alone(first: int) -> Result:
-        torch.set_num_threads(1)
-        with torch.no_grad(), stopping():
-            return run(task for task in tasks[first::workers] if not stop.is_set())
-
-    @contextmanager
-    def stopping() -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            stop.set()
-            raise
-
-    with one_thread():
-        if workers == 1:
-            return [alone(0)]
-        with ThreadPoolExecutor(workers) as pool, stopping():
-            return list(pool.map(alone, range(workers)))
-
-
-CHUNK = 2048
-"""Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
+Result = TypeVar("Result")
 
 ProgressCallback = Callable[[int], None]
 """Called with the number of samples, or of other steps, done since the last call."""
 
-Result = TypeVar("Result")
-
-
-def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slice | torch.Tensor]]:
-    """Chunks of samples that share a contact state: the state and an index into the samples."""
-    active = samples.active.cpu().numpy()
-    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
-    keys = packed.view(f"V{packed.shape[1]}")[:, 0]
-    found, first = np.unique(keys, return_index=True)
-    for key, example in zip(found, first, strict=True):
-        if len(found) == 1:
-            pieces: Iterable[slice | torch.Tensor] = (slice(i, i + chunk) for i in range(0, len(active), chunk))
-        else:
-            pieces = torch.from_numpy(np.flatnonzero(keys == key)).split(chunk)
-        for piece in pieces:
-            yield tuple(active[example].tolist()), piece
-
-
-def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
-    """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
-    found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
-    for samples in logs:
-        every = torch.arange(len(samples))
-        for state, index in chunks_by_state(samples):
-            found.setdefault(state, []).append((samples, every[index]))
-    for state, pieces in found.items():
-        total = sum(len(index) for _, index in pieces)
-        for samples, index in pieces:
-            share = min(len(index), max(1, round(count * len(index) / total)))
-            yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
+CHUNK = 2048
+"""Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
 
 
 def map_chunks(
@@ -147,3 +63,85 @@ def map_chunks(
                     progress(len(piece))
 
     return run_in_workers(tasks, run, threads or worker_count(builder.device))
+
+
+def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slice | torch.Tensor]]:
+    """Chunks of samples that share a contact state: the state and an index into the samples."""
+    active = samples.active.cpu().numpy()
+    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
+    keys = packed.view(f"V{packed.shape[1]}")[:, 0]
+    found, first = np.unique(keys, return_index=True)
+    for key, example in zip(found, first, strict=True):
+        if len(found) == 1:
+            pieces: Iterable[slice | torch.Tensor] = (slice(i, i + chunk) for i in range(0, len(active), chunk))
+        else:
+            pieces = torch.from_numpy(np.flatnonzero(keys == key)).split(chunk)
+        for piece in pieces:
+            yield tuple(active[example].tolist()), piece
+
+
+def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
+    """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
+    found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
+    for samples in logs:
+        every = torch.arange(len(samples))
+        for state, index in chunks_by_state(samples):
+            found.setdefault(state, []).append((samples, every[index]))
+    for state, pieces in found.items():
+        total = sum(len(index) for _, index in pieces)
+        for samples, index in pieces:
+            share = min(len(index), max(1, round(count * len(index) / total)))
+            yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
+
+
+def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
+    """Results of `run`, one per worker, each called without gradients on every n-th task.
+
+    A failure or an interrupt stops all workers at their next task.
+    """
+    stop = threading.Event()
+
+    def alone(first: int) -> Result:
+        torch.set_num_threads(1)
+        with torch.no_grad(), stopping():
+            return run(task for task in tasks[first::workers] if not stop.is_set())
+
+    @contextmanager
+    def stopping() -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            stop.set()
+            raise
+
+    with one_thread():
+        if workers == 1:
+            return [alone(0)]
+        with ThreadPoolExecutor(workers) as pool, stopping():
+            return list(pool.map(alone, range(workers)))
+
+
+def worker_count(device: torch.device) -> int:
+    """Workers that suit a device: one per thread torch would use on a CPU, one for a GPU."""
+    return torch.get_num_threads() if device.type == "cpu" else 1
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run the block with one intra-op thread, of torch and of NumPy's linear algebra.
+
+    These arrays are too small to split: on a busy two-core machine two threads made evaluation eight times slower, and
+    a consistent estimate three times.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with _pools().limit(limits=1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@cache
+def _pools() -> ThreadpoolController:
+    return ThreadpoolController()

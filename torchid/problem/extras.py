@@ -11,24 +11,6 @@ from torchid.parameters import WRENCH_COMPONENTS
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
-
-def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
-    """Recorded components (C, 6) that the measured ones are computed from: along world axes, whole vectors."""
-    measured = measured_components(contacts, sensors)
-    if not in_world:
-        return measured
-    whole = measured.reshape(-1, 2, 3).any(axis=2)
-    return np.repeat(whole, 3, axis=1)
-
-
-def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
-    """Measured components (C, 6) that the contacts can exert, along the frames' axes."""
-    possible = np.zeros((len(contacts), 6), dtype=bool)
-    for index, contact in enumerate(contacts):
-        possible[index, list(contact.components)] = True
-    return possible & sensors.wrench
-
-
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
 """Kinds of sensor channels, as `SensorNoise` has them."""
 
@@ -128,3 +110,20 @@ def _channels(
     for place, k in np.argwhere(recorded_components(contacts, sensors, in_world=True)).tolist():
         kind = "contact_force" if k < 3 else "contact_moment"
         yield kind, contacts[place].frame, WRENCH_COMPONENTS[k], None, (place, k)
+
+
+def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
+    """Measured components (C, 6) that the contacts can exert, along the frames' axes."""
+    possible = np.zeros((len(contacts), 6), dtype=bool)
+    for index, contact in enumerate(contacts):
+        possible[index, list(contact.components)] = True
+    return possible & sensors.wrench
+
+
+def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
+    """Recorded components (C, 6) that the measured ones are computed from: along world axes, whole vectors."""
+    measured = measured_components(contacts, sensors)
+    if not in_world:
+        return measured
+    whole = measured.reshape(-1, 2, 3).any(axis=2)
+    return np.repeat(whole, 3, axis=1)

@@ -22,115 +22,6 @@ from torchid.text import listed
 WHITENED = "projected_residual"
 """The group of the rows that a fit sees: whitened, and projected so that nothing unmeasured is in them."""
 
-
-class Squares:
-    """Sums and sums of squares by row, over the samples where the row is known."""
-
-    def __init__(self, rows: int) -> None:
-        """Start empty."""
-        self.plain, self.sum, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
-
-    def add(self, x: torch.Tensor, weight: float = 1.0) -> None:
-        """Add samples (N, rows), NaN where unknown, each of which stands for so many."""
-        values = x.cpu().numpy()
-        known = np.isfinite(values)
-        values = np.where(known, values, 0.0)
-        self.plain += weight * values.sum(0)
-        self.sum += weight * np.square(values).sum(0)
-        self.count += weight * known.sum(0)
-
-    def add_squares(self, squares: float, count: int) -> None:
-        """Add one row's sum of squares over so many samples, of whose mean nothing is known."""
-        self.sum += squares
-        self.count += count
-
-    def rms(self, rows: slice = slice(None)) -> Array:
-        """Row by row."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.sqrt(self.sum[rows] / self.count[rows])
-
-    def pooled(self, rows: slice) -> float:
-        """Rms over all components of some rows."""
-        count = self.count[rows].sum()
-        return float(np.sqrt(self.sum[rows].sum() / count)) if count else np.nan
-
-    def deviation(self, rows: slice) -> float:
-        """Rms about the mean of each row, over all of them."""
-        known = self.count[rows] > 0
-        count, plain = self.count[rows][known], self.plain[rows][known]
-        if not len(count):
-            return np.nan
-        return float(np.sqrt(max((self.sum[rows][known] - plain**2 / count).sum(), 0.0) / count.sum()))
-
-    def merge(self, other: Squares) -> None:
-        """Add what another has seen."""
-        self.plain += other.plain
-        self.sum += other.sum
-        self.count += other.count
-
-
-class ForceSums:
-    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space.
-
-    `whitened`: of the rows that a fit sees, V_x^T f of its sensors in units of their noise.
-    """
-
-    def __init__(self, n_rows: int) -> None:
-        """Start empty."""
-        self.rows, self.projected, self.whitened = Squares(n_rows), Squares(1), Squares(1)
-
-    @classmethod
-    def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
-        """Of all parts together."""
-        out = cls(len(parts[0].rows.sum))
-        for part in parts:
-            out.rows.merge(part.rows)
-            out.projected.merge(part.projected)
-            out.whitened.merge(part.whitened)
-        return out
-
-    def rms(self, base_rows: int, n: int) -> dict[str, float]:
-        """By group of rows, NaN where there are none, of a robot with so many base rows and joints."""
-        joints = self.rows.rms(slice(base_rows, base_rows + n))
-        force, moment = self._in_limbs(base_rows + n)
-        return {
-            "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
-            "base_force": self.rows.pooled(slice(0, 3)) if base_rows else np.nan,
-            "base_moment": self.rows.pooled(slice(3, 6)) if base_rows else np.nan,
-            "ft_force": force,
-            "ft_moment": moment,
-            "nullspace": self.projected.pooled(slice(None)),
-            WHITENED: self.whitened.pooled(slice(None)),
-        }
-
-    def _in_limbs(self, first: int) -> tuple[float, float]:
-        """Of forces and of moments of the sensors in limbs."""
-        squares, count = (x[first:].reshape(-1, 2, 3).sum((0, 2)) for x in (self.rows.sum, self.rows.count))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            force, moment = np.sqrt(squares / count)
-        return float(force), float(moment)
-
-
-def null_space_components(
-    builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor
-) -> Iterator[torch.Tensor]:
-    """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
-
-    Joints away from contacts pass unchanged.
-    """
-    layout, base = builder.layout(state), builder.tree.base_rows
-    coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
-    uncoupled = [base + joint for joint in layout.uncoupled_joints]
-    for index, V in builder.null_space_bases(samples, state):
-        these = vectors[:, index]
-        yield torch.cat([(V.mT @ these[..., coupled, None])[..., 0], these[..., uncoupled]], dim=2)
-
-
-def finite_or_none(x: float) -> float | None:
-    """A number, or None where there is none."""
-    return float(x) if np.isfinite(x) else None
-
-
 ROW_GROUPS = {
     "joint_torque": "joint torque [N m]",
     "base_force": "base force [N]",
@@ -151,10 +42,17 @@ SETS = ("train", "test")
 BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")
 """Names of the six base rows."""
 
+DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", WHITENED)
+"""Groups of rows that decide; what is projected without whitening repeats them."""
 
-def group_name(group: str) -> str:
-    """Name of a group of rows, without its unit."""
-    return ERROR_GROUPS[group].split(" [")[0]
+ADVICE = (
+    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge (auto "
+    "chooses one), or record more and other motion"
+)
+"""What to do about it."""
+
+_CLEARLY = 1.05  # ratio of errors: what is closer is as good
+_MATTERS = 1e-3  # share of the measured: two models that leave less, as on data without noise, are equally good
 
 
 @dataclass(frozen=True)
@@ -250,39 +148,6 @@ class Evaluation:
         )
 
 
-def _ratio(x: float, y: float) -> float | None:
-    return float(x / y) if np.isfinite(x) and y > 0.0 else None
-
-
-DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", WHITENED)
-"""Groups of rows that decide; what is projected without whitening repeats them."""
-
-_CLEARLY = 1.05  # ratio of errors: what is closer is as good
-_MATTERS = 1e-3  # share of the measured: two models that leave less, as on data without noise, are equally good
-
-
-@dataclass(frozen=True)
-class WorseThanNominal:
-    """A group of rows on a set of logs in which the URDF's parameters predict better, with both errors."""
-
-    logs: str
-    group: str
-    nominal: float
-    identified: float
-
-    def __str__(self) -> str:
-        return describe_errors(self.group, self.identified, self.nominal) or self.group
-
-
-def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:
-    """Both errors of a group of rows in words, None where it has none."""
-    if identified is None or nominal is None:
-        return None
-    unit = ERROR_GROUPS[group].split("[")[1].rstrip("]")
-    name = "whitened projected residual" if group == WHITENED else group_name(group)
-    return f"{name} {identified:.3g} against {nominal:.3g} {unit}"
-
-
 def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[WorseThanNominal]:
     """Groups of rows where identified parameters are clearly worse than nominal ones.
 
@@ -302,6 +167,19 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
     return found
 
 
+@dataclass(frozen=True)
+class WorseThanNominal:
+    """A group of rows on a set of logs in which the URDF's parameters predict better, with both errors."""
+
+    logs: str
+    group: str
+    nominal: float
+    identified: float
+
+    def __str__(self) -> str:
+        return describe_errors(self.group, self.identified, self.nominal) or self.group
+
+
 def describe_worse(found: list[WorseThanNominal]) -> str | None:
     """One line of what is worse, None if nothing is."""
     if not found:
@@ -311,8 +189,127 @@ def describe_worse(found: list[WorseThanNominal]) -> str | None:
     return f"the identified parameters predict worse than the URDF's, {told}"
 
 
-ADVICE = (
-    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge (auto "
-    "chooses one), or record more and other motion"
-)
-"""What to do about it."""
+def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:
+    """Both errors of a group of rows in words, None where it has none."""
+    if identified is None or nominal is None:
+        return None
+    unit = ERROR_GROUPS[group].split("[")[1].rstrip("]")
+    name = "whitened projected residual" if group == WHITENED else group_name(group)
+    return f"{name} {identified:.3g} against {nominal:.3g} {unit}"
+
+
+def group_name(group: str) -> str:
+    """Name of a group of rows, without its unit."""
+    return ERROR_GROUPS[group].split(" [")[0]
+
+
+def null_space_components(
+    builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor
+) -> Iterator[torch.Tensor]:
+    """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
+
+    Joints away from contacts pass unchanged.
+    """
+    layout, base = builder.layout(state), builder.tree.base_rows
+    coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
+    uncoupled = [base + joint for joint in layout.uncoupled_joints]
+    for index, V in builder.null_space_bases(samples, state):
+        these = vectors[:, index]
+        yield torch.cat([(V.mT @ these[..., coupled, None])[..., 0], these[..., uncoupled]], dim=2)
+
+
+class ForceSums:
+    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space.
+
+    `whitened`: of the rows that a fit sees, V_x^T f of its sensors in units of their noise.
+    """
+
+    def __init__(self, n_rows: int) -> None:
+        """Start empty."""
+        self.rows, self.projected, self.whitened = Squares(n_rows), Squares(1), Squares(1)
+
+    @classmethod
+    def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
+        """Of all parts together."""
+        out = cls(len(parts[0].rows.sum))
+        for part in parts:
+            out.rows.merge(part.rows)
+            out.projected.merge(part.projected)
+            out.whitened.merge(part.whitened)
+        return out
+
+    def rms(self, base_rows: int, n: int) -> dict[str, float]:
+        """By group of rows, NaN where there are none, of a robot with so many base rows and joints."""
+        joints = self.rows.rms(slice(base_rows, base_rows + n))
+        force, moment = self._in_limbs(base_rows + n)
+        return {
+            "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
+            "base_force": self.rows.pooled(slice(0, 3)) if base_rows else np.nan,
+            "base_moment": self.rows.pooled(slice(3, 6)) if base_rows else np.nan,
+            "ft_force": force,
+            "ft_moment": moment,
+            "nullspace": self.projected.pooled(slice(None)),
+            WHITENED: self.whitened.pooled(slice(None)),
+        }
+
+    def _in_limbs(self, first: int) -> tuple[float, float]:
+        """Of forces and of moments of the sensors in limbs."""
+        squares, count = (x[first:].reshape(-1, 2, 3).sum((0, 2)) for x in (self.rows.sum, self.rows.count))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            force, moment = np.sqrt(squares / count)
+        return float(force), float(moment)
+
+
+class Squares:
+    """Sums and sums of squares by row, over the samples where the row is known."""
+
+    def __init__(self, rows: int) -> None:
+        """Start empty."""
+        self.plain, self.sum, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
+
+    def add(self, x: torch.Tensor, weight: float = 1.0) -> None:
+        """Add samples (N, rows), NaN where unknown, each of which stands for so many."""
+        values = x.cpu().numpy()
+        known = np.isfinite(values)
+        values = np.where(known, values, 0.0)
+        self.plain += weight * values.sum(0)
+        self.sum += weight * np.square(values).sum(0)
+        self.count += weight * known.sum(0)
+
+    def add_squares(self, squares: float, count: int) -> None:
+        """Add one row's sum of squares over so many samples, of whose mean nothing is known."""
+        self.sum += squares
+        self.count += count
+
+    def rms(self, rows: slice = slice(None)) -> Array:
+        """Row by row."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.sqrt(self.sum[rows] / self.count[rows])
+
+    def pooled(self, rows: slice) -> float:
+        """Rms over all components of some rows."""
+        count = self.count[rows].sum()
+        return float(np.sqrt(self.sum[rows].sum() / count)) if count else np.nan
+
+    def deviation(self, rows: slice) -> float:
+        """Rms about the mean of each row, over all of them."""
+        known = self.count[rows] > 0
+        count, plain = self.count[rows][known], self.plain[rows][known]
+        if not len(count):
+            return np.nan
+        return float(np.sqrt(max((self.sum[rows][known] - plain**2 / count).sum(), 0.0) / count.sum()))
+
+    def merge(self, other: Squares) -> None:
+        """Add what another has seen."""
+        self.plain += other.plain
+        self.sum += other.sum
+        self.count += other.count
+
+
+def finite_or_none(x: float) -> float | None:
+    """A number, or None where there is none."""
+    return float(x) if np.isfinite(x) else None
+
+
+def _ratio(x: float, y: float) -> float | None:
+    return float(x / y) if np.isfinite(x) and y > 0.0 else None
