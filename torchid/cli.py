@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchid.fitting.cross_validation import CrossValidation
     from torchid.fitting.noise import NoiseSummary
     from torchid.identifiability.confounding import TotalMass
-    from torchid.problem.metrics import Worse
+    from torchid.problem.metrics import WorseThanNominal
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
@@ -174,17 +174,23 @@ def _print_fit(run: Identification) -> None:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
 
 
-def _print_headline(worse: list[Worse]) -> None:
-    from torchid.problem.metrics import ADVICE, verdict
+def _print_headline(worse: list[WorseThanNominal]) -> None:
+    from torchid.problem.metrics import ADVICE, describe_worse
 
-    for line in (f"WORSE THAN URDF: {verdict(worse)}", f"{ADVICE}; the results are written all the same, status 0"):
+    for line in (
+        f"WORSE THAN URDF: {describe_worse(worse)}",
+        f"{ADVICE}; the results are written all the same, status 0",
+    ):
         print(fill(line, 100, subsequent_indent="  "))
 
 
 def _print_validation(found: CrossValidation) -> None:
-    from torchid.problem.metrics import JUDGED, described
+    from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 
-    texts = (described(group, found.identified.rms.get(group), found.nominal.rms.get(group)) for group in JUDGED)
+    texts = (
+        describe_errors(group, found.identified.rms.get(group), found.nominal.rms.get(group))
+        for group in DECISIVE_GROUPS
+    )
     text = f"held out      each of {found.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
     print(fill(text, 100, subsequent_indent=" " * 14))
 

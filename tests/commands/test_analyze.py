@@ -21,7 +21,7 @@ from torchid.commands.reading import LogReader
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
 from torchid.identifiability.expected_error import ExpectedErrors
-from torchid.problem.metrics import GROUPS
+from torchid.problem.metrics import ROW_GROUPS
 from torchid.report.analysis import SetAccuracy, accuracy_figure, check_lines
 from torchid.report.tree_figure import tree_figure
 from torchid.sensor_planning.check import PostureSummary, StateCheck
@@ -268,7 +268,7 @@ def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
 
 
 def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
-    rms = {group: 0.05 for group in GROUPS}
+    rms = {group: 0.05 for group in ROW_GROUPS}
     expected = ExpectedErrors(rms, rms)
     figure = accuracy_figure({name: SetAccuracy(1, 1, expected, None) for name in ("full", "joints")})
     figure.savefig(io.BytesIO())

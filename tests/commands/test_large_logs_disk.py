@@ -38,7 +38,7 @@ from torchid.logs import read_log
 from torchid.logs.blocks import open_blocks, size_of
 from torchid.logs.spill import Spill, SpillError
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.predict import calibrated
+from torchid.problem.predict import calibrate_readings
 
 IDENTIFY = ("estimator.ridge=0.001", "sensors=joints")
 
@@ -75,7 +75,7 @@ def recalibrated(file: Path, terms: str, *more: str) -> tuple[Samples, Samples]:
     builder = RowBuilder(scene.robot, scene.contacts, scene.sensors, scene.terms)
     samples = LogReader(scene).read(scene.config.logs.train, None)[0]
     values = np.arange(1.0, 1.0 + len(builder.extras))
-    return samples, calibrated(samples, builder.extras, values, builder.tree)
+    return samples, calibrate_readings(samples, builder.extras, values, builder.tree)
 
 
 def test_calibrated_readings_of_a_large_log_stay_on_the_disk_and_those_of_a_small_one_in_memory(

@@ -21,7 +21,7 @@ from torchid.log_checks import without_condemned
 from torchid.log_checks.check import check, excluded
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
-from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.sensing import SensorNoise, named_sensors
 
 SPIKES = (200, 431, 700, 1011)
@@ -37,7 +37,7 @@ def spiked() -> Log:
 
 
 def processed(log: Log) -> Samples:
-    return bind(preprocess(log, CUTOFF), demo_robot(), CONTACTS)
+    return bind_log(preprocess(log, CUTOFF), demo_robot(), CONTACTS)
 
 
 def fitted(samples: Samples) -> Estimate:

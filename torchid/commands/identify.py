@@ -29,7 +29,7 @@ from torchid.identifiability.contributions import Contributions, contributions
 from torchid.identifiability.rank import StateReport, check_base, state_reports
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts
-from torchid.problem.compression import Part, folds_together, in_folds, states_together
+from torchid.problem.compression import Part, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import State, state_name
 from torchid.problem.metrics import SETS
 from torchid.report.tables import progress_bars
@@ -97,7 +97,7 @@ def _prepare(config: ExperimentConfig, source: object, clock: _Clock, bars: Prog
         experiment = with_noise(experiment, noise)
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
-        blocks = in_folds(logs["train"], builder)
+        blocks = split_into_folds(logs["train"], builder)
         parts = _compressed(builder, blocks, bars)
     with clock("ridge"):
         experiment, ridge = _with_ridge(experiment, parts, blocks, builder, conditions, bars)
@@ -136,13 +136,13 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             warn_of_confounded(fit.extras, source)
             warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
-            whole = folds_together(fit.parts, builder)
+            whole = merge_folds(fit.parts, builder)
             alone = _by_state(fitter, whole)
             added = _contributions(experiment, builder, whole, logs["train"], problem, bars)
         with clock("evaluate"):
             fits = (fit, *fitter.fit_without_folds(fit.parts))
             compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
-            scorer, of_blocks = Scorer(evaluation, builder), states_together(fit.parts, builder)
+            scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
             metrics, validation = _metrics(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
         run = Identification(

@@ -18,7 +18,7 @@ from torchid.log_checks.findings import SEVERITIES
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
-from torchid.problem.metrics import ADVICE, Worse, verdict
+from torchid.problem.metrics import ADVICE, WorseThanNominal, describe_worse
 from torchid.robot import Robot
 from torchid.rounding import is_significant
 
@@ -156,7 +156,7 @@ def check_plausible(fit: Fit, scene: Scene) -> TotalMass:
     return mass
 
 
-def check_not_worse(found: list[Worse], scene: Scene) -> None:
+def check_not_worse(found: list[WorseThanNominal], scene: Scene) -> None:
     """Stop where the URDF's parameters predict better and the checks condemn a training log; else say so.
 
     Raises:
@@ -167,7 +167,7 @@ def check_not_worse(found: list[Worse], scene: Scene) -> None:
     """
     if not found:
         return
-    told, advice = verdict(found), ADVICE
+    told, advice = describe_worse(found), ADVICE
     log, finding = next(_findings(scene), (None, None))
     if finding is not None:
         told, advice = f"{told}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice

@@ -36,9 +36,9 @@ from torchid.logs.preprocess import (
 )
 from torchid.logs.spill import Spill
 from torchid.logs.timeline import BLOCK, Timeline
-from torchid.problem import Samples, bind
+from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.samples import check_forces, oversampling
+from torchid.problem.samples import oversampling, require_forces
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -69,7 +69,7 @@ class LargeLog:
         """What reading, preprocessing and binding the log as a whole would give, on the disk.
 
         Raises:
-            InputError: as `read_log`, `preprocess` and `bind` would, or the disk is full.
+            InputError: as `read_log`, `preprocess` and `bind_log` would, or the disk is full.
 
         Warns:
             TorchidWarning: as `preprocess` would.
@@ -128,10 +128,10 @@ class LargeLog:
 
     def _bound(self, log: Log, piece: slice) -> Samples:
         """The samples of a part; errors count from the beginning."""
-        samples = bind(log, self.robot, self.contacts)
+        samples = bind_log(log, self.robot, self.contacts)
         if self.required is not None:
             try:
-                check_forces(samples, self.robot, self.contacts, self.required)
+                require_forces(samples, self.robot, self.contacts, self.required)
             except LogError as error:
                 raise counted_from(piece.start, error) from error
         return samples
@@ -254,7 +254,7 @@ class LogReader:
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
-        samples = bind(log, self.scene.robot, self.scene.contacts, required)
+        samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
         if checked is not None:
             count = len(samples)
             samples = without_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)

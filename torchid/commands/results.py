@@ -25,7 +25,7 @@ from torchid.identifiability.contributions import Contributions
 from torchid.identifiability.rank import StateReport
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, Metrics, Samples
-from torchid.problem.metrics import SETS, WHITENED, Worse, verdict, worse_than_nominal
+from torchid.problem.metrics import SETS, WHITENED, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.predict import force_series
 from torchid.report import identified_urdf, parameters_document
 from torchid.report.figures import (
@@ -95,7 +95,7 @@ class Identification:
         return [asdict(x) | {"body": None if x.body is None else names[x.body]} for x in self.violations]
 
     @cached_property
-    def worse(self) -> list[Worse]:
+    def worse(self) -> list[WorseThanNominal]:
         """Groups of rows where the URDF predicts better, on blocks left out of the fit or on the test logs."""
         sets = {} if self.validation is None else {LEFT_OUT: (self.validation.nominal, self.validation.identified)}
         return worse_than_nominal(sets | ({"test logs": self.metrics["test"]} if "test" in self.metrics else {}))
@@ -200,7 +200,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "cross_validation": _validation_document(run),
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
         "worse_than_nominal": [asdict(one) for one in run.worse],
-        "verdict": verdict(run.worse),
+        "verdict": describe_worse(run.worse),
         "contact_states": run.state_entries(),
         "identifiability": _identifiability_document(run),
         "seconds": run.seconds,
@@ -262,7 +262,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
         if run.validation is not None:
             events.errors(0, {"left_out": run.validation.nominal})
             events.errors(last, {"left_out": run.validation.identified})
-        events.verdict(last, verdict(run.worse) or "nowhere worse than the URDF's parameters")
+        events.verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
         events.fit(last, estimate)
         events.identifiability(
             last, estimate, run.contributions.known, table_text(verdict_counts_table(run.by_state, estimate))

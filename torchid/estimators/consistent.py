@@ -105,7 +105,7 @@ class Consistent(Regularized):
             **(vars(plain) | {"phi": phi, "cost": problem.cost(phi)}),
             objective=solution.objective,
             unconstrained=data.unconstrained,
-            distance=problem.distance(phi, plain.phi),
+            distance=problem.prediction_distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, problem.scale),
             gap=solution.gap,
             certified_gap=certified_gap,

@@ -21,8 +21,8 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import Part
 from torchid.problem.extras import Extra
-from torchid.problem.predict import calibrated
-from torchid.problem.samples import check_forces
+from torchid.problem.predict import calibrate_readings
+from torchid.problem.samples import require_forces
 from torchid.robot import Robot
 from torchid.text import listed
 
@@ -78,7 +78,7 @@ class Calibration:
         if not self.changes_readings:
             return list(logs)
         extras, tree = self.builder.extras, self._on_cpu.tree
-        return [calibrated(log, extras, self._values_for(log), tree) for log in logs]
+        return [calibrate_readings(log, extras, self._values_for(log), tree) for log in logs]
 
     def parameters(self, evaluation: Evaluation) -> Array:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""
@@ -86,7 +86,7 @@ class Calibration:
 
     def columns(self, builder: RowBuilder, log: Samples) -> Tensor:
         """Parameters in a builder's columns for the rows of a log, (width,)."""
-        return builder.columns_of(np.append(self.phi, self._values_for(log))[None])[0]
+        return builder.to_columns(np.append(self.phi, self._values_for(log))[None])[0]
 
     @cached_property
     def _on_cpu(self) -> RowBuilder:
@@ -111,7 +111,7 @@ class Calibration:
         """Extra parameters of a log, with everything else known."""
         builder = self._on_cpu
         try:
-            check_forces(log, self.robot, builder.contacts, builder.sensors)
+            require_forces(log, self.robot, builder.contacts, builder.sensors)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
             warn(message)
@@ -125,7 +125,7 @@ class Calibration:
         def columns(values: Array) -> Tensor:
             extras = np.empty(len(own))
             extras[own], extras[~own] = values, shared
-            return builder.columns_of(np.append(self.phi, extras)[None])[0]
+            return builder.to_columns(np.append(self.phi, extras)[None])[0]
 
         if self.loss is None:
             return solve(compress_parts([log], builder))

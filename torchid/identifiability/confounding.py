@@ -12,7 +12,7 @@ from torchid.estimators import Estimate
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder
 from torchid.problem.chunks import one_thread
-from torchid.problem.compression import Part, merged
+from torchid.problem.compression import Part, merge_factors
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, numerical_rank
@@ -161,7 +161,7 @@ def estimate_extras(
     known, names = Known.of(assembly.problem, rank_tolerance), _names(assembly.problem.free, body_names)
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     shared = next((found for found in assembly.eliminations if not found.log), None)
-    values = zip(assembly.unknowns(estimate.phi), assembly.unknowns(assembly.problem.nominal), strict=True)
+    values = zip(assembly.extras_at(estimate.phi), assembly.extras_at(assembly.problem.nominal), strict=True)
     out = []
     for found, pair in zip(assembly.eliminations, values, strict=True):
         out += _found(found, pair, noise, known, names, shared if found.log else None)
@@ -254,7 +254,9 @@ def disagreements(
     out = []
     for source in dict.fromkeys(part.source for part in parts if part.unloaded):
         own = {(x.extra.what, x.extra.contact): x for x in in_contact if x.log in ("", source)}
-        R = merged((part.factor for part in parts if part.unloaded and part.source == source), builder).triangle()
+        R = merge_factors(
+            (part.factor for part in parts if part.unloaded and part.source == source), builder
+        ).triangle()
         for number, extra in enumerate(builder.extras, start=builder.columns.count):
             column, offset = R[:, number].numpy(), own.get((extra.what, extra.contact))
             if extra.what == "offset" and extra.contact is not None and offset is not None and column.any():
@@ -264,7 +266,7 @@ def disagreements(
                 if scale is not None:
                     expected, variance = expected / (1.0 + scale.value), variance + (read * scale.standard_error) ** 2
                 out.append(Disagreement(extra, source, read, expected, float(np.sqrt(variance))))
-    sensors = builder.sensors.noise.wrench
+    sensors = builder.sensors.noise.wrench_std
     return sorted((x for x in out if x.matters(sensors)), key=lambda x: -x.standard_errors)
 
 

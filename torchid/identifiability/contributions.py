@@ -22,7 +22,7 @@ from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import state_name
-from torchid.problem.elimination import without
+from torchid.problem.elimination import eliminate_columns
 from torchid.rounding import RANK_TOLERANCE, numerical_rank
 
 
@@ -77,7 +77,7 @@ class ScaledParts:
         for i in chosen:
             by_source.setdefault(self.parts[i].source if self.unknowns.of_log else "", []).append(self._factors[i])
         nothing = np.empty((0, self._factors[0].shape[1] - len(self.unknowns.of_log)))
-        found = (without(triangle(np.concatenate(same)), self.unknowns.of_log) for same in by_source.values())
+        found = (eliminate_columns(triangle(np.concatenate(same)), self.unknowns.of_log) for same in by_source.values())
         return triangle(np.concatenate([nothing, *found]))
 
     @cached_property
@@ -87,7 +87,7 @@ class ScaledParts:
 
     def singular_values(self, X: Array) -> Array:
         """Of what X of several logs say of the bodies' parameters, descending."""
-        return np.asarray(np.linalg.svd(without(triangle(X), self.unknowns.of_all), compute_uv=False))
+        return np.asarray(np.linalg.svd(eliminate_columns(triangle(X), self.unknowns.of_all), compute_uv=False))
 
 
 def left_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float) -> list[PartContribution]:

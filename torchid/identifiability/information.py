@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import ProgressCallback, by_state, one_thread, spread_by_state
-from torchid.problem.compression import unloaded_channels
+from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
+from torchid.problem.compression import unloaded_offset_equations
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
 from torchid.rounding import KINEMATIC_TOLERANCE
@@ -47,7 +47,7 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
     `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
     `prior`, (12 L,), 0 where they are known, and extras with that of their size.
     """
-    rigid = triangle((builder.columns.from_parameters() * prior).T).T
+    rigid = triangle((builder.columns.parameter_map() * prior).T).T
     return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
 
 
@@ -201,7 +201,7 @@ def sensor_information(
 
 def _in_the_air(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
     """Contacts, and the information (count, count) that their readings in the air hold on offsets."""
-    for channel in unloaded_channels(builder, samples):
+    for channel in unloaded_offset_equations(builder, samples):
         if not channel.gated and (place := builder.extras[channel.offset].contact):
             columns, row = channel.row(builder)
             wide = row.new_zeros(count)
@@ -211,8 +211,8 @@ def _in_the_air(builder: RowBuilder, samples: Samples, count: int) -> Iterator[t
 
 def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State, float]]:
     """Chunks of about `most` samples, evenly spread over contact states and logs, and how many each stands for."""
-    states = {state for samples in logs for state, _ in by_state(samples)}
-    for samples, state, stands_for in spread_by_state(logs, max(most // max(len(states), 1), 1)):
+    states = {state for samples in logs for state, _ in chunks_by_state(samples)}
+    for samples, state, stands_for in subsample_states(logs, max(most // max(len(states), 1), 1)):
         for start in range(0, len(samples), _CHUNK):
             yield samples[start : start + _CHUNK], state, stands_for
 

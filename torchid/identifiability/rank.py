@@ -16,7 +16,7 @@ from torch import Tensor
 from torchid.errors import BaseLostError, BaseLostWarning, NumericalWarning, warn
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import by_state, one_thread, spread_by_state
+from torchid.problem.chunks import chunks_by_state, one_thread, subsample_states
 from torchid.problem.contact_state import State, state_name
 from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank
 from torchid.sensing.projection import base_rank, base_singular_values
@@ -114,15 +114,15 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
     counts = Counter[State]()
     for samples in logs:
         every = torch.arange(len(samples))
-        for state, index in by_state(samples):
+        for state, index in chunks_by_state(samples):
             counts[state] += len(every[index])
     rows, values, weights = (
         Counter[State](),
         defaultdict[State, list[Tensor]](list),
         defaultdict[State, list[Tensor]](list),
     )
-    for samples, state, weight in spread_by_state(logs, _CHECKED):
-        for _, V in builder.bases(samples.to(builder.device), state):
+    for samples, state, weight in subsample_states(logs, _CHECKED):
+        for _, V in builder.null_space_bases(samples.to(builder.device), state):
             rows[state] = max(rows[state], V.shape[2] + len(builder.layout(state).uncoupled_joints))
             if builder.tree.base_rows:
                 values[state].append(base_singular_values(V).cpu())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray, labels_of
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 
 #: Standard deviations of a normal distribution in one median absolute deviation.
 NORMAL = 1.4826
@@ -119,14 +119,14 @@ def channel_names(log: Log, field: str) -> tuple[str, ...]:
     labels = labels_of(field, log.names)
     array = log.arrays()[field]
     if array.ndim == 3:
-        return tuple(f"{label} {component}" for label in labels for component in COMPONENTS)
+        return tuple(f"{label} {component}" for label in labels for component in WRENCH_COMPONENTS)
     return labels or tuple(AXES[: array.shape[1]] if array.ndim == 2 else ("",))
 
 
 def unit(field: str, name: str) -> str:
     """Unit of a channel, "" for a number without one."""
     component = name.rpartition(" ")[2]
-    if field in UNITS or component not in COMPONENTS:
+    if field in UNITS or component not in WRENCH_COMPONENTS:
         return UNITS.get(field, "")
     return "N" if component.startswith("f") else "N m"
 

@@ -15,8 +15,8 @@ from torchid.log_checks.channels import median_step
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
-from torchid.problem import RowBuilder, Samples, bind
-from torchid.problem.predict import force_series, in_null_space
+from torchid.problem import RowBuilder, Samples, bind_log
+from torchid.problem.predict import force_series, null_space_part
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors
 
@@ -136,7 +136,7 @@ def bound(logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count:
     """
     out = []
     for log in logs:
-        samples = bind(log, robot, contacts)
+        samples = bind_log(log, robot, contacts)
         out.append(samples[torch.linspace(0, len(samples) - 1, min(count // len(logs), len(samples))).long()])
     return out
 
@@ -191,7 +191,7 @@ def _projected_fit(
         vectors[1 + place, :, base + joint] = torque[:, joint]
     ends = np.cumsum([len(part) for part in samples])[:-1]
     parts = np.split(vectors, ends, axis=1)
-    inside = np.concatenate([in_null_space(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
+    inside = np.concatenate([null_space_part(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
     inside = inside[..., rows].reshape(1 + len(joints), -1)
     y, A = inside[0], inside[1:].T
     norms = np.linalg.norm(A, axis=0)

@@ -14,7 +14,7 @@ from torchid.log_checks.model import DIFFERENTIATED_TO_TRY, NOTHING, bound, filt
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import by_state, one_thread
+from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
 from torchid.regressor.kinematics import GRAVITY_WORLD
@@ -60,7 +60,7 @@ class Terms:
 
 def known_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
     """The forces that are known throughout, with what no parameters explain of each kind as their noise."""
-    torque = np.zeros(robot.dofs, bool)
+    torque = np.zeros(robot.n_dofs, bool)
     wrench = np.zeros((len(contacts), 6), bool)
     size = 0.0
     if all(part.torque is not None for part in samples):
@@ -104,7 +104,7 @@ def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples])
     massless = [body.massless for body in robot.bodies]
     scale[massless, parameters.INERTIAL] = 0.0
     kept = scale.flatten() > 0.0
-    return np.asarray((builder.columns.from_parameters() * scale.flatten())[:, kept])
+    return np.asarray((builder.columns.parameter_map() * scale.flatten())[:, kept])
 
 
 @torch.no_grad()
@@ -113,7 +113,7 @@ def rows_of(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArr
     n_rows = builder.tree.n_rows
     rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
     with one_thread():
-        for state, index in by_state(samples):
+        for state, index in chunks_by_state(samples):
             where = index if isinstance(index, slice) else index.numpy()
             found = builder.rows_by_sample(samples[index], state)
             rows[where], W[where] = (x.numpy() for x in found)
@@ -261,13 +261,13 @@ def gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact])
         return None
     builder = RowBuilder(robot, contacts, sensors)
     columns = prior_columns(builder, robot, samples)
-    nominal = builder.columns.from_parameters() @ robot.nominal.flatten()
+    nominal = builder.columns.parameter_map() @ robot.nominal.flatten()
     parts = []
     for part in samples:
         rows, W, equations = rows_of(builder, part)
-        torque = np.zeros((len(part), builder.tree.base_rows + robot.dofs, len(joints)))
+        torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
         for place, joint in enumerate(joints):
-            torque[:, builder.tree.base_rows + joint, place] = builder.torque(part)[:, joint].numpy()
+            torque[:, builder.tree.base_rows + joint, place] = builder.recorded_torque(part)[:, joint].numpy()
         moved = np.concatenate([torque, _about(builder, part, sensors.wrench)], axis=2)
         through = np.einsum("nvr,nvk->nrk", W, moved)
         without = rows[..., -1] - through[..., : len(joints)].sum(axis=2)
@@ -286,10 +286,10 @@ def _about(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> Float
     if not _whole(measured):
         return out
     with torch.no_grad():
-        terms = builder.terms(samples)
+        terms = builder.dynamics(samples)
         J = builder.contact_jacobian(samples).numpy()
         for k in range(len(measured)):
-            force = builder.local_wrench(samples, k, terms)[:, :3].numpy()
+            force = builder.recorded_wrench(samples, k, terms)[:, :3].numpy()
             force = np.where(samples.active[:, k, None].numpy(), force, 0.0)
             for axis in range(3):
                 out[..., axis] += np.einsum("niv,ni->nv", J[:, k, 3:], np.cross(np.eye(3)[axis], force))

@@ -14,7 +14,7 @@ from torchid.errors import FieldError, current_file
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
 from torchid.logs.log import NAMES, SHAPES, VARIANTS, UnknownFieldError, is_quaternion, shape_of
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.text import is_plain, shown
 
 #: The one column of text: the same in every row.
@@ -145,7 +145,7 @@ def components_of(field: str) -> tuple[str, ...]:
     """What the last part of a column's name may be, nothing for fields without components."""
     size = shape_of(field)[-1] if len(shape_of(field)) > 1 else None
     if size == 6:
-        return COMPONENTS
+        return WRENCH_COMPONENTS
     if is_quaternion(field):
         return tuple(field.rpartition("_")[2])
     return ("x", "y", "z") if size == 3 else ()

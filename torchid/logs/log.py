@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import FieldError, LogError, UnknownNameError, about_file
 from torchid.guards import MAX_LETTERS
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.text import is_plain, shown
 
 FloatArray = NDArray[np.float64]
@@ -139,7 +139,7 @@ def place(index: tuple[int, ...], labels: tuple[str, ...]) -> str:
     words = f"sample {index[0]}"
     if len(index) > 1:
         words += f", {labels[index[1]] if labels else f'component {index[1]}'}"
-    return words + (f" {COMPONENTS[index[2]]}" if len(index) > 2 else "")
+    return words + (f" {WRENCH_COMPONENTS[index[2]]}" if len(index) > 2 else "")
 
 
 def check_finite(name: str, values: FloatArray, *, allow_nan: bool = False, labels: tuple[str, ...] = ()) -> None:

@@ -17,7 +17,7 @@ from rich.text import Text
 from torchid.identifiability.base_parameters import BaseParameters, relations, unseen
 from torchid.identifiability.expected_error import ExpectedErrors
 from torchid.problem import Metrics
-from torchid.problem.metrics import GROUPS, group_name
+from torchid.problem.metrics import ROW_GROUPS, group_name
 from torchid.report.figures import STYLE
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.candidates import Candidate
@@ -264,7 +264,7 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
     table.add_column("channels", justify="right")
     table.add_column("rank", justify="right")
     table.add_column("", no_wrap=True)
-    for label in GROUPS.values():
+    for label in ROW_GROUPS.values():
         table.add_column(Text(label.replace(" [", "\n[")), justify="right")
     for name, found in sets.items():
         first: list[Text | str] = [Text(name), str(found.channels), str(found.rank)]
@@ -273,7 +273,7 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
             ("with noise", found.expected.total),
             ("measured", {} if found.measured is None else found.measured.rms),
         ):
-            table.add_row(*first, label, *(_figure(errors.get(group)) for group in GROUPS))
+            table.add_row(*first, label, *(_figure(errors.get(group)) for group in ROW_GROUPS))
             first = ["", "", ""]
         table.add_section()
     return table
@@ -286,10 +286,10 @@ def _figure(x: float | None) -> str:
 @matplotlib.rc_context(STYLE)
 def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
     """One panel per group of rows, with the sensor sets side by side on a logarithmic scale."""
-    figure = Figure(figsize=(2.6 * len(GROUPS) + 0.6, 3.8), layout="constrained")
-    axes = figure.subplots(1, len(GROUPS))
+    figure = Figure(figsize=(2.6 * len(ROW_GROUPS) + 0.6, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(ROW_GROUPS))
     place = np.arange(len(sets))
-    for axis, (group, label) in zip(axes, GROUPS.items(), strict=True):
+    for axis, (group, label) in zip(axes, ROW_GROUPS.items(), strict=True):
         measured = [None if found.measured is None else found.measured.rms[group] for found in sets.values()]
         for shift, name, (marker, color), heights in (
             (-0.15, "expected model error", _MODEL, [found.expected.model[group] for found in sets.values()]),

@@ -24,7 +24,7 @@ from torchid.estimators.least_squares import FIXED
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import Metrics
-from torchid.problem.metrics import BASE_ROWS, SHOWN, group_name
+from torchid.problem.metrics import BASE_ROWS, ERROR_GROUPS, group_name
 from torchid.report.tables import MARKS, legend_of_marks
 from torchid.text import escaped
 
@@ -103,7 +103,7 @@ def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
-        groups = [group for group in SHOWN if nominal.relative.get(group) is not None]
+        groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         place = np.arange(len(groups))
         for shift, metrics, color, label in (
             (-0.2, nominal, _NOMINAL, "URDF"),

@@ -23,7 +23,7 @@ from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contribution, Contributions, PartContribution
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.metrics import SHOWN
+from torchid.problem.metrics import ERROR_GROUPS
 from torchid.text import escaped, unescaped
 
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
@@ -74,7 +74,7 @@ def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
     for name in columns:
         for which in ("URDF", "identified"):
             table.add_column(Text(f"{name}\n{which}"), justify="right", overflow="fold")
-    for group, label in SHOWN.items():
+    for group, label in ERROR_GROUPS.items():
         cells = [_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *cells)
         if group == "base_force":

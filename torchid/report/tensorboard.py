@@ -14,7 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torchid.estimators import BoundEstimate, Epoch, Estimate
 from torchid.identifiability.information import Knowledge
 from torchid.problem import Metrics
-from torchid.problem.metrics import SETS, SHOWN
+from torchid.problem.metrics import ERROR_GROUPS, SETS
 
 _CHARTED = (*SETS, "left_out")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
@@ -36,7 +36,9 @@ class RunEvents:
             since: step from which on what earlier event files in the folder say is void.
         """
         self._writer = SummaryWriter(str(folder), purge_step=since)
-        groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in _CHARTED]] for group in SHOWN}
+        groups = {
+            group: ["Multiline", [f"relative_error_{name}/{group}" for name in _CHARTED]] for group in ERROR_GROUPS
+        }
         loss = {
             "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
             "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
@@ -55,7 +57,7 @@ class RunEvents:
         """Write what is still held in memory."""
         self._writer.flush()
 
-    def errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(SHOWN)) -> None:
+    def errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(ERROR_GROUPS)) -> None:
         """Errors by group of rows of one parameter vector on sets of logs."""
         for name, metrics in sets.items():
             for group in groups:

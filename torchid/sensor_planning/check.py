@@ -181,7 +181,7 @@ def base_values(builder: RowBuilder, state: State, postures: Array) -> torch.Ten
     found = torch.zeros(len(postures), 6, dtype=torch.float64)
     for start in range(0, len(postures), _CHUNK):
         samples = at_rest(postures[start : start + _CHUNK], state)
-        for index, V in builder.bases(samples, state):
+        for index, V in builder.null_space_bases(samples, state):
             found[start : start + _CHUNK][index] = base_singular_values(V)
     return found
 
@@ -248,7 +248,7 @@ def _check(builder: RowBuilder, state: State, drawn: Array, recorded: Array | No
 
 
 def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> LostBase:
-    [(_, V)] = builder.bases(at_rest(posture, state), state)
+    [(_, V)] = builder.null_space_bases(at_rest(posture, state), state)
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
     directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]
     short = cause.missing()

@@ -13,7 +13,7 @@ from torchid.errors import SensorError
 from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import spread_by_state
+from torchid.problem.chunks import subsample_states
 from torchid.problem.contact_state import State
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -230,7 +230,7 @@ def check(question: Question, sensors: SensorSet) -> list[StateCheck]:
     """Whether a sensor set sees the base in every state of a scenario; over the postures of its logs as well."""
     ask = question
     pieces: dict[State, list[Array]] = {}
-    for samples, state, _ in spread_by_state(ask.logs, _POSTURES):
+    for samples, state, _ in subsample_states(ask.logs, _POSTURES):
         pieces.setdefault(state, []).append(samples.joint_position.numpy())
     postures = {state: np.concatenate(found) for state, found in pieces.items()}
     return check_set(ask.robot, ask.contacts, ask.states, sensors, ask.candidates, seed=ask.seed, postures=postures)

@@ -19,7 +19,7 @@ from torchid.identifiability.rank import structural_rank
 from torchid.identifiability.structure import structural_problem, structural_samples
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread, share_out, spread_by_state, worker_count
+from torchid.problem.chunks import one_thread, run_in_workers, subsample_states, worker_count
 from torchid.problem.contact_state import State
 from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE
@@ -167,7 +167,7 @@ class SetRanking:
         directions = torch.from_numpy(prior_directions(builder, prior))
         self._states: list[_StateRows] = []
         self._information = torch.eye(directions.shape[1], dtype=torch.float64)
-        for samples, state, stands_for in spread_by_state(logs, _SAMPLES):
+        for samples, state, stands_for in subsample_states(logs, _SAMPLES):
             weight = stands_for / samples.oversampling
             rows, W = builder.rows_by_sample(samples, state)
             R = rows[..., :-1] @ directions
@@ -223,7 +223,7 @@ def best_first(
         return found
 
     workers = min(worker_count(torch.device("cpu")), max(len(sets), 1))
-    found = sorted(chain.from_iterable(share_out(range(len(sets)), run, workers)))
+    found = sorted(chain.from_iterable(run_in_workers(range(len(sets)), run, workers)))
     return [(-bits, sets[place]) for bits, place in found]
 
 
