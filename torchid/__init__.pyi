@@ -25,7 +25,7 @@ from .identifiability.structure import (
 )
 from .log_checks import (
     Checked,
-    without_condemned,
+    drop_condemned,
 )
 from .log_checks.check import (
     check,
@@ -107,6 +107,7 @@ __all__ = [
     "chosen_sensors",
     "compress",
     "compress_parts",
+    "drop_condemned",
     "estimate_extras",
     "linear_problem",
     "load_robot",
@@ -118,6 +119,5 @@ __all__ = [
     "structural_problem",
     "violations",
     "with_ft_sensors",
-    "without_condemned",
     "write_log",
 ]

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from torchid import parameters
-from torchid.errors import InputError, install
+from torchid.errors import InputError, how_to_install
 from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, check_parameters
 from torchid.estimators.conic import ConicProblem, Solution
@@ -78,7 +78,7 @@ class Consistent:
         _check_names(self.prior, self.method)
         if (self.certify or self.method == "certified") and not (find_spec("cvxpy") and find_spec("clarabel")):
             found = "needs CVXPY and Clarabel, which are not installed"
-            raise InputError("estimator", "certified", found, f"{install('certified')}, or barrier alone")
+            raise InputError("estimator", "certified", found, f"{how_to_install('certified')}, or barrier alone")
         LeastSquares(self.ridge, self.rank_tolerance)
 
     @rounding_reported("consistent")

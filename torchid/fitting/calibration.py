@@ -22,7 +22,7 @@ from torchid.problem.extras import Extra
 from torchid.problem.predict import calibrated
 from torchid.problem.samples import check_forces
 from torchid.sensing import SensorSet
-from torchid.text import listed
+from torchid.text import join_names
 
 _NAMED = 6  # sensors or bodies that a warning names
 
@@ -185,5 +185,5 @@ def _grouped(labels: Iterable[str]) -> str:
         groups.setdefault(first, {})[last] = None
     order = sorted(groups, key=lambda first: -len(groups[first]))
     more = f"; and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
-    named = ((first, listed(list(groups[first]), _NAMED)) for first in order[:_NAMED])
+    named = ((first, join_names(list(groups[first]), _NAMED)) for first in order[:_NAMED])
     return "; ".join(f"{first} {names}" if " of" in first else f"{names} of {first}" for first, names in named) + more

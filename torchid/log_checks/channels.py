@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray, labels_of
+from torchid.logs.log import WRENCHES, BoolArray, FloatArray, column_labels
 from torchid.parameters import COMPONENTS
 
 #: Standard deviations of a normal distribution in one median absolute deviation.
 NORMAL = 1.4826
 
 
-def beside(series: FloatArray, at: NDArray[np.intp], direction: int, count: int) -> FloatArray:
+def neighbours_of(series: FloatArray, at: NDArray[np.intp], direction: int, count: int) -> FloatArray:
     """The `count` items before (-1) or after (1) some places of a series (M, ...), nearest first, (P, count, ...).
 
     NaN beyond the ends.
@@ -28,7 +28,7 @@ def beside(series: FloatArray, at: NDArray[np.intp], direction: int, count: int)
     return found
 
 
-def median_known(values: FloatArray) -> FloatArray:
+def finite_median(values: FloatArray) -> FloatArray:
     """Median along the second axis of (P, k, ...) over what is not NaN, the upper of two; 0 where nothing is."""
     ordered = np.sort(values, axis=1)  # NaN last
     count = np.sum(~np.isnan(ordered), axis=1, keepdims=True)
@@ -46,7 +46,7 @@ def block_spread(differences: FloatArray, block: int) -> FloatArray:
     return np.append(np.repeat(medians, block), np.full(rest, medians[-1]))
 
 
-def near(where: BoolArray, distance: int) -> BoolArray:
+def widen_mask(where: BoolArray, distance: int) -> BoolArray:
     """Which samples are within a distance of one in the mask (N,)."""
     padded = np.concatenate([np.zeros(distance + 1, np.intp), np.cumsum(where)])
     padded = np.concatenate([padded, np.full(distance, padded[-1])])
@@ -81,7 +81,7 @@ def median_step(log: Log) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class ChannelGroup:
     """Channels of one field, of all joints, of the base, or of one contact, where they were measured.
 
     Attributes:
@@ -116,14 +116,14 @@ class Group:
 
 def channel_names(log: Log, field: str) -> tuple[str, ...]:
     """Names of a field's channels, in the order in which its array is flattened."""
-    labels = labels_of(field, log.names)
+    labels = column_labels(field, log.names)
     array = log.arrays()[field]
     if array.ndim == 3:
         return tuple(f"{label} {component}" for label in labels for component in COMPONENTS)
     return labels or tuple(AXES[: array.shape[1]] if array.ndim == 2 else ("",))
 
 
-def unit(field: str, name: str) -> str:
+def channel_unit(field: str, name: str) -> str:
     """Unit of a channel, "" for a number without one."""
     component = name.rpartition(" ")[2]
     if field in UNITS or component not in COMPONENTS:
@@ -131,7 +131,7 @@ def unit(field: str, name: str) -> str:
     return "N" if component.startswith("f") else "N m"
 
 
-def groups(log: Log) -> Iterator[Group]:
+def channel_groups(log: Log) -> Iterator[ChannelGroup]:
     """All groups of a log that hold anything."""
     for field in log.arrays():
         if field in NO_SIGNALS:
@@ -141,7 +141,7 @@ def groups(log: Log) -> Iterator[Group]:
         if values.ndim == 2:
             yield from _group(log, field, "", names, values, np.ones(len(log), dtype=bool))
             continue
-        for index, label in enumerate(labels_of(field, log.names)):
+        for index, label in enumerate(column_labels(field, log.names)):
             measured = np.ones(len(log), dtype=bool)
             if field in WRENCHES and log.contact_active is not None:
                 measured = log.contact_active[:, index] & (values[:, index] != 0.0).any(axis=1)
@@ -150,7 +150,7 @@ def groups(log: Log) -> Iterator[Group]:
 
 def _group(
     log: Log, field: str, name: str, names: tuple[str, ...], values: FloatArray, measured: BoolArray
-) -> Iterator[Group]:
+) -> Iterator[ChannelGroup]:
     some = ~np.isnan(values[measured]).all(axis=0) if measured.any() else np.zeros(values.shape[1], dtype=bool)
     if not some.any():
         return
@@ -162,4 +162,4 @@ def _group(
     apart = (np.diff(samples) > 1) | (np.diff(elapsed) > LONG_STEP)
     kept = chosen if len(samples) == len(log) else chosen[samples]
     piece = np.append(0, np.cumsum(apart))
-    yield Group(field, name, tuple(np.array(names)[some].tolist()), samples, kept, elapsed, piece)
+    yield ChannelGroup(field, name, tuple(np.array(names)[some].tolist()), samples, kept, elapsed, piece)

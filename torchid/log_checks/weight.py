@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from torchid.log_checks.channels import median_step, near
+from torchid.log_checks.channels import median_step, widen_mask
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
-from torchid.logs.quaternion import rotate
+from torchid.logs.quaternion import rotate_to_world
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 
@@ -21,7 +21,7 @@ WINDOW = 0.5
 MOVED = 0.01
 
 
-def at_rest(log: Log) -> BoolArray:
+def find_rest(log: Log) -> BoolArray:
     """Which samples (N,) are inside a window in which neither base nor joints move."""
     still = np.zeros(len(log), bool)
     if len(log) < 3:
@@ -38,7 +38,7 @@ def at_rest(log: Log) -> BoolArray:
         turned = np.linalg.norm(log.imu_angular_velocity, axis=1)[half:-half] * WINDOW
         middle &= turned < 10.0 * MOVED  # a gyroscope has a bias
     still[half:-half] = middle
-    return near(still, half)
+    return widen_mask(still, half)
 
 
 def _poses(log: Log) -> list[FloatArray]:
@@ -64,11 +64,11 @@ _TILT = 5.0
 _NAME, _IMU = "weight at rest", "accelerometer at rest"
 
 
-def weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
+def check_weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about the sum of the contact forces."""
     if robot is not None and robot.fixed_base and not log.contact_names:
         return  # what it is bolted to carries it
-    still = at_rest(log)
+    still = find_rest(log)
     step = median_step(log)
     rests = still.sum() * step >= _REST
     if not rests and log.time[-1] - log.time[0] < _LONG:
@@ -138,15 +138,15 @@ def _in_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
         for index, name in enumerate(log.contact_names)
     ]
     if log.base_quat_xyzw is not None:
-        turned = [rotate(log.base_quat_xyzw, one) for one in turned]
+        turned = [rotate_to_world(log.base_quat_xyzw, one) for one in turned]
     return np.stack(turned, axis=1)
 
 
-def accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
+def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about the IMU's specific force, at rest; its direction also on average over a long log."""
     if log.imu_specific_force is None:
         return
-    still = at_rest(log)
+    still = find_rest(log)
     rests = still.sum() >= 10
     if not rests:
         yield Skipped(_IMU, f"the robot never rests for {_REST:g} s")
@@ -176,7 +176,7 @@ def _tilt(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterato
         yield Skipped("gravity against orientation", "no robot that says where the IMU is on the base")
         return
     in_base = log.imu_specific_force[still] @ robot.links[log.imu_frame][1][:3, :3].T
-    up = rotate(log.base_quat_xyzw[still], in_base).mean(axis=0)
+    up = rotate_to_world(log.base_quat_xyzw[still], in_base).mean(axis=0)
     angle = float(np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1.0, 1.0))))
     name, text = "imu_specific_force", f"{angle:.3g} degrees from up {when}, by base_quat"
     if angle <= 90.0:

@@ -10,7 +10,7 @@ import numpy as np
 from lxml import etree
 
 from torchid.config import FootConfig
-from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, install
+from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, how_to_install
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
 
@@ -101,7 +101,7 @@ try:
     import mujoco
 except ImportError as error:
     found = "needs MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
-    raise InputError("torchid", "simulate", found, install("sim")) from error
+    raise InputError("torchid", "simulate", found, how_to_install("sim")) from error
 
 _WORLD = "world link"
 _DISCARDED = ("transmission", "gazebo", "material", "mujoco")
