@@ -118,7 +118,7 @@ def read_log_to_check(path: Path, topics: Topics | None, settings: Preprocessing
 
 def _contact(log: Log, index: int) -> Contact:
     """A contact of a log without an experiment file: a point if forces without any moment were measured."""
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     force, moment = (False, True) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
     return Contact(log.contact_names[index], "point" if force and not moment else "flat")
 

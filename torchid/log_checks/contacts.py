@@ -7,16 +7,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from torchid.errors import InputError
-from torchid.log_checks.channels import NORMAL, median_step
+from torchid.log_checks.channels import median_step
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, Span, find_spans
 from torchid.log_checks.mistakes import Mistake, possible_mistakes
-from torchid.log_checks.model import COMPARED, bind_some_samples, default_cutoff_hz, preprocess_pieces
+from torchid.log_checks.model import COMPARED, bind_some_samples, default_cutoff_hz, link_poses, preprocess_pieces
+from torchid.log_checks.statistics import NORMAL
 from torchid.log_checks.weight import GRAVITY, WRONG
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray
+from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
 from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
@@ -75,7 +75,7 @@ def check_contact_flags(log: Log) -> Iterator[Finding | Skipped]:
 
 def _contacts(log: Log) -> Iterator[_Contact]:
     """Those whose force can be judged: NaN stands for no reading, which a contact may lack while it is in the air."""
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     if wrench is None or log.contact_active is None:
         return
     for index, name in enumerate(log.contact_names):
@@ -95,7 +95,7 @@ def _largest_load(contacts: list[_Contact]) -> float:
 def subtract_contact_offsets(log: Log) -> Log:
     """The log with what contact sensors read steadily in the air taken off."""
     offsets = {contact.name: _offset(contact) for contact in _contacts(log)}
-    field = WRENCHES[0] if log.contact_wrench_world is None else WRENCHES[1]
+    field = log.contact_wrench_field
     if not any(np.any(offset) for offset in offsets.values()):
         return log
     wrench = getattr(log, field).copy()
@@ -217,8 +217,7 @@ def measure_foot_slip(log: Log, robot: Robot, contacts: Sequence[Contact]) -> fl
     feet = [c for c in contacts if c.frame in log.contact_names and c.frame in robot.links]
     if log.base_quat_xyzw is None or log.contact_active is None or set(log.joint_names) != set(robot.joint_names):
         return None
-    order = [log.joint_names.index(name) for name in robot.joint_names]
-    poses = robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+    poses = link_poses(log, robot)
     active = {c.frame: log.contact_active[:, log.contact_names.index(c.frame)] for c in feet}
     moved: list[tuple[float, float, int]] = []
     for i, foot in enumerate(feet):

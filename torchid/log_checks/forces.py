@@ -85,7 +85,7 @@ def gain_and_point_findings(
     m = len(found.joints)
     off = _sure(found.point, found.spread[m:], found.blocks[:, m:]) & (np.abs(found.point) > POINT)
     if off.any():
-        field = WRENCHES[0] if log.contact_wrench_world is None else WRENCHES[1]
+        field = log.contact_wrench_field
         where = ", ".join(f"{1e3 * x:.0f}" for x in found.point)
         text = f"forces and moments fit the URDF about a point that lies {where} mm from the contact frames' origins"
         advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
@@ -147,7 +147,7 @@ def check_forces_against_urdf(
     except InputError as error:
         yield Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}")
         return
-    if log.joint_torque is None and log.contact_wrench_local is None and log.contact_wrench_world is None:
+    if log.joint_torque is None and log.contact_wrench is None:
         yield Skipped(_NAME, "neither joint torques nor contact wrenches")
         return
     fit = fit_nominal_model(samples, robot, contacts)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.log_checks.channels import ChannelGroup, finite_median, neighbours_of
+from torchid.log_checks.channels import ChannelGroup
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
+from torchid.log_checks.statistics import finite_median, neighbours_of
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.text import count_of, join_names
 

@@ -143,6 +143,12 @@ def bind_some_samples(
     return out
 
 
+def link_poses(log: Log, robot: Robot) -> dict[str, torch.Tensor]:
+    """Poses (N, 4, 4) in the base of the robot's links, by name, at the samples of a log of all its joints."""
+    order = [log.joint_names.index(name) for name in robot.joint_names]
+    return robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+
+
 def fit_nominal_model(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> ModelFit:
     """Compare the forces of some samples with those of the URDF."""
     measured = np.zeros(robot.n, dtype=bool)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchid.log_checks.channels import NORMAL, channel_names
+from torchid.log_checks.channels import channel_names
 from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.statistics import NORMAL
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import DERIVATIVE_CHAINS

@@ -9,16 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.log_checks.channels import (
-    NORMAL,
-    ChannelGroup,
-    block_spread,
-    finite_median,
-    median_step,
-    neighbours_of,
-    widen_mask,
-)
+from torchid.log_checks.channels import ChannelGroup, median_step
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
+from torchid.log_checks.statistics import NORMAL, block_spread, finite_median, neighbours_of, widen_mask
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes

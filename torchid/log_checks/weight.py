@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import torch
 
-from torchid.log_checks.channels import median_step, widen_mask
+from torchid.log_checks.channels import median_step
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.model import link_poses
+from torchid.log_checks.statistics import widen_mask
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray
+from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
@@ -81,7 +82,7 @@ def check_weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
         yield Skipped(_NAME, upward)
         return
     when = f"at rest ({still.sum() * step:.3g} s)" if rests else f"on average over {log.time[-1] - log.time[0]:.4g} s"
-    field = WRENCHES[0] if log.contact_wrench_world is None else WRENCHES[1]
+    field = log.contact_wrench_field
     yield from _judged(float(upward.mean()), when, field, robot)
 
 
@@ -114,7 +115,7 @@ def _judged(carried: float, when: str, field: str, robot: Robot | None) -> Itera
 
 def _upward(log: Log, robot: Robot | None) -> FloatArray | str:
     """Sum of the vertical contact forces (M,) [N] over samples where all active ones were measured, or why not."""
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     if wrench is None or log.contact_active is None:
         return "no contact forces"
     force = np.where(log.contact_active[..., None], wrench[..., :3], 0.0)
@@ -131,8 +132,7 @@ def _upward(log: Log, robot: Robot | None) -> FloatArray | str:
 
 
 def _in_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
-    order = [log.joint_names.index(name) for name in robot.joint_names]
-    poses = robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+    poses = link_poses(log, robot)
     turned = [
         np.einsum("nij,nj->ni", poses[name][:, :3, :3].numpy(), force[:, index])
         for index, name in enumerate(log.contact_names)
@@ -203,11 +203,8 @@ def _above_feet(log: Log, robot: Robot, upward: FloatArray) -> float | None:
         return None
     known = [index for index, name in enumerate(log.contact_names) if name in robot.links]
     some = np.linspace(0, len(log) - 1, min(_POSES, len(log))).astype(int)
-    order = [log.joint_names.index(name) for name in robot.joint_names]
-    poses = robot.link_poses(torch.from_numpy(log.joint_position[some][:, order]))
+    poses, active = link_poses(log.select(some), robot), log.contact_active[some]
     mean = upward.mean(axis=0)
-    heights = [
-        -(poses[log.contact_names[index]][:, :3, 3].numpy() @ mean)[log.contact_active[some, index]] for index in known
-    ]
+    heights = [-(poses[log.contact_names[k]][:, :3, 3].numpy() @ mean)[active[:, k]] for k in known]
     found = np.concatenate(heights) if heights else np.zeros(0)
     return float(found.mean() / np.linalg.norm(mean)) if len(found) else None

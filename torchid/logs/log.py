@@ -318,6 +318,16 @@ class Log:
         """Names of joints, contacts and force/torque sensors, by field."""
         return {name: getattr(self, name) for name in NAME_FIELDS}
 
+    @property
+    def contact_wrench_field(self) -> str:
+        """Name of the field that holds, or would hold, the contact wrenches."""
+        return WRENCHES[0] if self.contact_wrench_world is None else WRENCHES[1]
+
+    @property
+    def contact_wrench(self) -> FloatArray | None:
+        """Contact wrenches (N, C, 6) [N, N m] along whichever axes they were given; None if they were not."""
+        return self.contact_wrench_local if self.contact_wrench_world is None else self.contact_wrench_world
+
     def arrays(self) -> dict[str, FloatArray | BoolArray]:
         """Every array of the file format that is present and has the sample axis first, by field name."""
         present = {name: getattr(self, name) for name, shape in SHAPES.items() if shape[:1] == ("N",)}

@@ -193,7 +193,7 @@ def unloaded_readings(log: Log, where: BoolArray | None = None) -> FloatArray | 
     """
     if log.contact_unloaded is not None:
         return log.contact_unloaded
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     if wrench is None or log.contact_active is None:
         return None
     chosen = find_unloaded(log.time, log.contact_active) if where is None else where
