@@ -24,7 +24,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from torchid.errors import TorchidWarning, install
+from torchid.errors import TorchidWarning, how_to_install
 from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
@@ -63,7 +63,7 @@ def robots_folder() -> Path:
         found = folder / "share" / "example-robot-data" / "robots"
         if found.is_dir():
             return found
-    raise SystemExit(f"benchmark: the package example-robot-data is missing; {install('oracle')}")
+    raise SystemExit(f"benchmark: the package example-robot-data is missing; {how_to_install('oracle')}")
 
 
 def random_samples(robot: Robot, contacts: int, count: int) -> Samples:

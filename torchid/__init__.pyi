@@ -45,7 +45,6 @@ from .identifiability.structure import (
 )
 from .log_checks import (
     Checked,
-    without_condemned,
 )
 from .log_checks.check import (
     check,
@@ -152,6 +151,5 @@ __all__ = [
     "structural_problem",
     "violations",
     "with_ft_sensors",
-    "without_condemned",
     "write_log",
 ]

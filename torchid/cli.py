@@ -10,9 +10,9 @@ from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torchid import __version__
-from torchid.boundary import guarded, plain_streams
+from torchid.boundary import plain_streams, run_guarded
 from torchid.errors import during
-from torchid.staging import interrupt_held_back as _interrupt_held_back
+from torchid.staging import interrupts_deferred as _interrupt_held_back
 
 if TYPE_CHECKING:
     from torchid.commands import Identification
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
     with plain_streams():  # argparse repeats what it does not understand
         options = _options(arguments)
-    return guarded("torchid", lambda: _command(options), options.debug)
+    return run_guarded("torchid", lambda: _command(options), options.debug)
 
 
 def _command(options: argparse.Namespace) -> int | None:
@@ -266,19 +266,19 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     with _interrupt_held_back():
-        from torchid.commands.check import check_files, check_outputs, write_outputs
-        from torchid.report.log_checks import heading, hygiene_table, not_checked
+        from torchid.commands.check import check_files, check_outputs, write_check_outputs
+        from torchid.report.log_checks import finding_table, log_heading, skipped_checks_text
         from torchid.report.tables import print_tables
 
     check_outputs(options.json, options.figure, options.overwrite, (options.file, options.urdf, options.topics))
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
-    write_outputs(checked, options.json, options.figure)
+    write_check_outputs(checked, options.json, options.figure)
     for one in checked:
-        print(heading(one))
+        print(log_heading(one))
         if one.findings:
-            print_tables(hygiene_table(one.findings))
-        if missing := not_checked(one):
+            print_tables(finding_table(one.findings))
+        if missing := skipped_checks_text(one):
             print(fill(f"not checked   {missing}", 100, subsequent_indent=" " * 14))
         print(fill(f"verdict       {one.verdict}", 100, subsequent_indent=" " * 14))
         print()

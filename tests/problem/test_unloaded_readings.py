@@ -16,7 +16,7 @@ from unknowns import fit
 
 from torchid.identifiability.confounding import disagreements
 from torchid.logs import Log
-from torchid.logs.preprocess import UNLOADED_MARGIN_S, preprocess, unloaded
+from torchid.logs.preprocess import UNLOADED_MARGIN_S, find_unloaded, preprocess
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
 from torchid.problem.compression import Part, unloaded_offset_equations
@@ -80,7 +80,7 @@ def test_a_reading_counts_from_the_margin_away_from_the_last_contact_to_the_marg
     time = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.02, 800))
     active = np.stack([np.sin(3.0 * time) > 0.0, time < 0.0, time > 0.0], axis=1)
     far = np.abs(time[:, None] - time[active[:, 0]]).min(axis=1) > UNLOADED_MARGIN_S
-    found = unloaded(time, active)
+    found = find_unloaded(time, active)
     np.testing.assert_array_equal(found[:, 0], far)
     assert 0.2 < far.mean() < 0.45
     assert found[:, 1].all()
@@ -103,7 +103,7 @@ def test_a_filter_leaves_readings_in_the_air_as_they_were_recorded(settings: dic
     )  # fmt: skip
     found = value(bound(preprocess(log, **settings)).unloaded).numpy()
     assert set(np.unique(found[np.isfinite(found)])) == {60.0}
-    assert np.isfinite(found).mean() == pytest.approx(unloaded(time, active).mean(), abs=0.02)
+    assert np.isfinite(found).mean() == pytest.approx(find_unloaded(time, active).mean(), abs=0.02)
 
 
 def test_a_contact_whose_offset_is_not_asked_for_has_no_equation_in_the_air() -> None:

@@ -11,7 +11,7 @@ from functools import partial
 
 from rich.progress import Progress
 
-from torchid.commands.folder import RUN, check_free, claimed
+from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import check_not_worse, check_plausible
 from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
@@ -60,7 +60,7 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
     trains = config.estimator.name == "sgd"
-    with claimed(training_folder(config.output)) if trains else nullcontext():
+    with claim_folder(training_folder(config.output)) if trains else nullcontext():
         check_training(config, resume, source)
         check_free(config.output, config.overwrite, RUN, (source, *inputs_of(config)))
         return _identify(config, source, resume)

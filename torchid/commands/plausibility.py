@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from torchid import parameters
-from torchid.commands.check import log_to_check
+from torchid.commands.check import read_log_to_check
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
@@ -196,7 +196,7 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     found = []
     for path in files.train:
         try:
-            log = log_to_check(path, files.topics, scene.config.preprocessing)
+            log = read_log_to_check(path, files.topics, scene.config.preprocessing)
             checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
         except InputError:  # larger than memory: nothing is known of it
             continue

@@ -27,12 +27,12 @@ from torchid.commands.folder import (
     EVENTS,
     TRAINING,
     check_free,
-    clear_leftovers,
     new_folder,
+    recover_leftovers,
     refuse_inputs,
     refuse_link,
 )
-from torchid.commands.manifest import Manifest, inspect, read_manifest
+from torchid.commands.manifest import Manifest, inspect_folder, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError, InputError, SensorError, warn
@@ -44,7 +44,7 @@ from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Sam
 from torchid.problem.linear import parameter_scale
 from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
-from torchid.text import shown
+from torchid.text import excerpt
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -124,7 +124,7 @@ def damage_refused(folder: Path) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # noqa: B902 - an unpickler, torch and its optimizers raise what they like
-        found = f"not readable ({shown(str(error) or type(error).__name__, 200)})"
+        found = f"not readable ({excerpt(str(error) or type(error).__name__, 200)})"
         raise InputError(folder / CHECKPOINT, "file", found, _ACCEPTED) from error
 
 
@@ -189,7 +189,7 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
             raise ConfigError(source, "--resume", found, "estimator.name: sgd, or no --resume")
         return
     refuse_link(folder)
-    clear_leftovers(folder, TRAINING)
+    recover_leftovers(folder, TRAINING)
     waiting = (folder / CHECKPOINT).is_file()
     if resume and not waiting:
         if output.exists() and not config.overwrite:
@@ -261,7 +261,7 @@ class Training:
 
     def copy_curves(self, folder: Path) -> None:
         """Copy the training's event files into the finished run's folder."""
-        found = inspect(self.folder, TRAINING)
+        found = inspect_folder(self.folder, TRAINING)
         for path in found.own if found else ():
             if fnmatchcase(path.name, EVENTS):
                 shutil.copy2(path, folder)
@@ -272,7 +272,7 @@ class Training:
         Warns:
             TorchidWarning: there is more in its folder than torchid wrote.
         """
-        if found := inspect(self.folder, TRAINING):
+        if found := inspect_folder(self.folder, TRAINING):
             found.remove()
         if self.folder.exists():
             message = f"{self.folder}: stays: it holds what torchid did not write"

@@ -24,7 +24,7 @@ from torchid.problem.extras import Extra
 from torchid.problem.predict import calibrate_readings
 from torchid.problem.samples import require_forces
 from torchid.robot import Robot
-from torchid.text import listed
+from torchid.text import join_names
 
 T = TypeVar("T")
 
@@ -220,5 +220,5 @@ def _grouped(labels: Iterable[str]) -> str:
         groups.setdefault(first, {})[last] = None
     order = sorted(groups, key=lambda first: -len(groups[first]))
     more = f"; and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
-    named = ((first, listed(list(groups[first]), _NAMED)) for first in order[:_NAMED])
+    named = ((first, join_names(list(groups[first]), _NAMED)) for first in order[:_NAMED])
     return "; ".join(f"{first} {names}" if " of" in first else f"{names} of {first}" for first, names in named) + more

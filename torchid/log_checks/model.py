@@ -109,12 +109,12 @@ def wrong_gains(gain: FloatArray, clear: BoolArray) -> BoolArray:
     return clear & ((gain < 0.0) | (np.abs(np.log(np.maximum(np.abs(gain), _TINY))) > np.log(SCALE)))
 
 
-def usual_cutoff(log: Log) -> float:
+def default_cutoff_hz(log: Log) -> float:
     """A cutoff [Hz] for a log that nobody has named one for."""
     return min(CUTOFF, _OF_RATE / median_step(log))
 
 
-def filtered(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) -> list[Log]:
+def preprocess_pieces(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) -> list[Log]:
     """The log with velocities and accelerations; of one longer than `most`, runs of samples from all over it.
 
     Raises:
@@ -128,7 +128,9 @@ def filtered(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) -> list[Log
         return [preprocess(log.select(slice(start, start + length)), cutoff_hz) for start in starts]
 
 
-def bound(logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED) -> list[Samples]:
+def bind_some_samples(
+    logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED
+) -> list[Samples]:
     """About `count` evenly spread samples of filtered logs.
 
     Raises:
@@ -141,7 +143,13 @@ def bound(logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count:
     return out
 
 
-def model_fit(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> ModelFit:
+def link_poses(log: Log, robot: Robot) -> dict[str, torch.Tensor]:
+    """Poses (N, 4, 4) in the base of the robot's links, by name, at the samples of a log of all its joints."""
+    order = [log.joint_names.index(name) for name in robot.joint_names]
+    return robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+
+
+def fit_nominal_model(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> ModelFit:
     """Compare the forces of some samples with those of the URDF."""
     measured = np.zeros(robot.n, dtype=bool)
     if all(part.torque is not None for part in samples):

@@ -17,7 +17,7 @@ from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
-from torchid.text import listed
+from torchid.text import join_names
 
 WHITENED = "projected_residual"
 """The group of the rows that a fit sees: whitened, and projected so that nothing unmeasured is in them."""
@@ -185,7 +185,7 @@ def describe_worse(found: list[WorseThanNominal]) -> str | None:
     if not found:
         return None
     by_logs = {one.logs: [str(other) for other in found if other.logs == one.logs] for one in found}
-    told = "; ".join(f"on {logs}: {listed(texts)}" for logs, texts in by_logs.items())
+    told = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
     return f"the identified parameters predict worse than the URDF's, {told}"
 
 

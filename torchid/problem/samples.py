@@ -147,7 +147,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
     if log.contact_wrench_world is not None and contacts and base.quat_xyzw is None and not robot.fixed_base:
         accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
         raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     in_the_air = unloaded_readings(log) if contacts else None
     samples = Samples(
         log.source,

@@ -26,7 +26,7 @@ from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import Metrics
 from torchid.problem.metrics import BASE_ROWS, ERROR_GROUPS, group_name
 from torchid.report.tables import MARKS, legend_of_marks
-from torchid.text import escaped
+from torchid.text import escape
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -47,7 +47,7 @@ def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
     """
     with during("drawing", path), matplotlib.rc_context(STYLE):
         for text in figure.findobj(Text):
-            text.set_text(escaped(text.get_text(), "\n"))
+            text.set_text(escape(text.get_text(), "\n"))
         figure.savefig(path, dpi=130, format=kind)
 
 

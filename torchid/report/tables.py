@@ -24,7 +24,7 @@ from torchid.identifiability.contributions import Contribution, Contributions, P
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS
-from torchid.text import escaped, unescaped
+from torchid.text import escape, raw_stream
 
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
 
@@ -35,12 +35,12 @@ class PlainConsole(Console):
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """The segments of what is shown, of plain text."""
         for text, style, control in super().render(renderable, options):
-            yield Segment(text, style, control) if control else Segment(escaped(text, "\n"), style)
+            yield Segment(text, style, control) if control else Segment(escape(text, "\n"), style)
 
 
 def people_console(stderr: bool = False) -> Console:
     """A console on standard output or error; the boundary's own care of these would also undo its colors."""
-    return PlainConsole(file=unescaped(sys.stderr if stderr else sys.stdout))
+    return PlainConsole(file=raw_stream(sys.stderr if stderr else sys.stdout))
 
 
 def print_tables(*tables: Table) -> None:

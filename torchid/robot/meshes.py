@@ -8,8 +8,8 @@ from pathlib import Path, PurePosixPath
 
 from lxml import etree
 
-from torchid.guards import MAX_LINE, MAX_MESH, MAX_PARTS, MAX_UNFOLDED, in_mebibytes, read_bytes
-from torchid.text import is_plain, shown
+from torchid.guards import MAX_LINE, MAX_MESH, MAX_PARTS, MAX_UNFOLDED, format_bytes, read_bytes
+from torchid.text import excerpt, is_plain
 
 FORMATS = ("stl", "obj", "dae", "ply", "off")
 _PART = {"obj": b"usemtl"}
@@ -29,17 +29,17 @@ def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
     path = _mesh_file(urdf, filename)
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
-        raise MeshError(f"{shown(filename)}: none of {', '.join(FORMATS)}")
+        raise MeshError(f"{excerpt(filename)}: none of {', '.join(FORMATS)}")
     try:
         content = read_bytes(path, MAX_MESH)
         if kind == "dae":
             check_collada(content, MAX_UNFOLDED)
     except (OSError, ValueError, etree.XMLSyntaxError, RecursionError) as error:
-        raise MeshError(f"{shown(filename)}: {type(error).__name__}: {shown(str(error))}") from error
+        raise MeshError(f"{excerpt(filename)}: {type(error).__name__}: {excerpt(str(error))}") from error
     if kind in _PART and content.lower().count(_PART[kind]) > MAX_PARTS:
-        raise MeshError(f"{shown(filename)}: more than {MAX_PARTS} parts")
+        raise MeshError(f"{excerpt(filename)}: more than {MAX_PARTS} parts")
     if kind == "obj" and max(map(len, content.splitlines()), default=0) > MAX_LINE:
-        raise MeshError(f"{shown(filename)}: a line of more than {in_mebibytes(MAX_LINE)}")
+        raise MeshError(f"{excerpt(filename)}: a line of more than {format_bytes(MAX_LINE)}")
     return kind, content
 
 
@@ -50,20 +50,20 @@ def _mesh_file(urdf: Path, filename: str) -> Path:
     in it are followed: workspaces are made of them.
     """
     if not is_plain(filename):
-        raise MeshError(f"{shown(filename)}: no name of a file")
+        raise MeshError(f"{excerpt(filename)}: no name of a file")
     package = _package(urdf)
     scheme, _, rest = filename.rpartition("://")
     if scheme not in ("", "file", "package"):
-        raise MeshError(f"{shown(filename)}: neither a file nor in a package")
+        raise MeshError(f"{excerpt(filename)}: neither a file nor in a package")
     candidates = _in_packages(urdf, package, rest) if scheme == "package" else _in_package(urdf, package, rest)
     try:
         found = next((path for path in candidates if path.is_file()), None)
     except OSError as error:
-        raise MeshError(f"{shown(filename)}: {error.strerror}") from error
+        raise MeshError(f"{excerpt(filename)}: {error.strerror}") from error
     if found is not None:
         return found
     outside = scheme != "package" and not candidates
-    raise MeshError(f"{shown(filename)}: {f'outside {package}' if outside else 'no such file'}")
+    raise MeshError(f"{excerpt(filename)}: {f'outside {package}' if outside else 'no such file'}")
 
 
 def _package(urdf: Path) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 from lxml import etree
 
 from torchid.config import FootConfig
-from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, install
+from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, how_to_install
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
 
@@ -18,7 +18,7 @@ try:
     import mujoco
 except ImportError as error:
     found = "needs MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
-    raise InputError("torchid", "simulate", found, install("sim")) from error
+    raise InputError("torchid", "simulate", found, how_to_install("sim")) from error
 
 _RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
 _NARROWEST = 1e-3  # m, of a support polygon
