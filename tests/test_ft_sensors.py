@@ -19,7 +19,7 @@ from welded import REAL, SENSORS, machine
 from torchid import parameters
 from torchid.errors import LogError, UnknownNameError
 from torchid.estimators import LeastSquares
-from torchid.identifiability.rank import state_reports
+from torchid.identifiability.base_rank import state_reports
 from torchid.parameters import COMPONENTS
 from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
 from torchid.problem.chunks import by_state

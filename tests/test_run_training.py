@@ -40,7 +40,7 @@ from torchid.problem.metrics import GROUPS, SHOWN, WHITENED
 
 DEMO = Path(torchid.__file__).parent / "demo"
 EPOCHS, EVERY = 16, 5
-FIGURES = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
+FIGURES = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
 EVALUATED = sorted({*range(0, EPOCHS + 1, EVERY), EPOCHS})
 BY_EPOCH = list(range(1, EPOCHS + 1))
 
