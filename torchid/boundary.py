@@ -1,4 +1,4 @@
-"""The boundary between a command and its user: whatever stops a command is told in one line of plain text."""
+"""The boundary between a command and its user: whatever stops a command is reported in one line of plain text."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _HOW = "--debug shows where"
 
 
 def run_guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
-    """Run a command so that whatever stops it is told in one line.
+    """Run a command so that whatever stops it is reported in one line.
 
     What is written meanwhile, by whomever, has control characters as escapes. Libraries' warnings of numbers become a
     line of ours, for they may touch results; their other warnings, and what they log, tell users nothing that they
@@ -53,15 +53,15 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
         except KeyboardInterrupt as interrupt:
             _say(program, str(interrupt) or f"interrupted; {list_written()} was written")
             return 1
-        except Exception as error:  # a full disk, or a bug: still no wall of text unless asked for
+        except Exception as error:  # a full disk, or a bug: still one line, unless --debug is given
             if debug:
                 traceback.print_exc()
-            status, line = exit_status(error)
+            status, line = describe_error(error)
             _say(program, line)
             return status
 
 
-def exit_status(error: Exception) -> tuple[int, str]:
+def describe_error(error: Exception) -> tuple[int, str]:
     """Exit status and the one line that says what stopped a command."""
     if isinstance(error, (InputError, BaseLostError)):
         return 2, str(error)

@@ -45,7 +45,7 @@ def _command(options: argparse.Namespace) -> int | None:
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says; overrides may also come after options, where argparse takes them for strangers."""
+    """What the command line says; overrides may also come after options, which argparse does not know."""
     parser = _parser()
     options, late = parser.parse_known_args(arguments)
     if late and (not hasattr(options, "overrides") or any(text.startswith("-") for text in late)):
@@ -200,7 +200,7 @@ def _mass_text(mass: TotalMass) -> str:
     if mass.determined:
         return f"{mass.value:.3f} ± {mass.standard_error:.2g} kg"
     if not mass.separable:
-        return "not determined: the data do not tell it from offsets"
+        return "not determined: confounded with offsets"
     known = f", standard error {mass.standard_error:.2g} kg" if isfinite(mass.standard_error) else ""
     return f"not determined by the data{known}"
 
@@ -218,9 +218,9 @@ def _evaluate(options: argparse.Namespace) -> None:
         from torchid.commands.evaluate import evaluate
         from torchid.report.tables import error_tables, print_tables
 
-    metrics, output = evaluate(options.run, options.log, options.device)
-    print_tables(*error_tables(metrics))
-    print(f"written to    {output}")
+    found = evaluate(options.run, options.log, options.device)
+    print_tables(*error_tables(found.metrics))
+    print(f"written to    {found.output}")
 
 
 def _analyze(options: argparse.Namespace) -> None:
@@ -239,22 +239,29 @@ def _analyze(options: argparse.Namespace) -> None:
 
 
 def _print_scenario(scenario: ScenarioAnalysis) -> None:
-    from torchid.report.analysis import branch_table, check_lines, check_table, removal_table, set_text, sets_table
+    from torchid.report.analysis import (
+        branch_table,
+        describe_losses,
+        join_names,
+        observability_table,
+        removal_table,
+        sets_table,
+    )
     from torchid.report.tables import print_tables
 
     plan, base = scenario.plan, scenario.base
     print(f"Scenario {scenario.name}")
     print_tables(branch_table(plan), *([sets_table(plan.parts)] if plan.parts else []))
     proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
-    print(fill(f"chosen        {set_text(plan.chosen)}", 100, subsequent_indent=" " * 14))
+    print(fill(f"chosen        {join_names(plan.chosen)}", 100, subsequent_indent=" " * 14))
     print(f"cost          {plan.cost:g}; {proof}")
-    named = {"Chosen sensors": plan.checks}
-    if scenario.proposed is not None and scenario.proposed is not plan.checks:
+    named = {"Chosen sensors": plan.observability}
+    if scenario.proposed is not None and scenario.proposed is not plan.observability:
         named["Proposed sensors"] = scenario.proposed
     for title, checks in named.items():
         if checks:
-            print_tables(check_table(title, checks))
-        for line in check_lines(checks) if title != "Chosen sensors" or plan.parts else []:
+            print_tables(observability_table(title, checks))
+        for line in describe_losses(checks) if title != "Chosen sensors" or plan.parts else []:
             print(fill(line, 100, subsequent_indent="  "))
     if plan.removals:
         print_tables(removal_table(plan))

@@ -22,7 +22,7 @@ from torchid.cli import main
 from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError, TorchidWarning, during
 from torchid.guards import read_bytes
-from torchid.report.tables import people_console, print_tables, table_text
+from torchid.report.tables import print_tables, table_text, terminal_console
 from torchid.text import is_plain
 
 EVIL = "a\x1b[31m\u202eb\nc\r\x07\u200b$x_{$"
@@ -90,7 +90,7 @@ def test_whatever_is_printed_has_no_control_characters(capsys: pytest.CaptureFix
         table.add_column(Text(EVIL))
         table.add_row(Text(EVIL))
         print_tables(table)
-        people_console(stderr=True).print(Text(EVIL))
+        terminal_console(stderr=True).print(Text(EVIL))
         warnings.warn(f"{EVIL}: a gap", TorchidWarning, stacklevel=1)
         return 0
 
@@ -112,7 +112,7 @@ def test_a_terminal_keeps_its_colors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     screen = Terminal()
     monkeypatch.setattr(sys, "stdout", screen)
-    assert run_guarded("torchid", lambda: people_console().print(Text(EVIL, style="red"))) == 0
+    assert run_guarded("torchid", lambda: terminal_console().print(Text(EVIL, style="red"))) == 0
     assert "\x1b[31ma\\x1b[31m" in screen.getvalue()
 
 

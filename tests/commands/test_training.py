@@ -40,7 +40,7 @@ from torchid.problem.linear import parameter_scale
 from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS, WHITENED
 
 EPOCHS, EVERY = 16, 5
-FIGURES = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
+FIGURES = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
 EVALUATED = sorted({*range(0, EPOCHS + 1, EVERY), EPOCHS})
 BY_EPOCH = list(range(1, EPOCHS + 1))
 

@@ -18,14 +18,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import torchid
 from torchid.cli import main
-from torchid.commands.plausibility import absurd, force_gain, implausible
+from torchid.commands.plausibility import beyond_models, force_gain, implausibility
 from torchid.config import load_config
 from torchid.errors import BaseLostError
 from torchid.estimators import LeastSquares
 from torchid.fitting.cross_validation import with_all_readings
 from torchid.fitting.experiment import set_up
+from torchid.identifiability.base_rank import StateReport, _of_base, require_base
 from torchid.identifiability.confounding import TotalMass
-from torchid.identifiability.rank import StateReport, _of_base, check_base
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
 from torchid.problem import (
@@ -290,7 +290,7 @@ def test_an_arm_s_torques_of_the_wrong_sign_or_unit_are_noticed_without_a_total_
     problem, robot = arm_problem(factor)
     assert force_gain(problem) == pytest.approx(factor, rel=1e-6)
     estimate, unknown = LeastSquares().solve(problem), TotalMass(float("inf"), True, -3.0, 18.0)
-    found = implausible(problem, estimate.phi, unknown, robot)
+    found = implausibility(problem, estimate.phi, unknown, robot)
     assert (found is not None) is stops
     assert ("opposite sign" in (found or "")) is (factor < 0.0)
 
@@ -306,11 +306,11 @@ def test_a_single_body_may_break_conditions_but_not_be_beyond_all_bounds() -> No
     problem, robot = arm_problem()
     unknown, phi = TotalMass(float("inf"), True, 0.0, 18.0), problem.nominal.copy()
     phi[12] = -3.0  # seen in combination with others only: a condition that is broken, and no more
-    assert implausible(problem, phi, unknown, robot) is None
+    assert implausibility(problem, phi, unknown, robot) is None
     phi[12] = 1e11
-    assert "shoulder_link has m = 1e+11" in (implausible(problem, phi, unknown, robot) or "")
+    assert "shoulder_link has m = 1e+11" in (implausibility(problem, phi, unknown, robot) or "")
     phi[12], phi[22] = 3.0, 3.9e161
-    assert "fc = 3.9e+161" in (implausible(problem, phi, unknown, robot) or "")
+    assert "fc = 3.9e+161" in (implausibility(problem, phi, unknown, robot) or "")
 
 
 @pytest.mark.parametrize(
@@ -327,13 +327,13 @@ def test_a_single_body_may_break_conditions_but_not_be_beyond_all_bounds() -> No
 def test_a_total_mass_counts_where_the_data_determine_it(mass: TotalMass, determined: bool, stops: bool) -> None:
     problem, robot = arm_problem()
     assert mass.determined is determined
-    assert (implausible(problem, problem.nominal, mass, robot) is not None) is stops
+    assert (implausibility(problem, problem.nominal, mass, robot) is not None) is stops
 
 
 def test_a_ratio_that_is_no_number_is_absurd() -> None:
-    assert absurd(float("nan"))
-    assert absurd(float("inf"))
-    assert not absurd(1.0)
+    assert beyond_models(float("nan"))
+    assert beyond_models(float("inf"))
+    assert not beyond_models(1.0)
 
 
 # ------------------------------------------------------------------------------------------------------------- the base
@@ -346,7 +346,7 @@ def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
     assert (rank, smallest, full) == (2, 0.0, 1 / 64)
     assert shares == {6: 1 / 64, 2: 63 / 64}
     with pytest.raises(BaseLostError, match=r"rank 2 of 6, 6 in 1.6 % of them"):
-        check_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
+        require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
     rank, smallest, full, shares = _of_base(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
     assert rank == 6, "a sample counts as often as it stands for others"
 

@@ -21,7 +21,7 @@ from unknowns import Fit, fit
 from torchid import parameters
 from torchid.cli import main
 from torchid.estimators import LeastSquares
-from torchid.identifiability.confounding import APART, ExtraEstimate, total_mass
+from torchid.identifiability.confounding import INFLATION_LIMIT, ExtraEstimate, total_mass
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import WRENCH_COMPONENTS
@@ -110,7 +110,7 @@ def test_swing_phases_tell_offsets_from_mass(
     assert len(errors) == 2 * 3 * len(STEPPING)
     assert abs(mass_error(found)) < mass
     assert np.abs(errors).max() < force
-    assert max(x.inflation for x in forces) < 0.5 * APART
+    assert max(x.inflation for x in forces) < 0.5 * INFLATION_LIMIT
     assert total_mass(found.assembly, found.estimate).separable
 
 
@@ -122,7 +122,7 @@ def test_feet_that_never_leave_the_ground_do_not_and_that_is_said_by_a_wide_marg
     found, _ = identified(biped_folder, kind, SQUATTING, mount)
     vertical = [x for x in found.extras if x.extra.component == "fz"]
     assert len(vertical) == 2 * len(SQUATTING)
-    assert min(x.inflation for x in vertical) > 30.0 * APART
+    assert min(x.inflation for x in vertical) > 30.0 * INFLATION_LIMIT
     assert not any(x.separable for x in found.extras)
     assert not total_mass(found.assembly, found.estimate).separable
     assert all(x.confounded_with for x in vertical)

@@ -14,7 +14,7 @@ from torchid import parameters
 from torchid.estimators import LeastSquares
 from torchid.estimators.least_squares import VERDICTS
 from torchid.identifiability.contributions import Contributions, SensorContribution, contributions
-from torchid.identifiability.information import Knowledge, prior_directions, sensor_information
+from torchid.identifiability.information import InformationGain, prior_directions, sensor_information
 from torchid.problem import ExtraTerms, LinearProblem, RowBuilder, Samples, assemble, bind_log, compress, compress_parts
 from torchid.problem.compression import Part, merge_factors
 from torchid.report.tables import contribution_table, table_text, verdict_table
@@ -190,7 +190,7 @@ def test_some_samples_stand_for_all() -> None:
     exact, found = (sensor_information(w.logs, w.builder, most) for most in (4000, 240))
     problem = identified(w)[1]
     N = prior_directions(w.builder, problem.scale * problem.free)
-    bits = [Knowledge.of(np.linalg.eigvalsh(N.T @ one.total @ N)).bits for one in (exact, found)]
+    bits = [InformationGain.of(np.linalg.eigvalsh(N.T @ one.total @ N)).bits for one in (exact, found)]
     assert bits[1] == pytest.approx(bits[0], rel=0.02)
     seen: list[int] = []
     sensor_information(w.logs, w.builder, 240, seen.append)
@@ -212,14 +212,14 @@ def adds(w: World) -> Contributions:
     return contributions(parts, w.logs, builder, problem, w.robot.joint_names)
 
 
-def knowledge(w: World, logs: Sequence[Samples]) -> tuple[Knowledge, int]:
+def knowledge(w: World, logs: Sequence[Samples]) -> tuple[InformationGain, int]:
     """By the definition, from the rows of all parameters; and the rank."""
     _, problem, _ = identified(w, logs)
     A = problem.A[:, problem.free] * problem.scale[problem.free]
     H = A.T @ A / problem.oversampling
     unit = np.eye(len(H))
     bits = 0.5 * np.linalg.slogdet(unit + H).logabsdet / np.log(2.0)
-    return Knowledge(bits, np.trace(np.linalg.solve(unit + H, H))), LeastSquares().solve(problem).rank
+    return InformationGain(bits, np.trace(np.linalg.solve(unit + H, H))), LeastSquares().solve(problem).rank
 
 
 UNKNOWN = {
@@ -243,8 +243,8 @@ def three_logs(request: pytest.FixtureRequest) -> World:
 def test_what_a_log_adds_is_what_a_fit_without_it_lacks(three_logs: World) -> None:
     w, found = three_logs, adds(three_logs)
     whole, rank = knowledge(w, w.logs)
-    assert found.known.bits == pytest.approx(whole.bits, rel=1e-9)
-    assert found.known.determined == pytest.approx(whole.determined, rel=1e-9)
+    assert found.total.bits == pytest.approx(whole.bits, rel=1e-9)
+    assert found.total.determined == pytest.approx(whole.determined, rel=1e-9)
     assert [log.name for log in found.logs] == ["0.npz", "1.npz", "2.npz"]
     for number, log in enumerate(found.logs):
         rest, rank_of_rest = knowledge(w, w.logs[:number] + w.logs[number + 1 :])
@@ -304,8 +304,8 @@ def test_sensors_are_ranked_by_what_a_fit_without_them_lacks(unknown: str) -> No
 def test_half_as_many_independent_samples_tell_as_much_as_half_the_rows(three_logs: World) -> None:
     log = three_logs.logs[1]
     twice = [replace(log, oversampling=5.0), replace(log, source="again.npz", oversampling=5.0)]
-    assert adds(replace(three_logs, logs=twice)).known.bits == pytest.approx(
-        adds(replace(three_logs, logs=[log])).known.bits
+    assert adds(replace(three_logs, logs=twice)).total.bits == pytest.approx(
+        adds(replace(three_logs, logs=[log])).total.bits
     )
 
 

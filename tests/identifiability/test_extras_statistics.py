@@ -18,7 +18,7 @@ from welded import SENSORS, machine
 
 from torchid.config import load_config
 from torchid.errors import ConfigError
-from torchid.identifiability.confounding import APART, total_mass
+from torchid.identifiability.confounding import INFLATION_LIMIT, total_mass
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import WRENCH_COMPONENTS
@@ -182,7 +182,7 @@ def test_an_offset_and_a_weight_are_as_far_apart_as_the_acceleration_is_from_con
     if acceleration:
         assert found.inflation == pytest.approx(np.sqrt((s**2).mean()) / a.std(), rel=1e-6)
         assert found.value == pytest.approx(7.0, abs=1e-6)
-    assert found.separable == (acceleration > 9.81 / APART)
+    assert found.separable == (acceleration > 9.81 / INFLATION_LIMIT)
     if not found.separable:
         assert found.confounded_with == ("arm m",)
         assert (found.standard_error == np.inf) == (acceleration == 0.0)

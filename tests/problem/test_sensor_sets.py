@@ -9,7 +9,7 @@ import pytest
 from synthetic import ANYMAL, Oracle, load, make_log
 
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError
-from torchid.identifiability.rank import StateReport, check_base, state_reports
+from torchid.identifiability.base_rank import StateReport, require_base, state_reports
 from torchid.problem import RowBuilder, bind_log
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, validate_contacts
 
@@ -129,7 +129,7 @@ def test_torque_sensors_see_the_base_in_every_contact_state() -> None:
     assert flight.base_singular_value == pytest.approx(1.0, abs=1e-14)
     assert four.base_singular_value is not None
     assert 1e-6 < four.base_singular_value < 1.0
-    check_base([three, four, flight])
+    require_base([three, four, flight])
 
 
 def test_one_measured_foot_among_four_sees_nothing_of_the_base_but_in_flight() -> None:
@@ -140,7 +140,7 @@ def test_one_measured_foot_among_four_sees_nothing_of_the_base_but_in_flight() -
     with pytest.raises(
         BaseLostError, match="RF_FOOT \\+ LH_FOOT \\+ RH_FOOT \\(30 samples\\): rank 0 of 6; "
     ) as raised:
-        check_base([three, four, flight])
+        require_base([three, four, flight])
     assert "LF_FOOT + RF_FOOT + LH_FOOT + RH_FOOT (20 samples): rank 0 of 6" in str(raised.value)
     assert "none" not in str(raised.value)
     assert "accepted:" in str(raised.value)
@@ -149,10 +149,10 @@ def test_one_measured_foot_among_four_sees_nothing_of_the_base_but_in_flight() -
 def test_who_asks_to_go_on_is_warned() -> None:
     lost = reports(torques=False, first_foot=True)
     with pytest.warns(BaseLostWarning, match="30 samples.*out of reach"):
-        check_base(lost, "warn")
+        require_base(lost, "warn")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_base([lost[2]], "warn")
+        require_base([lost[2]], "warn")
 
 
 def test_a_bolted_base_cannot_be_lost() -> None:
@@ -161,4 +161,4 @@ def test_a_bolted_base_cannot_be_lost() -> None:
     (report,) = state_reports([bind_log(log, robot, FEET)], RowBuilder(robot, FEET, named_sensors("contacts", 12, 4)))
     assert report.base_rank is None
     assert report.base_singular_value is None
-    check_base([report])
+    require_base([report])

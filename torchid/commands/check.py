@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.reading import gigabytes
+from torchid.commands.reading import memory_needed
 from torchid.config import load_analysis
 from torchid.config.experiment import PreprocessingConfig, load_topics
 from torchid.errors import ConfigError, LogError
@@ -109,7 +109,7 @@ def read_log_to_check(path: Path, topics: Topics | None, settings: Preprocessing
     Raises:
         LogError: it cannot be read, or is larger than what may be in memory at once.
     """
-    size = gigabytes(path, settings.memory_gb)
+    size = memory_needed(path, settings.memory_gb)
     if size > settings.memory_gb:
         accepted = f"parts of the log, or an experiment file with a preprocessing.memory_gb above {size:.2g}"
         raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)

@@ -12,7 +12,7 @@ from functools import partial
 from rich.progress import Progress
 
 from torchid.commands.folder import RUN, check_free, claim_folder
-from torchid.commands.plausibility import check_not_worse, check_plausible
+from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, check_training, descent_settings, training_folder
@@ -25,8 +25,8 @@ from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
+from torchid.identifiability.base_rank import StateReport, require_base, state_reports
 from torchid.identifiability.contributions import Contributions, contributions
-from torchid.identifiability.rank import StateReport, check_base, state_reports
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts
 from torchid.problem.compression import Part, merge_folds, merge_states, split_into_folds
@@ -92,7 +92,7 @@ def _prepare(config: ExperimentConfig, source: object, clock: _Clock, bars: Prog
         logs = _read(reader, experiment, bars)
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
-        check_base(states, config.sensors.on_base_lost)
+        require_base(states, config.sensors.on_base_lost)
         noise = experiment.estimate_noise(logs["train"], experiment.sensors)
         experiment = with_noise(experiment, noise)
     with clock("compress"):
@@ -124,7 +124,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
         training, solve = None, None
         with clock("solve"):
             if experiment.config.estimator.name == "sgd":
-                check_plausible(fitter.fit(ready.parts), experiment)
+                require_plausible(fitter.fit(ready.parts), experiment)
                 training = Training(experiment)
                 evaluate = partial(_identified_metrics, evaluation, logs)
                 solve = partial(training.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
@@ -132,7 +132,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             fit, robust = _robust(fit, experiment, fitter, blocks, bars)
             ready.parts = []
             estimate, problem = fit.estimate, fit.assembly.problem
-            mass = check_plausible(fit, experiment)
+            mass = require_plausible(fit, experiment)
             warn_of_confounded(fit.extras, source)
             warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
@@ -163,7 +163,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             validation=validation,
             ridge=ready.ridge,
         )
-        check_not_worse(run.worse, experiment)
+        require_not_worse(run.worse, experiment)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], compared, training)
     return run

@@ -184,7 +184,7 @@ class _Stored:
         return replace(like, base=BaseMotion(**base), oversampling=oversampling, folder=self._folder, **own)
 
 
-def gigabytes(path: Path, memory_gb: float, held: float = 0.0) -> float:
+def memory_needed(path: Path, memory_gb: float, held: float = 0.0) -> float:
     """What the arrays of a log take together with those that are held [GB]; at most that, where that is in `memory_gb`.
 
     A bag counts as nothing: its size is known when it has been read.
@@ -233,7 +233,7 @@ class LogReader:
         """
         limit, logs = self.scene.config.preprocessing.memory_gb, []
         for path in paths:
-            together = gigabytes(path, limit, self._held)
+            together = memory_needed(path, limit, self._held)
             if existing_log_kind(path) is LogKind.BAG:
                 logs.append(self._small(path, required))
                 self._held += logs[-1].nbytes / GIGABYTE

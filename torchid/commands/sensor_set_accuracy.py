@@ -1,4 +1,4 @@
-"""What the choice of sensors costs: accuracy expected from the training logs, and measured on logs no fit has seen."""
+"""Accuracy of sensor sets: expected from the training logs, and measured on the test logs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from rich.progress import Progress
 
-from torchid.commands.plausibility import check_plausible
+from torchid.commands.plausibility import require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.estimator import batch_estimator
@@ -57,7 +57,7 @@ def accuracies(
 
 @dataclass(frozen=True)
 class _Reference:
-    """Sensors that readings are compared with, and what the training logs say of their unknowns."""
+    """Sensors whose readings predictions are compared with, and their extra parameters by the training logs."""
 
     scene: Scene
     builder: RowBuilder
@@ -109,7 +109,7 @@ def _accuracy(
     if settings.chooses_ridge:
         settings = replace(settings, ridge=scene.choose_ridge(parts, blocks, fitter, conditions).ridge)
     fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
-    check_plausible(fit, scene)
+    require_plausible(fit, scene)
     estimate, problem = fit.estimate, fit.assembly.problem
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling

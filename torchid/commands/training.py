@@ -79,7 +79,7 @@ def load_checkpoint(folder: Path) -> dict[str, Any]:
         InputError: the file is damaged, was changed by others than `save_checkpoint`, or is none of ours.
     """
     path = folder / CHECKPOINT
-    with damage_refused(folder):
+    with refusing_damage(folder):
         _check_archive(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of pickles that are not torch's, which it then refuses
@@ -113,7 +113,7 @@ def _digest(value: Any) -> str:
 
 
 @contextmanager
-def damage_refused(folder: Path) -> Iterator[None]:
+def refusing_damage(folder: Path) -> Iterator[None]:
     """Turn whatever reading a checkpoint or taking up its state raises into one line that names the file.
 
     Raises:
@@ -144,10 +144,10 @@ def _check_archive(path: Path) -> None:
 
 def _check_values(state: object) -> None:
     """Refuse tensors that are larger than what is stored of them, settings that would unfold, and endless nesting."""
-    left, seen = [state], 0
+    left, count = [state], 0
     while left:
-        value, seen = left.pop(), seen + 1
-        if seen > MAX_STATE:
+        value, count = left.pop(), count + 1
+        if count > MAX_STATE:
             raise ValueError(f"more than {MAX_STATE} values")
         if isinstance(value, dict):
             left += [*value.keys(), *value.values()]
@@ -299,7 +299,7 @@ class Training:
         """Start a new folder, or take up what is in it."""
         if resume and (self.folder / CHECKPOINT).is_file():
             state = load_checkpoint(self.folder)
-            with damage_refused(self.folder):
+            with refusing_damage(self.folder):
                 self._check(state, trainer)
                 trainer.load_state_dict(state["trainer"])
             self._saved = trainer.epoch

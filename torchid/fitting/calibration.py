@@ -42,7 +42,7 @@ ExtraValues = Mapping[tuple[str, str], float]
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Parameters of the bodies with the extra parameters that suit them, known or fitted anew to every new log.
+    """Parameters of the bodies with the extra parameters that fit them best, known or fitted anew to every new log.
 
     Readings of other logs of the same robot, as calibrated sensors would have recorded them::
 
@@ -169,7 +169,7 @@ def warn_of_confounded(found: Sequence[ExtraEstimate], source: object = "logs") 
         if mixed:
             named = _grouped(x.extra.label for x in mixed)
             others = _grouped(name for x in mixed for name in x.confounded_with if " of " not in name)
-            message = f"{log or source}: {named} confounded with {others or 'each other'}; do not trust either"
+            message = f"{log or source}: {named} are confounded with {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
             warn(f"{message}; {advice}", ConfoundedWarning)
 
@@ -204,7 +204,7 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
         own = [x for x in found if x.log == log]
         named = "; ".join(
             f"{x.extra.name} {x.extra.component} reads {x.in_the_air:.4g} {x.extra.unit} in the air, where "
-            f"{x.in_contact:.4g} +- {x.standard_error:.2g} suits the rest of the data"
+            f"{x.in_contact:.4g} +- {x.standard_error:.2g} fits the rest of the data"
             for x in own[:_NAMED]
         )
         more = f"; and {len(own) - _NAMED} more" if len(own) > _NAMED else ""

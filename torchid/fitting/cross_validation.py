@@ -1,4 +1,4 @@
-"""Cross-validation on blocks of the training logs: how well a fit predicts what it has not seen, and the best ridge."""
+"""Cross-validation on blocks of the training logs: errors on held-out data, and the ridge that predicts it best."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ class Scorer:
     def score_logs(
         self, logs: Sequence[Samples], compared: Comparison[Calibration], progress: ProgressCallback | None = None
     ) -> Comparison[Metrics]:
-        """Errors on logs as recorded, each with the extra parameters that suit the bodies' parameters.
+        """Errors on logs as recorded, each with the extra parameters that fit the bodies' parameters best.
 
         Rows of the fit's sensors count where a log has all their readings.
         """

@@ -126,7 +126,7 @@ class Scene:
         )
 
     def calibrations(self, fit: Fit, builder: RowBuilder) -> Comparison[Calibration]:
-        """Nominal and identified parameters of a fit, with the extra parameters that suit them."""
+        """Nominal and identified parameters of a fit, with the extra parameters that fit them best."""
         return calibrations(fit, self.robot, builder, self.loss)
 
     def estimate_noise(self, logs: Sequence[Samples], sensors: SensorSet | None = None) -> NoiseSummary:

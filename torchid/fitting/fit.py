@@ -1,4 +1,4 @@
-"""Fits of compressed logs: the linear problem that they pose, its solution, and the extra parameters that suit it."""
+"""Fits of compressed logs: the linear problem that they pose, its solution, and the extra parameters."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class GroupNoise:
 
     `origin`: "stated", "estimated", "at most" (drowned in other noise: an upper bound), "confounded" (residuals show
     little but its sum with other noise) or "assumed" (too few readings). `used`: standard deviation that rows were
-    weighed with; `residual`: that of the residuals, None if they cannot tell.
+    weighed with; `residual`: that of the residuals, None if they do not determine it.
     """
 
     group: str
@@ -145,10 +145,18 @@ def _summary(
     deviation = _rounded(rows.reference_std * np.sqrt(free.variance))
     groups = []
     for place, name in enumerate(rows.groups):
-        told = bool(free.estimated[place])
+        determined = bool(free.estimated[place])
         origin = "stated" if name in tied else _origin(free, place)
         unit = "N" if "force" in name else "N m"
-        groups.append(GroupNoise(name, unit, origin, float(used[place]), float(deviation[place]) if told else None))
+        groups.append(
+            GroupNoise(
+                group=name,
+                unit=unit,
+                origin=origin,
+                used=float(used[place]),
+                residual=float(deviation[place]) if determined else None,
+            )
+        )
     noise = noise_of_groups(std_by_group(guess) | {one.group: one.used for one in groups})
     known = {
         name: float(x)
@@ -160,16 +168,16 @@ def _summary(
     return NoiseSummary(noise, groups, _suggested(guess, tied, known), passes)
 
 
-def _origin(found: GroupVariances, place: int) -> str:
-    if not found.estimated[place]:
+def _origin(components: GroupVariances, place: int) -> str:
+    if not components.estimated[place]:
         return "assumed"
-    return "at most" if found.upper_bound[place] else "confounded" if found.confounded[place] else "estimated"
+    return "at most" if components.upper_bound[place] else "confounded" if components.confounded[place] else "estimated"
 
 
 def _suggested(
     stated: SensorNoise, tied: Sequence[str], known: Mapping[str, float]
 ) -> dict[str, float | tuple[float, float, float]]:
-    """What residuals show of stated noise, if no common factor of at most 1 explains it to within a factor of two."""
+    """Noise to state instead, if no common factor of at most 1 brings the stated one within a factor of two."""
     before = std_by_group(stated)
     ratios = [known[name] / before[name] for name in tied if name in known]
     if not ratios or (max(ratios) <= _APART and max(ratios) <= _APART**2 * min(ratios)):

@@ -145,7 +145,7 @@ def fit_extras_robustly(
     Args:
         log: a bound log.
         builder: of its rows.
-        solve: the extra parameters that suit compressed parts of the log best.
+        solve: the extra parameters that fit compressed parts of the log best.
         columns: all parameters in the builder's columns for given extra parameters, (width,).
         loss: what residuals cost.
     """

@@ -1,4 +1,4 @@
-"""How far off a fit is expected to be, before anything unseen is measured."""
+"""Expected errors of a fit: of its parameters, and of the forces that it predicts on any motion."""
 
 from __future__ import annotations
 
@@ -10,51 +10,14 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from torchid.identifiability.information import triangle
+from torchid.identifiability.information import triangular_factor
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import one_thread, subsample_states
 from torchid.problem.contact_state import State
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components
 from torchid.problem.predict import predicted_forces
-from torchid.rounding import RANK_TOLERANCE, is_significant
 from torchid.sensing import SensorNoise
-
-
-@one_thread()
-def error_directions(
-    problem: LinearProblem,
-    ridge: float,
-    noise_variance: float,
-    prior_error: float,
-    rank_tolerance: float = RANK_TOLERANCE,
-) -> Array:
-    """Independent errors of least squares with a ridge, (M, P): their outer products sum up to the error's covariance.
-
-    Along each right singular vector of the scaled problem, with singular value s and r = ridge * rows, the noise of the
-    rows enters by s / (s^2 + r) and the error of the nominal parameters stays by r / (s^2 + r); along directions that
-    no row sees it stays in full. This is exact for white noise and independent nominal errors of one size.
-
-    Args:
-        problem: of the training logs.
-        ridge: of the fit.
-        noise_variance: of the whitened rows, as if they were independent.
-        prior_error: standard deviation of the nominal parameters, as a share of `problem.scale`.
-        rank_tolerance: of the fit.
-    """
-    scale = problem.scale[problem.free]
-    _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, lapack_driver="gesvd")  # see `base_parameters`
-    values = np.pad(values, (0, len(scale) - len(values)))
-    values[~is_significant(values, rank_tolerance)] = 0.0
-    pull = ridge * problem.rows
-    with np.errstate(invalid="ignore", divide="ignore"):
-        through = np.where(values > 0.0, values / (values**2 + pull), 0.0)
-        kept = np.where(values > 0.0, pull / (values**2 + pull), 1.0)
-    length = np.hypot(np.sqrt(noise_variance) * through, prior_error * kept)
-    directions = np.zeros((len(scale), len(problem.free)))
-    directions[:, problem.free] = length[:, None] * Vh * scale
-    return directions
-
 
 _SAMPLES = 400  # a contact state
 
@@ -63,8 +26,8 @@ _SAMPLES = 400  # a contact state
 class ExpectedErrors:
     """Rms by group of rows: of the model's own error, and of what it is compared with.
 
-    The latter is the noise of torque and contact sensors, and on the base rows that of the differentiated motion, which
-    the floors `SensorNoise.base` stand for.
+    The latter is the noise of torque and contact sensors, and on the base rows that of the differentiated motion,
+    `SensorNoise.base`.
     """
 
     model: dict[str, float | None]
@@ -72,9 +35,9 @@ class ExpectedErrors:
 
     @property
     def total(self) -> dict[str, float | None]:
-        """What a comparison with measured forces is to show."""
-        both = {group: (self.model[group], self.sensors[group]) for group in ROW_GROUPS}
-        return {group: None if x is None or y is None else float(np.hypot(x, y)) for group, (x, y) in both.items()}
+        """Expected difference between predicted and measured forces."""
+        pairs = {group: (self.model[group], self.sensors[group]) for group in ROW_GROUPS}
+        return {group: None if x is None or y is None else float(np.hypot(x, y)) for group, (x, y) in pairs.items()}
 
 
 @one_thread()
@@ -82,7 +45,7 @@ class ExpectedErrors:
 def expected_errors(
     builder: RowBuilder, logs: Sequence[Samples], directions: Array, noise: SensorNoise
 ) -> ExpectedErrors:
-    """Errors on some logs.
+    """Expected errors of predicted forces on some logs.
 
     Args:
         builder: of an `Evaluation`.
@@ -90,9 +53,9 @@ def expected_errors(
         directions: (M, 12 L), independent errors of the parameters, as `error_directions` gives them.
         noise: of the sensors that recorded these logs, with its floors of the base rows.
     """
-    columns = torch.from_numpy(triangle(directions @ builder.columns.parameter_map().T)).to(builder.device)
-    base, n_rows = builder.tree.base_rows, builder.tree.n_rows
-    model, sensors = ForceSums(n_rows), ForceSums(n_rows)
+    columns = torch.from_numpy(triangular_factor(directions @ builder.columns.parameter_map().T)).to(builder.device)
+    base, nv = builder.tree.base_rows, builder.tree.base_rows + len(builder.columns.joint_rows)
+    model, sensors = ForceSums(nv), ForceSums(nv)
     for samples, state, weight in subsample_states(logs, _SAMPLES):
         samples = samples.to(builder.device)
         terms = builder.dynamics(samples)
@@ -108,6 +71,37 @@ def expected_errors(
                 sums.projected.add(_together(inside).flatten()[:, None], weight)
     found = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
     return ExpectedErrors(*({group: finite_or_none(rms[group]) for group in ROW_GROUPS} for rms in found))
+
+
+@one_thread()
+def error_directions(
+    problem: LinearProblem, ridge: float, noise_variance: float, prior_error: float, rank_tolerance: float = 1e-10
+) -> Array:
+    """Independent errors of least squares with a ridge, (M, P): their outer products sum up to the error's covariance.
+
+    Along each right singular vector of the scaled problem, with singular value s and r = ridge * rows, the noise of the
+    rows enters by s / (s^2 + r) and the error of the nominal parameters stays by r / (s^2 + r); along directions that
+    no row depends on it stays in full. This is exact for white noise and independent nominal errors of one size.
+
+    Args:
+        problem: of the training logs.
+        ridge: of the fit.
+        noise_variance: of the whitened rows, as if they were independent.
+        prior_error: standard deviation of the nominal parameters, as a share of `problem.scale`.
+        rank_tolerance: of the fit.
+    """
+    scale = problem.scale[problem.free]
+    _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, lapack_driver="gesvd")  # see `base_parameters`
+    values = np.pad(values, (0, len(scale) - len(values)))
+    values[values <= rank_tolerance * values.max(initial=0.0)] = 0.0
+    prior = ridge * problem.rows
+    with np.errstate(invalid="ignore", divide="ignore"):
+        through = np.where(values > 0.0, values / (values**2 + prior), 0.0)
+        kept = np.where(values > 0.0, prior / (values**2 + prior), 1.0)
+    length = np.hypot(np.sqrt(noise_variance) * through, prior_error * kept)
+    directions = np.zeros((len(scale), len(problem.free)))
+    directions[:, problem.free] = length[:, None] * Vh * scale
+    return directions
 
 
 def _together(errors: Tensor) -> Tensor:

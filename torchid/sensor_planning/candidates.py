@@ -125,7 +125,7 @@ def sensor_set(
     return SensorSet(torque, wrench, noise or SensorNoise())
 
 
-def chosen_from(
+def contained_candidates(
     contacts: Sequence[Contact], sensors: SensorSet, candidates: Sequence[Candidate]
 ) -> tuple[Candidate, ...]:
     """The candidates that a sensor set contains: those all of whose readings are measured."""
