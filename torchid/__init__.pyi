@@ -10,7 +10,7 @@ from .estimators import (
     LogCholeskyParameters,
     Sgd,
     Trainer,
-    project,
+    nearest_consistent,
     violations,
 )
 from .identifiability.base_parameters import (
@@ -113,7 +113,7 @@ __all__ = [
     "motion_from_state",
     "named_sensors",
     "preprocess",
-    "project",
+    "nearest_consistent",
     "read_log",
     "structural_problem",
     "violations",

@@ -13,8 +13,8 @@ from torchid.config.sensors import STRICT
 from torchid.errors import ConfigError
 from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.conditions import EnclosureKind
+from torchid.estimators.conic_formulation import Prior
 from torchid.estimators.consistent import Method
-from torchid.estimators.formulate import Prior
 from torchid.estimators.sgd import Consistency
 from torchid.settings import BelowOne, Count, NotNegative, Number, Positive, Seed, Tolerance
 

@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.estimators import Estimate
-from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
+from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contribution, Contributions, PartContribution
 from torchid.parameters import PARAMETERS, PER_BODY
@@ -26,7 +26,7 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import SHOWN
 from torchid.text import escaped, unescaped
 
-MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
+MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNOBSERVABLE: ".", FIXED: ""}
 
 
 class PlainConsole(Console):
