@@ -9,7 +9,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.parameters import PER_BODY, Array
-from torchid.settings import BelowOne, Positive, check_settings
+from torchid.settings import BelowOne, Positive, validate_settings
 
 EnclosureKind = Literal["box", "ellipsoid"]
 
@@ -32,7 +32,7 @@ class Enclosure:
 
     def __post_init__(self) -> None:
         """Check kind, place and size."""
-        check_settings(self)
+        validate_settings(self)
         if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
             raise ValueError(f"centre: found {_short(self.centre)}; accepted: three finite numbers")
         if np.shape(self.half) != (3,) or not (np.isfinite(self.half).all() and (self.half > 0.0).all()):
@@ -92,7 +92,7 @@ class Conditions:
 
     def __post_init__(self) -> None:
         """Check the numbers; `bounds` checks those by body."""
-        check_settings(self)
+        validate_settings(self)
 
     def body_name(self, body: int) -> str:
         """The name of a body in messages."""

@@ -13,7 +13,7 @@ from torchid.errors import InputError
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
-from torchid.settings import NotNegative, Tolerance, check_settings
+from torchid.settings import NotNegative, Tolerance, validate_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
 UNOBSERVABLE, FIXED = "cannot be seen", "fixed"
@@ -152,7 +152,7 @@ class Regularized:
         Raises:
             ValueError: names the first that is not accepted.
         """
-        check_settings(self)
+        validate_settings(self)
 
     @property
     def least_squares(self) -> LeastSquares:

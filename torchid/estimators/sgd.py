@@ -16,7 +16,7 @@ from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.least_squares import Regularized
 from torchid.estimators.optimizers import try_out
 from torchid.problem import Batch, LinearProblem, MiniBatches
-from torchid.settings import BelowOne, Count, NamedClass, NotNegative, Positive, check_settings
+from torchid.settings import BelowOne, Count, NamedClass, NotNegative, Positive, validate_settings
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class PenaltyWeights:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_settings(self)
+        validate_settings(self)
 
     @property
     def curvature(self) -> float:
