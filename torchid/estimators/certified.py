@@ -7,7 +7,7 @@ import warnings
 import cvxpy as cp
 import numpy as np
 
-from torchid.errors import InputError, NumericalWarning
+from torchid.errors import InputError, NumericalWarning, warn
 from torchid.estimators.barrier import find_strictly_feasible
 from torchid.estimators.conic_problem import ConicProblem, Solution
 from torchid.parameters import Array
@@ -51,7 +51,7 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
         return best
     message = f"estimator: the conic solver stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
     message += f", {_violation(problem, best):.1g} outside the conditions"
-    warnings.warn(message, NumericalWarning, stacklevel=4)
+    warn(message, NumericalWarning)
     return best
 
 

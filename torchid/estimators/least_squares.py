@@ -13,7 +13,7 @@ from torchid.errors import InputError
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
-from torchid.rounding import RANK_TOLERANCE, relative_tolerance
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
 from torchid.settings import NotNegative, Tolerance, validate_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
@@ -131,7 +131,6 @@ def report_rounding(estimator: str) -> Iterator[None]:
 
 
 _OBSERVABLE = 1e-12  # squared share in the row space: a finger's in a sum with the trunk's mass is 1e-7
-_IDENTIFIABLE = 1e-6  # share in the null space: far above rounding (1e-10 on a humanoid), below any found (1e-4)
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ class LeastSquares(Regularized):
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         observable, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
-        observable[free], identifiable[free] = null_share**2 < 1.0 - _OBSERVABLE, null_share < _IDENTIFIABLE
+        observable[free], identifiable[free] = null_share**2 < 1.0 - _OBSERVABLE, null_share < UNOBSERVABLE_SHARE
         standard_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
         standard_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
         standard_error[~identifiable] = np.nan

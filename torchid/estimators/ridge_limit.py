@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchid.errors import InputError, NumericalWarning
+from torchid.errors import InputError, NumericalWarning, warn
 from torchid.estimators.barrier import find_strictly_feasible, solve_barrier
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.conic_formulation import Prior, build_conic_problem
@@ -198,7 +198,7 @@ class _RegularizationPath:
             f"beyond belief ({self.largest_deviation(steps[-1]):.0f} scales); taken is the least prior at the misfit "
         )
         message += f"expected of the true parameters, as with ridge {below.ridge:.1g}; accepted: a ridge"
-        warnings.warn(message, NumericalWarning, stacklevel=6)
+        warn(message, NumericalWarning)
         return below.limit
 
 
