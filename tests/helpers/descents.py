@@ -57,7 +57,7 @@ def demo() -> World:
 def true_arm(robot: Robot) -> Array:
     """Parameters (L, 12) of a bolted arm that differs from its URDF and has friction."""
     rng = np.random.default_rng(0)
-    truth = parameters.perturbed(robot.nominal, 0.3, rng)
+    truth = parameters.perturb_parameters(robot.nominal, 0.3, rng)
     truth[1:, 10:] = rng.uniform(0.5, 2.0, truth[1:, 10:].shape)
     return truth
 

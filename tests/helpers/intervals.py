@@ -44,6 +44,6 @@ def noisy_torques(samples: Samples, builder: RowBuilder, rng: np.random.Generato
     held = -J[:, :, 6:].transpose(0, 2, 1) @ borne  # (N, n, 6)
     assert samples.torque is not None
     while True:
-        pushes = noise.base * rng.normal(size=(len(samples), 6))
+        pushes = noise.base_std * rng.normal(size=(len(samples), 6))
         error = noise.joint_torque * rng.normal(size=samples.torque.shape) + (held @ pushes[..., None])[..., 0]
         yield replace(samples, torque=samples.torque + torch.from_numpy(error))
