@@ -115,7 +115,7 @@ def library_path(file: Path) -> None:
     log = torchid.preprocess(
         torchid.read_log(file.parent / settings["logs"]["train"][0]), **settings.get("preprocessing", {})
     )
-    samples = torchid.bind(log, robot, contacts, required=sensor_set)
+    samples = torchid.bind_log(log, robot, contacts, required=sensor_set)
     builder = torchid.RowBuilder(robot, contacts, sensor_set)
     problem = torchid.linear_problem(torchid.compress([samples], builder), builder, robot)
     torchid.LeastSquares(ridge=settings["estimator"]["ridge"]).solve(problem)

@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import Tensor, nn
 
 import torchid
-from torchid.boundary import guarded
+from torchid.boundary import run_guarded
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError
@@ -60,7 +60,7 @@ def main() -> int:
     parser.add_argument("--weight", type=float, help="of the networks' force in the loss; chosen if not given")
     parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="folder for TensorBoard")
     options = parser.parse_args()
-    return guarded("train_residual", lambda: compare(options))
+    return run_guarded("train_residual", lambda: compare(options))
 
 
 def compare(options: argparse.Namespace) -> None:

@@ -19,7 +19,7 @@ from synthetic import Array, random_states
 import torchid
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.chunks import by_state
+from torchid.problem.chunks import chunks_by_state
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
@@ -39,7 +39,7 @@ def random_samples(count: int = 60) -> tuple[Samples, tuple[torch.Tensor, ...]]:
         joint_position=q[:, 7:],
         joint_velocity=v[:, 6:],
         joint_acceleration=a[:, 6:],
-        base=BaseMotion.of(q, v, a),
+        base=BaseMotion.from_coordinates(q, v, a),
         torque=torch.from_numpy(20.0 * rng.normal(size=(count, ROBOT.n))),
         wrench=torch.from_numpy(wrench),
         wrench_in_world=False,
@@ -72,7 +72,7 @@ def by_public_modules(sensors: torchid.SensorSet) -> tuple[Array, Array]:
         sensors.wrench[:, FORCE].flatten(),
         torque_noise=NOISE.joint_torque,
         wrench_noise=NOISE.contact_force,
-        base_noise=torch.from_numpy(NOISE.base),
+        base_noise=torch.from_numpy(NOISE.base_std),
     )
     active = samples.active.repeat_interleave(len(FORCE), dim=1)
     groups = project(J_C, active, K, samples.torque, samples.wrench[..., FORCE].flatten(1))
@@ -87,9 +87,9 @@ def by_row_builder(sensors: torchid.SensorSet) -> tuple[Array, Array]:
     """The same of the fast path, its columns expanded to the bodies' parameters."""
     samples, _ = random_samples()
     builder = RowBuilder(ROBOT, FEET, sensors)
-    rows = torch.cat([builder.rows_by_sample(samples[index], state)[0] for state, index in by_state(samples)])
+    rows = torch.cat([builder.rows_by_sample(samples[index], state)[0] for state, index in chunks_by_state(samples)])
     rows = rows.flatten(0, 1).numpy()
-    return rows[:, :-1] @ builder.columns.from_parameters(), rows[:, -1]
+    return rows[:, :-1] @ builder.columns.parameter_map(), rows[:, -1]
 
 
 @pytest.mark.parametrize("name", SENSOR_SETS)

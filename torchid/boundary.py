@@ -1,4 +1,4 @@
-"""The boundary between a command and its user: whatever stops a command is told in one line of plain text."""
+"""The boundary between a command and its user: whatever stops a command is reported in one line of plain text."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from torchid.errors import BaseLostError, InputError, TorchidWarning, doing_of
-from torchid.staging import begin, ending_interrupts, written
+from torchid.errors import BaseLostError, InputError, TorchidWarning, activity_of
+from torchid.staging import forget_written, list_written, termination_as_interrupt
 from torchid.text import EscapedStream, one_line
 
 #: What the machine refuses, and not the user's files nor the program: no room, no memory, no permission.
@@ -22,8 +22,8 @@ _NUMERICAL = (RuntimeWarning,)
 _HOW = "--debug shows where"
 
 
-def guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
-    """Run a command so that whatever stops it is told in one line.
+def run_guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
+    """Run a command so that whatever stops it is reported in one line.
 
     What is written meanwhile, by whomever, has control characters as escapes. Libraries' warnings of numbers become a
     line of ours, for they may touch results; their other warnings, and what they log, tell users nothing that they
@@ -42,8 +42,8 @@ def guarded(program: str, command: Callable[[], int | None], debug: bool = False
         warnings.simplefilter("always", TorchidWarning)
         warnings.showwarning = _Warnings(program, debug)
         try:
-            begin()
-            with ending_interrupts():
+            forget_written()
+            with termination_as_interrupt():
                 status = command() or 0
             sys.stdout.flush()
             return status
@@ -51,21 +51,21 @@ def guarded(program: str, command: Callable[[], int | None], debug: bool = False
             _forget(sys.stdout)
             return 1
         except KeyboardInterrupt as interrupt:
-            _say(program, str(interrupt) or f"interrupted; {written()} was written")
+            _say(program, str(interrupt) or f"interrupted; {list_written()} was written")
             return 1
-        except Exception as error:  # a full disk, or a bug: still no wall of text unless asked for
+        except Exception as error:  # a full disk, or a bug: still one line, unless --debug is given
             if debug:
                 traceback.print_exc()
-            status, line = told(error)
+            status, line = describe_error(error)
             _say(program, line)
             return status
 
 
-def told(error: Exception) -> tuple[int, str]:
+def describe_error(error: Exception) -> tuple[int, str]:
     """Exit status and the one line that says what stopped a command."""
     if isinstance(error, (InputError, BaseLostError)):
         return 2, str(error)
-    doing = doing_of(error)
+    doing = activity_of(error)
     where = f"{doing}: " if doing else ""
     if isinstance(error, MemoryError):
         return 1, f"{where}not enough memory ({str(error) or 'the system gives no more'}); accepted: smaller logs"

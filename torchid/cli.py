@@ -10,9 +10,9 @@ from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torchid import __version__
-from torchid.boundary import guarded, plain_streams
+from torchid.boundary import plain_streams, run_guarded
 from torchid.errors import during
-from torchid.staging import interrupt_held_back as _interrupt_held_back
+from torchid.staging import interrupts_deferred as _interrupt_held_back
 
 if TYPE_CHECKING:
     from torchid.commands import Identification
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchid.fitting.cross_validation import CrossValidation
     from torchid.fitting.noise import NoiseSummary
     from torchid.identifiability.confounding import TotalMass
-    from torchid.problem.metrics import Worse
+    from torchid.problem.metrics import WorseThanNominal
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
     with plain_streams():  # argparse repeats what it does not understand
         options = _options(arguments)
-    return guarded("torchid", lambda: _command(options), options.debug)
+    return run_guarded("torchid", lambda: _command(options), options.debug)
 
 
 def _command(options: argparse.Namespace) -> int | None:
@@ -45,7 +45,7 @@ def _command(options: argparse.Namespace) -> int | None:
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says; overrides may also come after options, where argparse takes them for strangers."""
+    """What the command line says; overrides may also come after options, which argparse does not know."""
     parser = _parser()
     options, late = parser.parse_known_args(arguments)
     if late and (not hasattr(options, "overrides") or any(text.startswith("-") for text in late)):
@@ -174,17 +174,23 @@ def _print_fit(run: Identification) -> None:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
 
 
-def _print_headline(worse: list[Worse]) -> None:
-    from torchid.problem.metrics import ADVICE, verdict
+def _print_headline(worse: list[WorseThanNominal]) -> None:
+    from torchid.problem.metrics import ADVICE, describe_worse
 
-    for line in (f"WORSE THAN URDF: {verdict(worse)}", f"{ADVICE}; the results are written all the same, status 0"):
+    for line in (
+        f"WORSE THAN URDF: {describe_worse(worse)}",
+        f"{ADVICE}; the results are written all the same, status 0",
+    ):
         print(fill(line, 100, subsequent_indent="  "))
 
 
 def _print_validation(found: CrossValidation) -> None:
-    from torchid.problem.metrics import JUDGED, described
+    from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 
-    texts = (described(group, found.identified.rms.get(group), found.nominal.rms.get(group)) for group in JUDGED)
+    texts = (
+        describe_errors(group, found.identified.rms.get(group), found.nominal.rms.get(group))
+        for group in DECISIVE_GROUPS
+    )
     text = f"held out      each of {found.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
     print(fill(text, 100, subsequent_indent=" " * 14))
 
@@ -194,7 +200,7 @@ def _mass_text(mass: TotalMass) -> str:
     if mass.determined:
         return f"{mass.value:.3f} ± {mass.standard_error:.2g} kg"
     if not mass.separable:
-        return "not determined: the data do not tell it from offsets"
+        return "not determined: confounded with offsets"
     known = f", standard error {mass.standard_error:.2g} kg" if isfinite(mass.standard_error) else ""
     return f"not determined by the data{known}"
 
@@ -212,9 +218,9 @@ def _evaluate(options: argparse.Namespace) -> None:
         from torchid.commands.evaluate import evaluate
         from torchid.report.tables import error_tables, print_tables
 
-    metrics, output = evaluate(options.run, options.log, options.device)
-    print_tables(*error_tables(metrics))
-    print(f"written to    {output}")
+    found = evaluate(options.run, options.log, options.device)
+    print_tables(*error_tables(found.metrics))
+    print(f"written to    {found.output}")
 
 
 def _analyze(options: argparse.Namespace) -> None:
@@ -233,22 +239,29 @@ def _analyze(options: argparse.Namespace) -> None:
 
 
 def _print_scenario(scenario: ScenarioAnalysis) -> None:
-    from torchid.report.analysis import branch_table, check_lines, check_table, removal_table, set_text, sets_table
+    from torchid.report.analysis import (
+        branch_table,
+        describe_losses,
+        join_names,
+        observability_table,
+        removal_table,
+        sets_table,
+    )
     from torchid.report.tables import print_tables
 
     plan, base = scenario.plan, scenario.base
     print(f"Scenario {scenario.name}")
     print_tables(branch_table(plan), *([sets_table(plan.parts)] if plan.parts else []))
     proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
-    print(fill(f"chosen        {set_text(plan.chosen)}", 100, subsequent_indent=" " * 14))
+    print(fill(f"chosen        {join_names(plan.chosen)}", 100, subsequent_indent=" " * 14))
     print(f"cost          {plan.cost:g}; {proof}")
-    named = {"Chosen sensors": plan.checks}
-    if scenario.proposed is not None and scenario.proposed is not plan.checks:
+    named = {"Chosen sensors": plan.observability}
+    if scenario.proposed is not None and scenario.proposed is not plan.observability:
         named["Proposed sensors"] = scenario.proposed
     for title, checks in named.items():
         if checks:
-            print_tables(check_table(title, checks))
-        for line in check_lines(checks) if title != "Chosen sensors" or plan.parts else []:
+            print_tables(observability_table(title, checks))
+        for line in describe_losses(checks) if title != "Chosen sensors" or plan.parts else []:
             print(fill(line, 100, subsequent_indent="  "))
     if plan.removals:
         print_tables(removal_table(plan))
@@ -260,19 +273,19 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     with _interrupt_held_back():
-        from torchid.commands.check import check_files, check_outputs, write_outputs
-        from torchid.report.log_checks import heading, hygiene_table, not_checked
+        from torchid.commands.check import check_files, check_outputs, write_check_outputs
+        from torchid.report.log_checks import finding_table, log_heading, skipped_checks_text
         from torchid.report.tables import print_tables
 
     check_outputs(options.json, options.figure, options.overwrite, (options.file, options.urdf, options.topics))
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
-    write_outputs(checked, options.json, options.figure)
+    write_check_outputs(checked, options.json, options.figure)
     for one in checked:
-        print(heading(one))
+        print(log_heading(one))
         if one.findings:
-            print_tables(hygiene_table(one.findings))
-        if missing := not_checked(one):
+            print_tables(finding_table(one.findings))
+        if missing := skipped_checks_text(one):
             print(fill(f"not checked   {missing}", 100, subsequent_indent=" " * 14))
         print(fill(f"verdict       {one.verdict}", 100, subsequent_indent=" " * 14))
         print()

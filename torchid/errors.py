@@ -71,7 +71,7 @@ class UnknownNameError(InputError, KeyError):
         """Take the name and those that are valid; `what` the name stands for elsewhere, if it is not unknown."""
         self.name, self.valid, self.what = name, tuple(valid), what
         found = f"'{name}', {what}" if what else f"unknown name '{name}'"
-        super().__init__(source, field, found, nearest(name, self.valid))
+        super().__init__(source, field, found, nearest_names(name, self.valid))
 
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self.source, self.field, self.name, self.valid, self.what)
@@ -120,7 +120,7 @@ def warn(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
     warnings.warn(message, category, stacklevel=level)
 
 
-def install(extra: str) -> str:
+def how_to_install(extra: str) -> str:
     """How to install the packages of an extra; the name torchid on PyPI is not ours."""
     return f"pip install '.[{extra}]' in the clone of torchid"
 
@@ -155,17 +155,17 @@ def during(doing: str, source: object) -> Iterator[None]:
         with about_file(source):
             yield
     except Exception as error:
-        if not doing_of(error):
+        if not activity_of(error):
             error._torchid_doing = f"{doing} {source}"  # type: ignore[attr-defined]
         raise
 
 
-def doing_of(error: BaseException) -> str:
+def activity_of(error: BaseException) -> str:
     """What was being done when an error came up, as `during` noted; empty if it did not."""
     return str(getattr(error, "_torchid_doing", ""))
 
 
-def nearest(name: str, valid: Iterable[str], limit: int = 3) -> str:
+def nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:
     """The names in `valid` closest to `name`, or the first few of them, as one readable string."""
     valid = list(valid)
     close = difflib.get_close_matches(name, valid, n=limit, cutoff=0.5)

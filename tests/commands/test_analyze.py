@@ -21,10 +21,10 @@ from torchid.commands.reading import LogReader
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
 from torchid.identifiability.expected_error import ExpectedErrors
-from torchid.problem.metrics import GROUPS
-from torchid.report.analysis import SetAccuracy, accuracy_figure, check_lines
+from torchid.problem.metrics import ROW_GROUPS
+from torchid.report.analysis import SetAccuracy, accuracy_figure, describe_losses
 from torchid.report.tree_figure import tree_figure
-from torchid.sensor_planning.check import PostureSummary, StateCheck
+from torchid.sensor_planning.observability import BaseObservability, PostureSummary
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 FEET = tuple(f"{leg}_foot" for leg in LEGS)
@@ -259,16 +259,16 @@ def test_no_two_labels_of_the_tree_lie_on_each_other(experiment: Path) -> None:
 
 
 def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
-    def checked(low: float) -> StateCheck:
+    def checked(low: float) -> BaseObservability:
         random, zero = PostureSummary(6, 0.1, low, low), PostureSummary(6, 0.1, 0.1, 0.1)
-        return StateCheck((True,), "sole", random, zero, None, None, ())
+        return BaseObservability((True,), "sole", random, zero, None, None, ())
 
-    (line,) = check_lines([checked(1e-3), checked(1e-8)])
+    (line,) = describe_losses([checked(1e-3), checked(1e-8)])
     assert "in 1 of 2 contact states" in line
 
 
 def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
-    rms = {group: 0.05 for group in GROUPS}
+    rms = {group: 0.05 for group in ROW_GROUPS}
     expected = ExpectedErrors(rms, rms)
     figure = accuracy_figure({name: SetAccuracy(1, 1, expected, None) for name in ("full", "joints")})
     figure.savefig(io.BytesIO())
@@ -339,7 +339,7 @@ def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
     with pytest.warns(TorchidWarning):  # fitted on what it is tested on
         analysis = analyze(load_analysis(file), file)
     (scenario,) = analysis.scenarios
-    assert scenario.plan.question.criterion == "stack"
+    assert scenario.plan.problem.criterion == "stack"
     assert scenario.plan.stack_rank == scenario.plan.stack_full == scenario.base.rank - 2 * len(TORQUES)
     assert scenario.plan.cost < len(TORQUES)
     assert set(analysis.accuracies) == {"proposed", "planned for logs"}

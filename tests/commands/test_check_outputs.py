@@ -25,7 +25,7 @@ def test_an_interrupt_between_the_files_says_which_one_was_written(
     def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(check, "hygiene_figure", interrupted)
+    monkeypatch.setattr(check, "log_check_figure", interrupted)
     assert main(given) == 1
     said = capsys.readouterr().err.splitlines()
     assert said[-1] == f"torchid: interrupted; {tmp_path / 'found.json'} was written"

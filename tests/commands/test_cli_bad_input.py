@@ -16,7 +16,7 @@ from refusals import files_in, refusal
 from torchid.cli import _interrupt_held_back, main
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
-from torchid.problem.extras import extras_of
+from torchid.problem.extras import list_extras
 
 Edit = Callable[[Path], None]
 
@@ -277,7 +277,7 @@ def test_a_limb_sensor_is_planned_at_a_fixed_joint_only(experiment: Path, capsys
 @pytest.mark.parametrize("scope", ["log", "all"])
 def test_a_scope_alone_is_that_of_the_channels_that_are_measured(experiment: Path, scope: str) -> None:
     scene = set_up(load_config(experiment / "quadruped.yaml", [f"sensors.offsets={scope}", f"sensors.scales={scope}"]))
-    extras = extras_of(scene.robot, scene.contacts, scene.sensors, scene.terms)
+    extras = list_extras(scene.robot, scene.contacts, scene.sensors, scene.terms)
     assert {x.name for x in extras} == set(scene.robot.joint_names)
 
 

@@ -20,7 +20,7 @@ from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log, write_log
-from torchid.problem import ExtraTerms, bind
+from torchid.problem import ExtraTerms, bind_log
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 
 EXACT = 1e-7
@@ -148,7 +148,7 @@ def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(run
             values=shared,
             loss=experiment.loss,
         )
-        (read,) = calibration.logs([bind(new, experiment.robot, CONTACTS)])
+        (read,) = calibration.logs([bind_log(new, experiment.robot, CONTACTS)])
         expected = torque - run.off[str(run.folder / "new.npz")].torque
         errors[robust] = np.abs(value(read.torque)[:, : len(expected[0])].numpy() - expected).max()
     assert errors["null"] > 1.0

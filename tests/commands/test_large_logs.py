@@ -24,7 +24,7 @@ from motions import RATE
 
 from torchid.errors import InputError, LogError, TorchidWarning
 from torchid.logs import read_log, write_log
-from torchid.logs.blocks import open_blocks, size_of
+from torchid.logs.blocks import log_bytes, open_log_blocks
 from torchid.logs.timeline import lay_out_timeline
 
 SETTINGS = {
@@ -172,20 +172,20 @@ def test_the_size_of_a_log_is_known_before_it_is_read(tmp_path: Path) -> None:
     numbers = sum(x[:1].size for x in fields.values() if len(x) == 2_000)
     experiment(tmp_path, fields, ".csv")
     write_log(read_log(tmp_path / "log.npz"), tmp_path / "log.parquet")
-    assert size_of(tmp_path / "log.parquet", 0.0) == 8 * 2_000 * numbers
-    assert size_of(tmp_path / "log.csv", 0.0) == pytest.approx(8 * 2_000 * numbers, rel=1e-3)
-    most = size_of(tmp_path / "log.csv", 1e9)
+    assert log_bytes(tmp_path / "log.parquet", 0.0) == 8 * 2_000 * numbers
+    assert log_bytes(tmp_path / "log.csv", 0.0) == pytest.approx(8 * 2_000 * numbers, rel=1e-3)
+    most = log_bytes(tmp_path / "log.csv", 1e9)
     assert 8 * 2_000 * numbers <= most == 4 * (tmp_path / "log.csv").stat().st_size, "a small file is not counted"
-    stored = size_of(tmp_path / "log.npz", 0.0)
+    stored = log_bytes(tmp_path / "log.npz", 0.0)
     assert stored == pytest.approx(sum(x.nbytes for x in fields.values()), abs=4_000)
     with pytest.raises(LogError, match="no such file"):
-        size_of(tmp_path / "other.npz", 0.0)
+        log_bytes(tmp_path / "other.npz", 0.0)
 
 
 def test_signs_of_quaternions_go_on_across_blocks_that_overlap_touch_or_start_anew(tmp_path: Path) -> None:
     experiment(tmp_path, recorded(1_000))
     whole = read_log(tmp_path / "log.npz").base_quat_xyzw
     assert whole is not None
-    with open_blocks(tmp_path / "log.npz", tmp_path) as blocks:
+    with open_log_blocks(tmp_path / "log.npz", tmp_path) as blocks:
         for first, last in ((0, 2), (0, 400), (380, 700), (700, 701), (701, 1_000)):
             np.testing.assert_array_equal(blocks.read(slice(first, last)).base_quat_xyzw, whole[first:last])

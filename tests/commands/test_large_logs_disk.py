@@ -35,10 +35,10 @@ from torchid.config import load_config
 from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import set_up
 from torchid.logs import read_log
-from torchid.logs.blocks import open_blocks, size_of
+from torchid.logs.blocks import log_bytes, open_log_blocks
 from torchid.logs.spill import Spill, SpillError
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.predict import calibrated
+from torchid.problem.predict import calibrate_readings
 
 IDENTIFY = ("estimator.ridge=0.001", "sensors=joints")
 
@@ -59,7 +59,7 @@ def test_the_parameters_are_the_same(tmp_path: Path) -> None:
 
 def test_logs_that_fit_one_by_one_but_not_together_go_to_the_disk_when_the_limit_is_reached(tmp_path: Path) -> None:
     file = experiment(tmp_path, recorded(3_000), ".h5")
-    scene, size = set_up(load_config(file, overrides({}))), size_of(tmp_path / "log.h5", 0.0)
+    scene, size = set_up(load_config(file, overrides({}))), log_bytes(tmp_path / "log.h5", 0.0)
     settings = replace(scene.config.preprocessing, memory_gb=2.5e-9 * size)
     reader = LogReader(replace(scene, config=replace(scene.config, preprocessing=settings)))
     files = [tmp_path / "log.h5"] * 3
@@ -75,7 +75,7 @@ def recalibrated(file: Path, terms: str, *more: str) -> tuple[Samples, Samples]:
     builder = RowBuilder(scene.robot, scene.contacts, scene.sensors, scene.terms)
     samples = LogReader(scene).read(scene.config.logs.train, None)[0]
     values = np.arange(1.0, 1.0 + len(builder.extras))
-    return samples, calibrated(samples, builder.extras, values, builder.tree)
+    return samples, calibrate_readings(samples, builder.extras, values, builder.tree)
 
 
 def test_calibrated_readings_of_a_large_log_stay_on_the_disk_and_those_of_a_small_one_in_memory(
@@ -120,7 +120,7 @@ def test_a_table_takes_one_file_for_each_field_however_many_batches_it_is_read_i
 ) -> None:
     experiment(tmp_path, recorded(2_000), ".parquet")
     monkeypatch.setattr("torchid.logs.tables._ROWS", 100)
-    with open_blocks(tmp_path / "log.parquet", tmp_path) as blocks:
+    with open_log_blocks(tmp_path / "log.parquet", tmp_path) as blocks:
         assert len(blocks) == 2_000
         assert len(made_in) == 1 + len(blocks.fields), "time too"
 
@@ -130,7 +130,7 @@ def test_bags_take_memory_too_and_are_read_whole_whatever_is_held(tmp_path: Path
     file = experiment(tmp_path, recorded(200))
     log = read_log(tmp_path / "log.npz")
     write_bag(tmp_path / "log.mcap", entries_of(log))
-    scene, size = set_up(load_config(file, overrides({}))), size_of(tmp_path / "log.npz", 0.0)
+    scene, size = set_up(load_config(file, overrides({}))), log_bytes(tmp_path / "log.npz", 0.0)
     settings = replace(scene.config.preprocessing, memory_gb=1.5e-9 * size)
     logs = replace(scene.config.logs, topics=parsed(topics_of(log)))
     reader = LogReader(replace(scene, config=replace(scene.config, preprocessing=settings, logs=logs)))

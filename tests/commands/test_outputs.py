@@ -29,13 +29,13 @@ from torchid.commands.folder import (
     check_free,
     new_folder,
     refuse_inputs,
-    replaceable,
+    require_replaceable,
 )
 from torchid.commands.manifest import MANIFEST, read_manifest
 from torchid.commands.training import Training
 from torchid.config import load_analysis, load_simulation
 from torchid.errors import ConfigError, TorchidWarning
-from torchid.staging import ending_interrupts, interrupt_held_back, staging
+from torchid.staging import interrupts_deferred, staging_folder, termination_as_interrupt
 
 Add = Callable[[Path], None]
 
@@ -157,7 +157,7 @@ def test_a_folder_as_torchid_left_it_is_replaced_whole_even_if_files_are_gone(tm
     a_run(output, "new")
     assert {path.read_text() for path in output.rglob("*") if path.is_file() and path.name != MANIFEST} == {"new"}
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    replaceable(output, RUN)
+    require_replaceable(output, RUN)
 
 
 OTHERS: dict[str, dict[str, str]] = {
@@ -286,7 +286,7 @@ def test_what_a_living_process_makes_and_what_only_looks_like_it_stay(tmp_path: 
     write(tmp_path, dict.fromkeys(names, "mine"))
     (tmp_path / ".run-76543210.torchid").symlink_to(tmp_path / ".run-01234567")
     before = everything(tmp_path)
-    with staging(output) as living:
+    with staging_folder(output) as living:
         (living / "new").mkdir()
         a_run(output)
         assert (living / "new").exists()
@@ -467,22 +467,22 @@ def test_calls_to_end_are_interrupts_even_in_the_background(number: signal.Signa
     if ignored:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with pytest.raises(KeyboardInterrupt), ending_interrupts():
+        with pytest.raises(KeyboardInterrupt), termination_as_interrupt():
             signal.raise_signal(number)
         done = []
-        with pytest.raises(KeyboardInterrupt), ending_interrupts(), interrupt_held_back():  # noqa: PT012
+        with pytest.raises(KeyboardInterrupt), termination_as_interrupt(), interrupts_deferred():  # noqa: PT012
             signal.raise_signal(number)
             done.append("all of it")
         assert done
         if ignored:
-            with interrupt_held_back():
+            with interrupts_deferred():
                 signal.raise_signal(signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, before)
         signal.signal(number, inherited)
     earlier = signal.signal(number, signal.SIG_IGN)
     try:
-        with ending_interrupts():
+        with termination_as_interrupt():
             signal.raise_signal(number)
     finally:
         signal.signal(number, earlier)

@@ -37,10 +37,10 @@ from torchid.errors import InputError
 from torchid.estimators import Trainer
 from torchid.estimators.least_squares import VERDICTS
 from torchid.problem.linear import parameter_scale
-from torchid.problem.metrics import GROUPS, SHOWN, WHITENED
+from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS, WHITENED
 
 EPOCHS, EVERY = 16, 5
-FIGURES = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
+FIGURES = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
 EVALUATED = sorted({*range(0, EPOCHS + 1, EVERY), EPOCHS})
 BY_EPOCH = list(range(1, EPOCHS + 1))
 
@@ -205,7 +205,7 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
         *("descent/learning_rate", "descent/samples_per_second"),
     ]
     evaluated = [f"{kind}_error_{name}/{group}" for kind in ("relative", "rms") for name in ("train", "test")
-                 for group in GROUPS]  # fmt: skip
+                 for group in ROW_GROUPS]  # fmt: skip
     # the log is too short to leave folds of it out
     judged = [f"{kind}_error_{name}/{WHITENED}" for kind in ("relative", "rms") for name in ("train", "test")]
     evaluated += [f"eigenvalue/{name}" for name in robot.body_names]
@@ -229,7 +229,7 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
 def test_hyperparameters_stand_beside_the_final_errors(run: Path) -> None:
     events = events_in(run / "hparams")
     tags = set(events.Tags()["scalars"])
-    assert {f"final/{name}_{group}" for name in ("train", "test") for group in GROUPS} <= tags
+    assert {f"final/{name}_{group}" for name in ("train", "test") for group in ROW_GROUPS} <= tags
     metrics = json.loads((run / "metrics.json").read_text())
     (found,) = events.Scalars("final/test_nullspace")
     assert found.value == pytest.approx(metrics["test"]["nullspace_rms_relative"], rel=1e-6)
@@ -243,7 +243,7 @@ def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None
     layout = layout_pb2.Layout()
     layout.ParseFromString(events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0])
     charts = {chart.title: list(chart.multiline.tag) for category in layout.category for chart in category.chart}
-    for group in SHOWN:
+    for group in ERROR_GROUPS:
         assert charts[group] == [f"relative_error_{name}/{group}" for name in ("train", "test", "left_out")]
     assert charts["train and held out"] == ["loss/data", "loss_held_out/data"]
     tags = events.Tags()["scalars"]

@@ -143,7 +143,10 @@ def test_a_general_optimizer_finds_nothing_better(seed: int, prior: Prior) -> No
         return np.append(R.T[rows, columns], np.sqrt(np.maximum(phi[0, 10:], 0.0)))
 
     assert phi_of(z_of(estimate.phi[None])) == pytest.approx(estimate.phi[None], abs=1e-6)
-    for start in (parameters.perturbed(problem.nominal[None], 0.1, np.random.default_rng(0)), estimate.phi[None]):
+    for start in (
+        parameters.perturb_parameters(problem.nominal[None], 0.1, np.random.default_rng(0)),
+        estimate.phi[None],
+    ):
         found = minimize(
             lambda z: objective(prior, ridge, problem, phi_of(z)) / estimate.objective,
             z_of(start) + 1e-3,
@@ -200,7 +203,7 @@ def test_what_the_conditions_cost_is_stated(method: Method, prior: Prior) -> Non
 def test_noise_free_data_of_a_real_robot_are_explained(method: Method, rows: int, ridge: float) -> None:
     rng = np.random.default_rng(6)
     nominal = random_bodies(rng, 2)
-    truth = parameters.perturbed(nominal, 0.2, rng)
+    truth = parameters.perturb_parameters(nominal, 0.2, rng)
     truth[:, 10:] += 0.1
     problem = data(rng, nominal, truth, parameter_scale(nominal), rows, 10.0, 0.0)
     estimate = Consistent(ridge, conditions=Conditions(1e-4), method=method).solve(problem)

@@ -16,7 +16,7 @@ from true_robots import true_parameters
 from torchid import parameters
 from torchid.estimators import Conditions, Consistent, LeastSquares, violations
 from torchid.logs import Log
-from torchid.problem import LinearProblem, RowBuilder, bind, compress, linear_problem
+from torchid.problem import LinearProblem, RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.linear import parameter_scale
 from torchid.regressor import Regressor
 from torchid.robot import Robot
@@ -81,7 +81,7 @@ class World:
         """The rows that joint torques see of a log."""
         sensors = named_sensors("joints", self.robot.n, len(self.contacts))
         builder = RowBuilder(self.robot, self.contacts, sensors)
-        return linear_problem(compress([bind(log, self.robot, self.contacts)], builder), builder, self.robot)
+        return linear_problem(compress([bind_log(log, self.robot, self.contacts)], builder), builder, self.robot)
 
     @cached_property
     def unseen_rows(self) -> Array:

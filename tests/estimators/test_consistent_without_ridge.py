@@ -112,7 +112,7 @@ def structural(name: str, states: int, sensors: str, friction: bool, noise: floa
     robot, contacts = biped(name)
     problem = structural_problem(robot, contacts, named_sensors(sensors, robot.n, 2), STATES[states], friction)
     rng = np.random.default_rng(states)
-    truth = parameters.perturbed(robot.nominal, 0.2, rng)
+    truth = parameters.perturb_parameters(robot.nominal, 0.2, rng)
     truth[:, parameters.FRICTION] = rng.uniform(0.0, 0.5, (len(truth), 2)) if friction else 0.0
     phi = np.where(problem.free, truth.ravel(), problem.nominal)
     error = noise * rng.normal(size=len(problem.b))
@@ -211,7 +211,7 @@ def test_exact_data_of_bodies_without_friction_are_explained(prior: Prior) -> No
     rng = np.random.default_rng(4)
     nominal = random_bodies(rng, 2)
     nominal[:, 10:] = 0.2
-    truth = parameters.perturbed(nominal, 0.1, rng)
+    truth = parameters.perturb_parameters(nominal, 0.1, rng)
     truth[:, 10:] = 0.0
     problem = data(rng, nominal, truth, parameter_scale(nominal), 40, 10.0, 0.0)
     found = fit(problem, Conditions(1e-5), prior, "barrier")
@@ -242,7 +242,7 @@ def test_priors_of_matter_from_bodies_that_are_nearly_flat(prior: Prior) -> None
     inertia = np.trace(second) * np.eye(3) - second
     nominal[0, :10] = [flat[3, 3], *flat[:3, 3], *(inertia[i, j] for i, j in parameters.INERTIA_AXES)]
     nominal[:, 10:] = 0.2
-    truth = parameters.perturbed(nominal, 0.2, rng)
+    truth = parameters.perturb_parameters(nominal, 0.2, rng)
     problem = data(rng, nominal, truth, parameter_scale(nominal), 18, 30.0, 1e-2)
     fast, sure = (Consistent(1e-2, prior, Conditions(0.0), method).solve(problem) for method in METHODS)
     assert fast.objective == pytest.approx(sure.objective, rel=1e-6)

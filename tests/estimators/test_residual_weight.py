@@ -72,7 +72,7 @@ def truth(friction_in_model: bool) -> Truth:
     experiment = set_up(config)
     robot = experiment.robot
     builder = RowBuilder(robot, experiment.contacts, named_sensors("full", robot.n, 4, NOISE))
-    phi = parameters.perturbed(robot.nominal, 0.3, np.random.default_rng(1))
+    phi = parameters.perturb_parameters(robot.nominal, 0.3, np.random.default_rng(1))
     phi[1:, parameters.FRICTION] = 0.3, 0.05
     reader, rng = LogReader(experiment), np.random.default_rng(0)
     train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))

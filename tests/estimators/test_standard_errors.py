@@ -16,7 +16,7 @@ from torchid.estimators import Estimate, LeastSquares
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
 from torchid.logs.timeline import FILTER_ORDER
-from torchid.problem import LinearProblem, RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem import LinearProblem, RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors
 
@@ -57,7 +57,7 @@ def test_intervals_from_noisy_joint_torques_of_a_robot_on_its_feet_hold_the_trut
     log = make_log(oracle, [(foot.frame, 3) for foot in FEET], STATES, 60, rng)
     builder = RowBuilder(robot, FEET, named_sensors("joints", robot.n, 4, SensorNoise(0.3, 1.0, 0.1)))
     estimates = []
-    for _, samples in zip(range(REPETITIONS), noisy_torques(bind(log, robot, FEET), builder, rng), strict=False):
+    for _, samples in zip(range(REPETITIONS), noisy_torques(bind_log(log, robot, FEET), builder, rng), strict=False):
         estimates.append(LeastSquares().solve(linear_problem(compress([samples], builder, threads=1), builder, robot)))
     holds = covered(estimates, true_parameters(oracle, robot).ravel())
     assert holds.shape[1] > 60
@@ -96,7 +96,7 @@ def filtered() -> tuple[list[Estimate], list[Estimate], Array]:
     corrected, counted = [], []
     for _ in range(REPETITIONS):
         noise = TORQUE_NOISE * rng.normal(size=log.joint_position.shape)
-        samples = bind(preprocess(replace(log, joint_torque=log.joint_torque + noise), CUTOFF), robot, ())
+        samples = bind_log(preprocess(replace(log, joint_torque=log.joint_torque + noise), CUTOFF), robot, ())
         factor = compress([samples], builder, threads=1)
         for kappa, estimates in ((samples.oversampling, corrected), (1.0, counted)):
             estimates.append(LeastSquares().solve(replace(linear_problem(factor, builder, robot), oversampling=kappa)))
@@ -163,7 +163,7 @@ def test_the_noise_bandwidth_is_what_the_filter_leaves_of_white_noise(cutoff: fl
 def arm_samples(log: Log) -> Samples:
     robot = load(UR5, fixed_base=True)
     spread = {name: np.repeat(array, robot.n, axis=1) for name, array in log.arrays().items() if name != "time"}
-    return bind(replace(log, joint_names=robot.joint_names, **spread), robot, ())
+    return bind_log(replace(log, joint_names=robot.joint_names, **spread), robot, ())
 
 
 def test_samples_count_as_often_as_the_filtered_noise_can_change() -> None:

@@ -26,7 +26,7 @@ from torchid.estimators import Conditions, violations
 from torchid.estimators.conditions import mirrored_parameters
 from torchid.fitting.estimator import batch_estimator, conditions_from
 from torchid.parameters import PARAMETERS
-from torchid.problem import RowBuilder, bind, compress, linear_problem
+from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.linear import parameter_scale
 from torchid.robot import Robot, body_extents
 from torchid.sensing import Contact, named_sensors
@@ -296,7 +296,7 @@ def test_all_conditions_hold_together_where_least_squares_breaks_each(kind: str,
     log = make_log(Oracle.of(robot), [(foot, 3) for foot in feet], [[True] * 4], 40, rng)
     assert log.joint_torque is not None
     log = replace(log, joint_torque=log.joint_torque + 5.0 * rng.normal(size=log.joint_torque.shape))
-    problem = linear_problem(compress([bind(log, robot, contacts)], builder), builder, robot)
+    problem = linear_problem(compress([bind_log(log, robot, contacts)], builder), builder, robot)
     keys = {"com_inside": kind, "symmetry": {"left": "L_", "right": "R_"}, "total_mass": 2.5,
             "bounds": {"base_link": {"m": [1.2, 1.3]}, "FL_SHOULDER": {"fc": [0.05, 0.1]}}}  # fmt: skip
     settings = settings_of(tmp_path, ridge=1e-3, margin=1e-3, **keys)

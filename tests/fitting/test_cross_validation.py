@@ -18,19 +18,28 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import torchid
 from torchid.cli import main
-from torchid.commands.plausibility import absurd, force_gain, implausible
+from torchid.commands.plausibility import beyond_models, force_gain, implausibility
 from torchid.config import load_config
 from torchid.errors import BaseLostError
 from torchid.estimators import LeastSquares
 from torchid.fitting.cross_validation import with_all_readings
 from torchid.fitting.experiment import set_up
+from torchid.identifiability.base_rank import StateReport, _of_base, require_base
 from torchid.identifiability.confounding import TotalMass
-from torchid.identifiability.rank import StateReport, _of_base, check_base
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
-from torchid.problem import LinearProblem, Metrics, RowBuilder, Samples, bind, compress, compress_parts, linear_problem
-from torchid.problem.compression import FOLDS, folds_together, in_folds, states_together
-from torchid.problem.metrics import GROUPS, WHITENED, verdict, worse_than_nominal
+from torchid.problem import (
+    LinearProblem,
+    Metrics,
+    RowBuilder,
+    Samples,
+    bind_log,
+    compress,
+    compress_parts,
+    linear_problem,
+)
+from torchid.problem.compression import FOLDS, merge_folds, merge_states, split_into_folds
+from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 FEET = [f"{place}_foot" for place in ("front_left", "front_right", "rear_left", "rear_right")]
@@ -43,7 +52,7 @@ UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 def demo() -> tuple[RowBuilder, Samples]:
     robot, contacts = torchid.load_robot(DEMO / "quadruped.urdf"), [Contact(foot, "point") for foot in FEET]
     sensors = named_sensors("joints", robot.n, 4, SensorNoise(0.1, 0.5, 0.05))
-    log = bind(preprocess(read_log(DEMO / "sway_train.npz"), 8.0), robot, contacts, sensors)
+    log = bind_log(preprocess(read_log(DEMO / "sway_train.npz"), 8.0), robot, contacts, sensors)
     return RowBuilder(robot, contacts, sensors), log
 
 
@@ -54,7 +63,7 @@ def test_folds_are_contiguous_blocks_that_hold_every_sample_once(
     builder, log = demo
     starts = np.cumsum([0, *lengths])
     logs = [replace(log[a:b], source=f"{a}") for a, b in zip(starts, starts[1:], strict=False)]
-    blocks = in_folds(logs, builder)
+    blocks = split_into_folds(logs, builder)
     assert torch.equal(torch.cat([block.time for block in blocks]), torch.cat([one.time for one in logs]))
     folds = [block.fold for block in blocks]
     assert folds == sorted(folds)
@@ -68,20 +77,22 @@ def test_folds_are_contiguous_blocks_that_hold_every_sample_once(
 
 def test_too_few_independent_samples_are_not_cut(demo: tuple[RowBuilder, Samples]) -> None:
     builder, log = demo
-    assert [block.fold for block in in_folds([log[:200]], builder)] == [0], "200 samples at 100 Hz, filtered at 8 Hz"
+    assert [block.fold for block in split_into_folds([log[:200]], builder)] == [0], (
+        "200 samples at 100 Hz, filtered at 8 Hz"
+    )
 
 
 def test_parts_of_folds_together_are_those_of_the_logs(demo: tuple[RowBuilder, Samples]) -> None:
     builder, log = demo
-    parts = compress_parts(in_folds([log], builder), builder)
-    whole = folds_together(parts, builder)
+    parts = compress_parts(split_into_folds([log], builder), builder)
+    whole = merge_folds(parts, builder)
     by_state = {part.state: part for part in compress_parts([log], builder)}
     assert {part.state for part in whole} == set(by_state)
     for part in whole:
         R, expected = (x.factor.triangle() for x in (part, by_state[part.state]))
         assert (part.samples, part.factor.rows) == (by_state[part.state].samples, by_state[part.state].factor.rows)
         assert torch.allclose(R.T @ R, expected.T @ expected, rtol=0.0, atol=1e-12 * float(expected.norm() ** 2))
-    assert [part.fold for part in states_together(parts, builder)] == list(range(FOLDS))
+    assert [part.fold for part in merge_states(parts, builder)] == list(range(FOLDS))
 
 
 # ------------------------------------------------------------------------------------------------------- whole runs
@@ -99,7 +110,7 @@ def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple
     metrics, config = json.loads((run / "metrics.json").read_text()), load_config(run / "config.yaml")
     weighed = set_up(config)  # with the noise that the run has estimated
     builder = RowBuilder(weighed.robot, weighed.contacts, weighed.sensors)
-    robot, blocks, squares, rows = torchid.load_robot(DEMO / "quadruped.urdf"), in_folds([log], builder), 0.0, 0
+    robot, blocks, squares, rows = torchid.load_robot(DEMO / "quadruped.urdf"), split_into_folds([log], builder), 0.0, 0
     for fold in range(FOLDS):
         seen = [block for block in blocks if block.fold != fold]
         phi = config.estimator.least_squares.solve(linear_problem(compress(seen, builder), builder, robot)).phi
@@ -235,7 +246,7 @@ def test_a_fit_that_predicts_worse_than_the_urdf_says_so_first(
 
 
 def metrics_of(rms: float, measured: float, group: str = "base_force") -> Metrics:
-    values: dict[str, float | None] = dict.fromkeys([*GROUPS, WHITENED])
+    values: dict[str, float | None] = dict.fromkeys([*ROW_GROUPS, WHITENED])
     return Metrics({**values, group: rms}, {**values, group: rms / measured if rms else 0.0}, {}, {}, None)
 
 
@@ -253,11 +264,11 @@ def metrics_of(rms: float, measured: float, group: str = "base_force") -> Metric
 def test_worse_is_clearly_larger_and_no_rounding(nominal: float, identified: float, worse: bool) -> None:
     found = worse_than_nominal({"test": (metrics_of(nominal, 100.0), metrics_of(identified, 100.0))})
     assert bool(found) is worse
-    assert (verdict(found) is None) is not worse
+    assert (describe_worse(found) is None) is not worse
 
 
 def test_what_was_not_measured_is_not_judged() -> None:
-    nothing = Metrics(dict.fromkeys(GROUPS), dict.fromkeys(GROUPS), {}, {}, None)
+    nothing = Metrics(dict.fromkeys(ROW_GROUPS), dict.fromkeys(ROW_GROUPS), {}, {}, None)
     assert worse_than_nominal({"test": (nothing, nothing)}) == []
 
 
@@ -269,7 +280,7 @@ def arm_problem(factor: float = 1.0) -> tuple[LinearProblem, torchid.Robot]:
     log = make_log(Oracle.of(robot), [], [()], 200, np.random.default_rng(0))
     log = replace(log, joint_torque=factor * np.asarray(log.joint_torque))
     builder = RowBuilder(robot, [], named_sensors("joints", robot.n, 0))
-    return linear_problem(compress([bind(log, robot, [])], builder), builder, robot), robot
+    return linear_problem(compress([bind_log(log, robot, [])], builder), builder, robot), robot
 
 
 @pytest.mark.parametrize(("factor", "stops"), [(1.0, False), (3.0, False), (-1.0, True), (1e3, True), (1e-3, True)])
@@ -279,7 +290,7 @@ def test_an_arm_s_torques_of_the_wrong_sign_or_unit_are_noticed_without_a_total_
     problem, robot = arm_problem(factor)
     assert force_gain(problem) == pytest.approx(factor, rel=1e-6)
     estimate, unknown = LeastSquares().solve(problem), TotalMass(float("inf"), True, -3.0, 18.0)
-    found = implausible(problem, estimate.phi, unknown, robot)
+    found = implausibility(problem, estimate.phi, unknown, robot)
     assert (found is not None) is stops
     assert ("opposite sign" in (found or "")) is (factor < 0.0)
 
@@ -295,11 +306,11 @@ def test_a_single_body_may_break_conditions_but_not_be_beyond_all_bounds() -> No
     problem, robot = arm_problem()
     unknown, phi = TotalMass(float("inf"), True, 0.0, 18.0), problem.nominal.copy()
     phi[12] = -3.0  # seen in combination with others only: a condition that is broken, and no more
-    assert implausible(problem, phi, unknown, robot) is None
+    assert implausibility(problem, phi, unknown, robot) is None
     phi[12] = 1e11
-    assert "shoulder_link has m = 1e+11" in (implausible(problem, phi, unknown, robot) or "")
+    assert "shoulder_link has m = 1e+11" in (implausibility(problem, phi, unknown, robot) or "")
     phi[12], phi[22] = 3.0, 3.9e161
-    assert "fc = 3.9e+161" in (implausible(problem, phi, unknown, robot) or "")
+    assert "fc = 3.9e+161" in (implausibility(problem, phi, unknown, robot) or "")
 
 
 @pytest.mark.parametrize(
@@ -316,13 +327,13 @@ def test_a_single_body_may_break_conditions_but_not_be_beyond_all_bounds() -> No
 def test_a_total_mass_counts_where_the_data_determine_it(mass: TotalMass, determined: bool, stops: bool) -> None:
     problem, robot = arm_problem()
     assert mass.determined is determined
-    assert (implausible(problem, problem.nominal, mass, robot) is not None) is stops
+    assert (implausibility(problem, problem.nominal, mass, robot) is not None) is stops
 
 
 def test_a_ratio_that_is_no_number_is_absurd() -> None:
-    assert absurd(float("nan"))
-    assert absurd(float("inf"))
-    assert not absurd(1.0)
+    assert beyond_models(float("nan"))
+    assert beyond_models(float("inf"))
+    assert not beyond_models(1.0)
 
 
 # ------------------------------------------------------------------------------------------------------------- the base
@@ -335,7 +346,7 @@ def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
     assert (rank, smallest, full) == (2, 0.0, 1 / 64)
     assert shares == {6: 1 / 64, 2: 63 / 64}
     with pytest.raises(BaseLostError, match=r"rank 2 of 6, 6 in 1.6 % of them"):
-        check_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
+        require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
     rank, smallest, full, shares = _of_base(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
     assert rank == 6, "a sample counts as often as it stands for others"
 
@@ -346,7 +357,7 @@ def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
 def test_samples_without_a_reading_are_left_out_of_the_residual() -> None:
     robot, contacts = load(SOLO12), [Contact("FL_FOOT", "point")]
     log = make_log(Oracle.of(robot), [("FL_FOOT", 3)], [(True,), (False,)], 20, np.random.default_rng(0))
-    samples = bind(log, robot, contacts)
+    samples = bind_log(log, robot, contacts)
     assert samples.torque is not None
     assert samples.wrench is not None
     samples.torque[3, 2] = np.nan

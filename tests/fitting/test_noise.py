@@ -19,11 +19,11 @@ from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.fit import LogFitter
 from torchid.fitting.noise import NoiseSummary, recorded_sensors
 from torchid.parameters import MASS, PER_BODY
-from torchid.problem import RowBuilder, Samples, bind, compress_parts
-from torchid.problem.base_motion import levelled
-from torchid.problem.noise import by_group
+from torchid.problem import RowBuilder, Samples, bind_log, compress_parts
+from torchid.problem.base_motion import levelled_base_axes
+from torchid.problem.noise import std_by_group
 from torchid.sensing import SensorNoise
-from torchid.sensing.projection import levelled_null_space
+from torchid.sensing.projection import whitened_null_space
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 STATES = [[True] * 4, [False, True, True, True], [True, True, False, True]]
@@ -40,9 +40,9 @@ QUICK, MANY = 8, 200
 def test_the_levelled_base_has_the_vertical_for_an_axis_and_is_the_base_where_that_stands_upright() -> None:
     rng = np.random.default_rng(0)
     turned = Rotation.from_euler("z", rng.uniform(-3.0, 3.0, (20, 1))).as_matrix()
-    np.testing.assert_allclose(levelled(torch.from_numpy(turned)), np.tile(np.eye(3), (20, 1, 1)), atol=1e-15)
+    np.testing.assert_allclose(levelled_base_axes(torch.from_numpy(turned)), np.tile(np.eye(3), (20, 1, 1)), atol=1e-15)
     R = Rotation.random(200, random_state=1).as_matrix()
-    axes = levelled(torch.from_numpy(R)).numpy()
+    axes = levelled_base_axes(torch.from_numpy(R)).numpy()
     np.testing.assert_allclose(axes.transpose(0, 2, 1) @ axes, np.tile(np.eye(3), (200, 1, 1)), atol=1e-14)
     np.testing.assert_allclose(np.linalg.det(axes), 1.0)
     up = np.abs(R[:, 2]).argmax(1)
@@ -59,7 +59,7 @@ def test_rows_are_white_under_noise_along_the_axes_of_the_levelled_base() -> Non
     A, J = (torch.from_numpy(rng.normal(size=(5, k, 10))) for k in (3, 4))
     row_std, wrench_std = (torch.from_numpy(rng.uniform(0.1, 3.0, k)) for k in (10, 4))
     axes = torch.from_numpy(Rotation.random(5, random_state=3).as_matrix())
-    ((index, W),) = levelled_null_space(A, row_std, J, wrench_std, axes)
+    ((index, W),) = whitened_null_space(A, row_std, J, wrench_std, axes)
     assert index == slice(None)
     T = torch.eye(10, dtype=torch.float64).repeat(5, 1, 1)
     T[:, :3, :3] = T[:, 3:6, 3:6] = axes
@@ -96,7 +96,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
         return set_up(load_config(file, overrides))
 
     contacts_in_use = experiment().contacts
-    return Scene(experiment, bind(log, robot, contacts_in_use), true_parameters(oracle, robot).ravel())
+    return Scene(experiment, bind_log(log, robot, contacts_in_use), true_parameters(oracle, robot).ravel())
 
 
 @dataclass(frozen=True)
@@ -125,11 +125,11 @@ def read(scene: Scene, rng: np.random.Generator, push: Array) -> Samples:
 
 
 def axes_of(scene: Scene) -> Array:
-    return levelled(scene.samples.base.rotation).numpy()
+    return levelled_base_axes(scene.samples.base.rotation).numpy()
 
 
 def pushed(scene: Scene, rng: np.random.Generator) -> Samples:
-    push = (TRUE.base * rng.normal(size=(SAMPLES, 6))).reshape(-1, 2, 3)
+    push = (TRUE.base_std * rng.normal(size=(SAMPLES, 6))).reshape(-1, 2, 3)
     return read(scene, rng, np.einsum("nij,nkj->nki", axes_of(scene), push).reshape(-1, 6))
 
 
@@ -190,7 +190,7 @@ def check_intervals(scene: Scene, sensors: str, repeats: int) -> None:
     if sensors != "joints":
         before, after = (np.sqrt(np.mean(mass_errors(x, scene.true) ** 2)) for x in (found.guessed, found.estimated))
         assert after < 0.5 * before
-    for group, true in by_group(TRUE).items():
+    for group, true in std_by_group(TRUE).items():
         here = [(x.used, x.origin) for found_once in found.found for x in found_once.groups if x.group == group]
         if here and group != "contact_moment" and [origin for _, origin in here].count("estimated") == repeats:
             assert np.median([used for used, _ in here]) == pytest.approx(true, rel=0.1), group
@@ -255,7 +255,7 @@ def test_what_is_estimated_keeps_the_proportion_to_what_is_stated(scene: Scene) 
     estimated, proportional = (x.estimate_noise([samples], x.sensors).noise for x in (alone, beside))
     assert proportional.joint_torque == 1.0
     ratio = 1.0 / estimated.joint_torque
-    np.testing.assert_allclose(proportional.base[:2], ratio * estimated.base[:2], rtol=0.05)
+    np.testing.assert_allclose(proportional.base_std[:2], ratio * estimated.base_std[:2], rtol=0.05)
     one, other = fit(alone, samples, estimated), fit(beside, samples, proportional)
     known = one.identifiable
     np.testing.assert_allclose(one.standard_error[known], other.standard_error[known], rtol=0.1)
@@ -273,7 +273,7 @@ def test_impacts_do_not_pass_for_noise(scene: Scene) -> None:
         experiment.estimate_noise([replace(samples, base=replace(samples.base, specific_force=f))], experiment.sensors)
         for f in (samples.base.specific_force, hit)
     )
-    assert spoilt.noise.base[0] < 1.5 * clean.noise.base[0]
+    assert spoilt.noise.base_std[0] < 1.5 * clean.noise.base_std[0]
     assert spoilt.noise.joint_torque < 1.5 * clean.noise.joint_torque
 
 

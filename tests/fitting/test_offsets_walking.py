@@ -21,11 +21,11 @@ from unknowns import Fit, fit
 from torchid import parameters
 from torchid.cli import main
 from torchid.estimators import LeastSquares
-from torchid.identifiability.confounding import APART, ExtraEstimate, total_mass
+from torchid.identifiability.confounding import INFLATION_LIMIT, ExtraEstimate, total_mass
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
-from torchid.parameters import COMPONENTS
-from torchid.problem import ExtraTerms, Samples, bind
+from torchid.parameters import WRENCH_COMPONENTS
+from torchid.problem import ExtraTerms, Samples, bind_log
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors, with_ft_sensors
 
@@ -77,7 +77,7 @@ def identified(folder: Path, kind: str, names: tuple[str, ...], mount: str) -> t
     if welds:
         sensors = with_ft_sensors(replace(sensors, wrench=np.zeros((2, 6), dtype=bool)), robot, welds)
     channels = ("ft_force", "ft_moment") if welds else ("contact_force", "contact_moment")
-    samples = [bind(preprocess(off.log, CUTOFF_HZ, 200.0), robot, CONTACTS) for off in logs]
+    samples = [bind_log(preprocess(off.log, CUTOFF_HZ, 200.0), robot, CONTACTS) for off in logs]
     terms = ExtraTerms(offsets=dict.fromkeys(channels, "log"))
     return fit(robot, CONTACTS, sensors, terms, samples, LeastSquares(ridge=1e-4)), logs
 
@@ -92,10 +92,10 @@ def force_errors(found: Fit, logs: list[Off]) -> Array:
     """Of all force offsets [N]."""
     errors = []
     for x in found.extras:
-        if x.extra.component in COMPONENTS[:3]:
+        if x.extra.component in WRENCH_COMPONENTS[:3]:
             (off,) = (off for off in logs if off.log.source == x.log)
             foot = [*SOLES, *WELDS].index(x.extra.name) % 2
-            errors.append(x.value - off.offsets[foot, COMPONENTS.index(x.extra.component)])
+            errors.append(x.value - off.offsets[foot, WRENCH_COMPONENTS.index(x.extra.component)])
     return np.array(errors)
 
 
@@ -106,11 +106,11 @@ def test_swing_phases_tell_offsets_from_mass(
 ) -> None:
     found, logs = identified(biped_folder, kind, STEPPING, mount)
     errors = force_errors(found, logs)
-    forces = [x for x in found.extras if x.extra.component in COMPONENTS[:3]]
+    forces = [x for x in found.extras if x.extra.component in WRENCH_COMPONENTS[:3]]
     assert len(errors) == 2 * 3 * len(STEPPING)
     assert abs(mass_error(found)) < mass
     assert np.abs(errors).max() < force
-    assert max(x.inflation for x in forces) < 0.5 * APART
+    assert max(x.inflation for x in forces) < 0.5 * INFLATION_LIMIT
     assert total_mass(found.assembly, found.estimate).separable
 
 
@@ -122,7 +122,7 @@ def test_feet_that_never_leave_the_ground_do_not_and_that_is_said_by_a_wide_marg
     found, _ = identified(biped_folder, kind, SQUATTING, mount)
     vertical = [x for x in found.extras if x.extra.component == "fz"]
     assert len(vertical) == 2 * len(SQUATTING)
-    assert min(x.inflation for x in vertical) > 30.0 * APART
+    assert min(x.inflation for x in vertical) > 30.0 * INFLATION_LIMIT
     assert not any(x.separable for x in found.extras)
     assert not total_mass(found.assembly, found.estimate).separable
     assert all(x.confounded_with for x in vertical)
@@ -185,7 +185,7 @@ class Gait:
     def samples(self, logs: list[Log], in_the_air: bool = True) -> list[Samples]:
         """Without the readings in the air, if so said."""
         rate = 200.0 if self.cutoff_hz else None
-        found = [bind(preprocess(log, self.cutoff_hz, rate), self.robot, CONTACTS) for log in logs]
+        found = [bind_log(preprocess(log, self.cutoff_hz, rate), self.robot, CONTACTS) for log in logs]
         return found if in_the_air else [replace(samples, unloaded=None) for samples in found]
 
     def fit(self, samples: list[Samples]) -> Fit:
@@ -194,7 +194,7 @@ class Gait:
 
 
 def true_offset(x: ExtraEstimate) -> float:
-    return float(OFF[SOLES.index(x.extra.name), COMPONENTS.index(x.extra.component)])
+    return float(OFF[SOLES.index(x.extra.name), WRENCH_COMPONENTS.index(x.extra.component)])
 
 
 @pytest.mark.parametrize(("draws", "cutoff_hz"), [(3, 10.0), (2, None), pytest.param(40, 10.0, marks=pytest.mark.slow)])

@@ -12,7 +12,7 @@ from repository import CONFIGS, SHARED
 
 from torchid.cli import main
 from torchid.errors import ConfoundedWarning
-from torchid.identifiability.confounding import APART
+from torchid.identifiability.confounding import INFLATION_LIMIT
 
 pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
 
@@ -53,7 +53,7 @@ def test_a_person_whose_feet_never_leave_the_plates_is_told_that_offset_and_mass
     overrides = f"logs.train=[{path}]", "logs.test=[]", choice
     metrics, parameters = identified(tmp_path / "run", "human_squats.yaml", *overrides)
     (message,) = [line for line in capsys.readouterr().err.splitlines() if ConfoundedWarning.__name__ in line]
-    sensors, parameters_named = message.split(" confounded with ")
+    sensors, parameters_named = message.split(" are confounded with ")
     for plate in ("calcn_l", "calcn_r"):
         (own,) = [part for part in sensors.split("; ") if plate in part]
         assert "fz" in own
@@ -64,7 +64,7 @@ def test_a_person_whose_feet_never_leave_the_plates_is_told_that_offset_and_mass
     assert len(vertical) == 2
     for x in vertical:
         assert x["told_apart"] is False
-        assert x["inflation"] > 3.0 * APART
+        assert x["inflation"] > 3.0 * INFLATION_LIMIT
         assert any(name.endswith((" m", " mcx", " mcy", " mcz")) for name in x["mixed_with"])
     assert metrics["total_mass_told_from_offsets"] is False
     verdicts = {body["name"]: body["verdict"]["m"] for body in parameters["bodies"]}

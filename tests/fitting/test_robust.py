@@ -25,9 +25,9 @@ from torchid.cli import main
 from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares, violations
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import TUNING, Reweighting, RobustLoss, RobustSummary, fit_robustly
-from torchid.problem import ExtraTerms, RowBuilder, Samples, bind, compress_parts
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
 from torchid.problem.compression import Part
-from torchid.problem.rows import ChunkTerms, Workspace
+from torchid.problem.rows import ChunkDynamics, Workspace
 from torchid.robot import Robot
 from torchid.sensing import SensorNoise, named_sensors
 
@@ -142,11 +142,11 @@ class Bench:
 class StillRows(RowBuilder):
     """A builder for logs of one chunk and one motion, whose dynamics are worked out once."""
 
-    kept: ChunkTerms | None = None
+    kept: ChunkDynamics | None = None
 
-    def terms(self, samples: Samples, workspace: Workspace | None = None) -> ChunkTerms:
+    def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
         if self.kept is None:
-            self.kept = super().terms(samples)
+            self.kept = super().dynamics(samples)
         return self.kept
 
 
@@ -165,7 +165,10 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     oracle.perturb(rng, 0.2)
     builder = StillRows(robot, (), named_sensors("full", robot.n, 0, SensorNoise(NOISE)))
     return Bench(
-        robot, builder, bind(make_log(oracle, [], [[]], 100, rng), robot, ()), true_parameters(oracle, robot).ravel()
+        robot,
+        builder,
+        bind_log(make_log(oracle, [], [[]], 100, rng), robot, ()),
+        true_parameters(oracle, robot).ravel(),
     )
 
 
@@ -176,7 +179,7 @@ def industrial_arm(samples: int = 400, terms: ExtraTerms | None = None) -> Bench
     oracle.perturb(rng, 0.2)
     log = make_log(oracle, [], [[]], samples, rng)
     builder = RowBuilder(robot, (), named_sensors("full", robot.n, 0, SensorNoise(NOISE)), terms)
-    return Bench(robot, builder, bind(log, robot, ()), true_parameters(oracle, robot).ravel())
+    return Bench(robot, builder, bind_log(log, robot, ()), true_parameters(oracle, robot).ravel())
 
 
 def quadruped(samples: int = 400) -> Bench:
@@ -186,7 +189,7 @@ def quadruped(samples: int = 400) -> Bench:
     oracle.perturb(rng, 0.2)
     log = make_log(oracle, [(foot.frame, 3) for foot in FEET], STATES, samples, rng)
     builder = RowBuilder(robot, FEET, named_sensors("joints", robot.n, 4, SensorNoise(NOISE, 1.0, 0.1)))
-    clean = bind(log, robot, FEET)
+    clean = bind_log(log, robot, FEET)
     pushed = next(noisy_torques(clean, builder, rng))  # on the base too; torques become noisier below
     return Bench(robot, builder, pushed, true_parameters(oracle, robot).ravel())
 
@@ -281,7 +284,7 @@ def whitened(bench: Bench, log: Samples) -> tuple[Array, Array]:
         wide[:, [*support, bench.builder.width]] = block.numpy()
         rows.append(wide)
     X = np.concatenate(rows)
-    return X[:, :-1] @ bench.builder.columns.from_parameters(), X[:, -1]
+    return X[:, :-1] @ bench.builder.columns.parameter_map(), X[:, -1]
 
 
 @pytest.mark.parametrize("kind", LOSSES)

@@ -14,9 +14,9 @@ from synthetic import Oracle, load, make_log
 from welded import SENSORS, machine
 
 from torchid.logs import Log
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import ExtraTerms, RowBuilder
-from torchid.problem.extras import read_components
+from torchid.problem.extras import recorded_components
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
@@ -39,7 +39,7 @@ class World:
         """Offsets, and scales less 1, of the channels that are unknown and read, by log and label."""
         out = {}
         for log, found in zip(self.logs, self.sensors, strict=True):
-            read = read_components(builder.contacts, builder.sensors, log.contact_wrench_world is not None)
+            read = recorded_components(builder.contacts, builder.sensors, log.contact_wrench_world is not None)
             for what, scopes, less in (("offset", terms.offsets, 0.0), ("scale", terms.scales, 1.0)):
                 torque, wrench, ft = (
                     getattr(found, name if what == "offset" else f"{name}_scale") - less
@@ -51,7 +51,7 @@ class World:
                     channels.append((f"ft_{KINDS[component[0]]}", f"limb sensor {joint} {component}", x))
                 chosen = [channel for channel, taken in zip(channels, builder.sensors.torque, strict=True) if taken]
                 for c, k in np.argwhere(read):
-                    component = COMPONENTS[k]
+                    component = WRENCH_COMPONENTS[k]
                     name = f"{builder.contacts[c].frame} {component}"
                     chosen.append((f"contact_{KINDS[component[0]]}", name, wrench[c, k]))
                 for channel, name, x in chosen:

@@ -22,7 +22,7 @@ from torchid.errors import TorchidError
 from torchid.log_checks import NOTE, Checked
 from torchid.log_checks.check import check
 from torchid.logs import Log, write_log
-from torchid.logs.quaternion import sign_continuous
+from torchid.logs.quaternion import make_sign_continuous
 
 SENSORS = ("full", "contacts", "joints")
 CUTOFF = 10.0
@@ -100,7 +100,7 @@ def _world_downward(case: Case) -> Log | None:
 def _quaternion(change: Callable[[Array], Array]) -> Callable[[Case], Log | None]:
     def make(case: Case) -> Log | None:
         quat = case.log.base_quat_xyzw
-        return None if quat is None else replace(case.log, base_quat_xyzw=sign_continuous(change(quat)))
+        return None if quat is None else replace(case.log, base_quat_xyzw=make_sign_continuous(change(quat)))
 
     return make
 

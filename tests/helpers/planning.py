@@ -78,7 +78,7 @@ def sees_the_base(
     oracle, result = Oracle.of(robot), np.ones(len(sets), dtype=bool)
     for number, state in enumerate(states):
         q = random_states(np.random.default_rng(number), robot.n, 1)[0]
-        torque = np.eye(6 + robot.dofs)[6:]
+        torque = np.eye(6 + robot.n_dofs)[6:]
         rows = [(c, k) for c, active in enumerate(state) if active for k in contacts[c].components]
         J = {c: oracle.jacobian(q, contacts[c].frame)[0] for c in {c for c, _ in rows}}
         A = np.vstack([torque, *(J[c][[k]] for c, k in rows)])

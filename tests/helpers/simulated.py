@@ -19,7 +19,7 @@ import torchid
 from torchid.config import FootConfig, MotionConfig, SimulationConfig, StepsConfig, load_simulation
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.logs import Log
-from torchid.problem import Evaluation, bind
+from torchid.problem import Evaluation, bind_log
 from torchid.problem.predict import force_series
 from torchid.simulation import Stability
 
@@ -99,7 +99,7 @@ def forces(log: Log, urdf: Path = BIPED, feet: Sequence[str] = SOLES) -> tuple[A
     phi = robot.nominal.copy()
     phi[:, 10:] = 0.0
     builder = Evaluation(robot, contacts).builder
-    measured, (predicted,) = force_series(builder, bind(log, robot, contacts), phi.flatten()[None])
+    measured, (predicted,) = force_series(builder, bind_log(log, robot, contacts), phi.flatten()[None])
     return measured, predicted
 
 

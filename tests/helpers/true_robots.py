@@ -13,7 +13,7 @@ from synthetic import G1, ROBOTS, Array, Oracle, load, make_log, random_states
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
-from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.regressor import Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
@@ -78,7 +78,7 @@ def world(name: str) -> World:
     size = 3 if kind.foot == "point" else 6
     contacts = [(frame, size) for frame in kind.feet]
     logs = [make_log(oracle, contacts, kind.states, n, rng, f"{n}.npz") for n in (SAMPLES // 3, SAMPLES * 2 // 3)]
-    return World(kind, robot, oracle, [bind(log, robot, kind.contacts) for log in logs])
+    return World(kind, robot, oracle, [bind_log(log, robot, kind.contacts) for log in logs])
 
 
 def fit(w: World, sensors: SensorSet, logs: Sequence[Samples] | None = None, **options: int) -> Estimate:

@@ -11,7 +11,7 @@ from torchid.estimators import Consistent, Estimate, LeastSquares
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras
 from torchid.problem import ExtraTerms, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.elimination import Assembly
-from torchid.problem.extras import read_components
+from torchid.problem.extras import recorded_components
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -42,7 +42,7 @@ def fit(
 ) -> Fit:
     """Least squares, unless said otherwise, on logs whose unread forces are not even numbers."""
     builder = RowBuilder(robot, contacts, sensors, terms)
-    read = [replace(sensors, wrench=read_components(contacts, sensors, log.wrench_in_world)) for log in logs]
+    read = [replace(sensors, wrench=recorded_components(contacts, sensors, log.wrench_in_world)) for log in logs]
     seen = [hide(*pair) if contacts else pair[0] for pair in zip(logs, read, strict=True)]
     assembly = assemble(compress_parts(seen, builder, threads=1), builder, robot)
     estimate = (estimator or LeastSquares()).solve(assembly.problem)

@@ -18,7 +18,7 @@ import json, os, resource, signal, sys
 import torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.analyze, torchid.commands.convert
 from matplotlib.figure import Figure
 from torchid.cli import main
-names = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure", "tree_figure",
+names = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure", "tree_figure",
          "accuracy_figure")
 for module in (torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze):
     for name in names:

@@ -8,7 +8,7 @@ import pytest
 from hostile import examined
 from hostile_costs import CASES, SLOW, costs
 
-from torchid.guards import FREE_MESSAGES, MAX_GROWTH, MAX_SMALL, Budget, most_expanded
+from torchid.guards import FREE_MESSAGES, MAX_GROWTH, MAX_SMALL, Budget, max_unpacked_bytes
 from torchid.logs import Topics, read_log
 from torchid.robot import body_extents, load_robot
 
@@ -34,7 +34,7 @@ def test_small_files_that_stand_for_much_cost_little(tmp_path: Path, slow: bool)
 
 def test_a_file_may_come_to_more_the_larger_it_is() -> None:
     sizes = [0, 10**3, 10**6, 5 * 10**6, 10**7, 2 * 10**7, 10**9]
-    most = [most_expanded(size) for size in sizes]
+    most = [max_unpacked_bytes(size) for size in sizes]
     assert most == sorted(most)
     assert most[0] == MAX_SMALL
     assert most[4] == MAX_GROWTH * 10**7

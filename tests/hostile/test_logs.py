@@ -17,7 +17,7 @@ from refusals import refusal
 from torchid.errors import LogError
 from torchid.guards import MAX_FIELDS, MAX_LETTERS, MAX_NAMES
 from torchid.logs import read_log, write_log
-from torchid.logs.blocks import open_blocks
+from torchid.logs.blocks import open_log_blocks
 from torchid.logs.log import LARGEST, NAN_ALLOWED
 
 SUFFIXES = (".npz", ".h5")
@@ -72,7 +72,7 @@ def test_a_number_beyond_all_that_is_measured_is_refused_where_it_stands(tmp_pat
         path = write(tmp_path / f"log{suffix}", fields() | {name: too_large(name, fields()[name])})
         with pytest.raises(LogError, match=f"{name}: {PLACE}"):
             read_log(path)
-        with pytest.raises(LogError, match=f"{name}: {PLACE}"), open_blocks(path, tmp_path) as blocks:
+        with pytest.raises(LogError, match=f"{name}: {PLACE}"), open_log_blocks(path, tmp_path) as blocks:
             blocks.read(slice(N // 2, N))
 
 

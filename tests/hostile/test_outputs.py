@@ -17,7 +17,7 @@ from refusals import files_in
 from repository import ROOT
 
 from torchid.cli import main
-from torchid.commands.folder import RUN, claimed, new_folder, replaceable, write_json
+from torchid.commands.folder import RUN, claim_folder, new_folder, require_replaceable, write_json
 from torchid.commands.manifest import MANIFEST
 from torchid.errors import ConfigError, LogError
 from torchid.logs import read_log, write_log
@@ -35,7 +35,7 @@ def is_whole(run: Path) -> bool:
     names = {path.name for path in run.iterdir()}
     json.loads((run / "parameters.json").read_text())
     json.loads((run / "metrics.json").read_text())
-    replaceable(run, RUN)
+    require_replaceable(run, RUN)
     return names >= WHOLE
 
 
@@ -247,13 +247,13 @@ def test_a_folder_is_claimed_by_one_process_until_that_ends(tmp_path: Path) -> N
     with child(hold) as first:
         assert first.stdout is not None
         assert first.stdout.readline() == "mine\n"
-        with pytest.raises(ConfigError, match="another run is at work there"), claimed(tmp_path / "x" / "run"):
+        with pytest.raises(ConfigError, match="another run is at work there"), claim_folder(tmp_path / "x" / "run"):
             pass
         first.kill()
     assert [path.name for path in (tmp_path / "x").iterdir()] == [".run.lock"]
-    with claimed(tmp_path / "x" / "run"):
+    with claim_folder(tmp_path / "x" / "run"):
         pass
     assert list((tmp_path / "x").iterdir()) == []
-    with claimed(tmp_path / "y" / "run"):
+    with claim_folder(tmp_path / "y" / "run"):
         pass
     assert not (tmp_path / "y").exists()

@@ -23,7 +23,7 @@ from torchid.estimators.state import check_alike
 from torchid.report.parameter_files import read_parameters
 from torchid.robot import load_robot
 
-FIGURES = ("forces_of", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
+FIGURES = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
 SGD = "estimator={name: sgd, ridge: 0.001, training: {epochs: 2}}"
 
 

@@ -18,7 +18,7 @@ from torchid.config import load_analysis, load_config
 from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError
 from torchid.guards import MAX_DEPTH, MAX_NODES
-from torchid.text import is_plain, shown
+from torchid.text import excerpt, is_plain
 
 COUNTS = [30, pytest.param(1000, marks=pytest.mark.slow)]
 
@@ -117,9 +117,9 @@ def test_aliases_are_for_sharing_and_not_for_multiplying() -> None:
 
 
 def test_what_is_shown_of_a_text_is_one_short_line() -> None:
-    assert shown("größe, 関節 [red]") == "größe, 関節 [red]"
-    assert shown("a\nb\x1b[2J\u2028\u202e\x7f") == r"a\nb\x1b[2J\u2028\u202e\x7f"
-    long = shown("a" * 10_000 + "z")
+    assert excerpt("größe, 関節 [red]") == "größe, 関節 [red]"
+    assert excerpt("a\nb\x1b[2J\u2028\u202e\x7f") == r"a\nb\x1b[2J\u2028\u202e\x7f"
+    long = excerpt("a" * 10_000 + "z")
     assert len(long) < 130
     assert long.endswith("z (10001 characters)")
     assert is_plain("l_knee/joint 1")

@@ -18,8 +18,14 @@ from urdfs import BASE, inertial, joint, link, write
 from torchid import parameters
 from torchid.errors import NumericalWarning
 from torchid.estimators import LeastSquares
-from torchid.identifiability.base_parameters import BaseParameters, base_parameters, relations, unseen
-from torchid.identifiability.rank import rank_and_gap, structural_rank
+from torchid.identifiability.base_parameters import (
+    BaseParameters,
+    base_parameters,
+    format_base_parameters,
+    rank_and_gap,
+    structural_rank,
+    unobservable_parameters,
+)
 from torchid.identifiability.structure import structural_problem
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
@@ -147,9 +153,9 @@ def test_base_parameters_cause_all_forces_and_hidden_directions_none(robot: Robo
     forces = K @ phi.T
     K_B = base(torch.from_numpy(K)).numpy()
     assert K_B.shape == (*K.shape[:2], base.rank)
-    np.testing.assert_allclose(K_B @ base.of(phi).T + K @ constant.T, forces, rtol=0, atol=1e-10 * size)
-    np.testing.assert_allclose(K @ base.hidden.T, 0.0, atol=1e-12 * size)
-    directions = base.hidden / base.scale
+    np.testing.assert_allclose(K_B @ base.reduce(phi).T + K @ constant.T, forces, rtol=0, atol=1e-10 * size)
+    np.testing.assert_allclose(K @ base.null_space.T, 0.0, atol=1e-12 * size)
+    directions = base.null_space / base.scale
     np.testing.assert_allclose(directions @ directions.T, np.eye(len(directions)), atol=1e-12)
     assert len(directions) + base.rank == base.free.sum()
     if not robot.fixed_base:
@@ -164,15 +170,15 @@ def test_lifted_parameters_cause_the_same_forces_and_are_the_nearest(robot: Robo
     K, rng = regressor(robot, 30, seed), np.random.default_rng(seed)
     nominal, true = base.scale * rng.normal(size=(2, len(base.scale)))
     true = np.where(base.free, true, nominal)
-    lifted = base.lift(base.of(true), nominal)
+    lifted = base.lift(base.reduce(true), nominal)
     np.testing.assert_allclose(
-        base.of(lifted) / base.scale[base.kept], base.of(true) / base.scale[base.kept], atol=1e-9
+        base.reduce(lifted) / base.scale[base.kept], base.reduce(true) / base.scale[base.kept], atol=1e-9
     )
     np.testing.assert_allclose(K @ lifted, K @ true, rtol=0, atol=1e-10 * np.abs(K * base.scale).max())
     step = (lifted - nominal) / base.scale
     np.testing.assert_array_equal(step[~base.free], 0.0)
-    np.testing.assert_allclose(base.hidden / base.scale @ step, 0.0, atol=1e-10 * np.linalg.norm(step))
-    np.testing.assert_allclose(base.lift(base.of(nominal), nominal), nominal, rtol=0, atol=1e-12 * base.scale.max())
+    np.testing.assert_allclose(base.null_space / base.scale @ step, 0.0, atol=1e-10 * np.linalg.norm(step))
+    np.testing.assert_allclose(base.lift(base.reduce(nominal), nominal), nominal, rtol=0, atol=1e-12 * base.scale.max())
 
 
 @pytest.mark.parametrize("name", ["UR5", "TIAGo", "Solo12", "Talos", "human"])
@@ -183,7 +189,7 @@ def test_of_real_robots_too(name: str) -> None:
     phi[~base.free] = 0.0
     forces = K @ phi
     np.testing.assert_allclose(
-        base(torch.from_numpy(K)).numpy() @ base.of(phi), forces, rtol=0, atol=1e-10 * abs(forces).max()
+        base(torch.from_numpy(K)).numpy() @ base.reduce(phi), forces, rtol=0, atol=1e-10 * abs(forces).max()
     )
 
 
@@ -203,7 +209,7 @@ def test_forces_by_base_parameters_have_the_same_derivatives() -> None:
     for whole in (True, False):
         q, v, a = (torch.from_numpy(x).requires_grad_() for x in random_states(np.random.default_rng(5), robot.n, 4))
         K = Regressor(robot)(q, v, a)
-        forces = K @ torch.from_numpy(phi) if whole else base(K) @ torch.from_numpy(base.of(phi))
+        forces = K @ torch.from_numpy(phi) if whole else base(K) @ torch.from_numpy(base.reduce(phi))
         gradients.append(torch.cat(torch.autograd.grad((forces**2).sum(), [q, v, a]), dim=1))
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-9, atol=1e-9 * float(gradients[0].abs().max()))
 
@@ -230,7 +236,7 @@ def test_least_squares_finds_the_same_forces_in_base_parameters(frozen: str) -> 
     b = problem.A @ (nominal + problem.scale * rng.normal(size=nominal.shape)) + rng.normal(size=problem.b.shape)
     problem = replace(problem, free=free.flatten(), nominal=nominal, b=b, oversampling=1.7)
     base = base_parameters(problem)
-    whole, reduced = LeastSquares().solve(problem), LeastSquares().solve(base.problem(problem))
+    whole, reduced = LeastSquares().solve(problem), LeastSquares().solve(base.reduce_problem(problem))
     constant = np.where(problem.free, 0.0, nominal)
     forces = problem.A @ whole.phi
     found = problem.A[:, base.kept] @ reduced.phi + problem.A @ constant
@@ -247,7 +253,7 @@ def test_least_squares_finds_the_same_forces_in_base_parameters(frozen: str) -> 
 def test_other_free_parameters_than_it_was_made_from_are_refused() -> None:
     _, problem, base = arm()
     with pytest.raises(ValueError, match="free"):
-        base.problem(replace(problem, free=~problem.free))
+        base.reduce_problem(replace(problem, free=~problem.free))
 
 
 # ----------------------------------------------------------------------------------------------------------- words
@@ -262,7 +268,7 @@ def hinge(folder: Path) -> Robot:
 def test_a_hinge_hides_mass_first_moment_along_it_and_one_inertia_as_textbooks_say(tmp_path: Path) -> None:
     robot = hinge(tmp_path)
     base = base_parameters(flying(robot))
-    assert relations(base, robot.body_names) == [
+    assert format_base_parameters(base, robot.body_names) == [
         "m[base] + m[arm]",
         "mcx[base] + 0.5 m[arm]",
         "mcy[base]",
@@ -283,15 +289,15 @@ def test_a_hinge_hides_mass_first_moment_along_it_and_one_inertia_as_textbooks_s
         "fc[arm]",
         "fv[arm]",
     ]
-    assert unseen(base, robot.body_names) == []  # the base's friction is no parameter of the fit
+    assert unobservable_parameters(base, robot.body_names) == []  # the base's friction is no parameter of the fit
 
 
 def test_of_a_bolted_hinge_across_gravity_four_numbers_are_seen(tmp_path: Path) -> None:
     elements = [BASE, link("arm"), joint("elbow", "base", "arm", extra='<axis xyz="0 1 0"/>')]
     robot = load(write(tmp_path, *elements), fixed_base=True)
     base = base_parameters(flying(robot))
-    assert relations(base, robot.body_names) == ["mcx[arm]", "mcz[arm]", "Iyy[arm]", "fc[arm]", "fv[arm]"]
-    assert unseen(base, robot.body_names) == [
+    assert format_base_parameters(base, robot.body_names) == ["mcx[arm]", "mcz[arm]", "Iyy[arm]", "fc[arm]", "fv[arm]"]
+    assert unobservable_parameters(base, robot.body_names) == [
         "base: m, mcx, mcy, mcz, Ixx, Ixy, Ixz, Iyy, Iyz, Izz",
         "arm: m, mcy, Ixx, Ixy, Ixz, Iyz, Izz",
     ]
@@ -304,7 +310,7 @@ def test_a_preference_chooses_what_is_kept(tmp_path: Path) -> None:
     wish[0] = 1e3  # the base's mass rather than the arm's
     base = base_parameters(problem, preference=wish)
     assert 0 not in base.kept
-    assert "m[arm] + m[base]" in relations(base, robot.body_names)
+    assert "m[arm] + m[base]" in format_base_parameters(base, robot.body_names)
 
 
 # ------------------------------------------------------------------------------------------------------- how clear

@@ -14,9 +14,9 @@ from torchid import parameters
 from torchid.estimators import LeastSquares
 from torchid.estimators.least_squares import VERDICTS
 from torchid.identifiability.contributions import Contributions, SensorContribution, contributions
-from torchid.identifiability.information import Knowledge, prior_directions, sensor_information
-from torchid.problem import ExtraTerms, LinearProblem, RowBuilder, Samples, assemble, bind, compress, compress_parts
-from torchid.problem.compression import Part, merged
+from torchid.identifiability.information import InformationGain, prior_directions, sensor_information
+from torchid.problem import ExtraTerms, LinearProblem, RowBuilder, Samples, assemble, bind_log, compress, compress_parts
+from torchid.problem.compression import Part, merge_factors
 from torchid.report.tables import contribution_table, table_text, verdict_table
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors
@@ -111,7 +111,7 @@ def quadruped(sensors: SensorSet, samples: Sequence[int] = (24,), states: Sequen
     robot, rng = load(SOLO12), np.random.default_rng(3)
     oracle, feet = Oracle.of(robot), [(foot.frame, 3) for foot in FEET]
     logs = [make_log(oracle, feet, states, n, rng, f"{number}.npz") for number, n in enumerate(samples)]
-    return World(robot, FEET, sensors, [bind(log, robot, FEET) for log in logs])
+    return World(robot, FEET, sensors, [bind_log(log, robot, FEET) for log in logs])
 
 
 def with_sensors(w: World, torques: Sequence[str], wrenches: Mapping[str, Sequence[str]]) -> World:
@@ -123,7 +123,7 @@ def arm(point: bool) -> World:
     robot, rng = load(UR5, fixed_base=True), np.random.default_rng(4)
     contacts = (Contact("tool0", "point" if point else "flat"),)
     log = make_log(Oracle.of(robot), [("tool0", 3 if point else 6)], [[True], [False]], 40, rng, "arm.npz")
-    return World(robot, contacts, named_sensors("full", robot.n, 1, NOISE), [bind(log, robot, contacts)])
+    return World(robot, contacts, named_sensors("full", robot.n, 1, NOISE), [bind_log(log, robot, contacts)])
 
 
 def gram(w: World) -> Array:
@@ -179,7 +179,7 @@ def test_a_foot_in_the_air_adds_nothing_and_a_torque_beside_too_few_others_neith
     robot, rng = load(UR5, fixed_base=True), np.random.default_rng(5)
     contacts = (Contact("tool0", "flat"),)
     log = make_log(Oracle.of(robot), [("tool0", 6)], [[True]], 20, rng)
-    held = World(robot, contacts, named_sensors("joints", robot.n, 1, NOISE), [bind(log, robot, contacts)])
+    held = World(robot, contacts, named_sensors("joints", robot.n, 1, NOISE), [bind_log(log, robot, contacts)])
     found = sensor_information(held.logs, held.builder)  # six unknown forces, six torques: nothing is left
     assert not found.total.any()
     assert not any(lost.any() for lost in found.torques.values())
@@ -190,7 +190,7 @@ def test_some_samples_stand_for_all() -> None:
     exact, found = (sensor_information(w.logs, w.builder, most) for most in (4000, 240))
     problem = identified(w)[1]
     N = prior_directions(w.builder, problem.scale * problem.free)
-    bits = [Knowledge.of(np.linalg.eigvalsh(N.T @ one.total @ N)).bits for one in (exact, found)]
+    bits = [InformationGain.of(np.linalg.eigvalsh(N.T @ one.total @ N)).bits for one in (exact, found)]
     assert bits[1] == pytest.approx(bits[0], rel=0.02)
     seen: list[int] = []
     sensor_information(w.logs, w.builder, 240, seen.append)
@@ -212,14 +212,14 @@ def adds(w: World) -> Contributions:
     return contributions(parts, w.logs, builder, problem, w.robot.joint_names)
 
 
-def knowledge(w: World, logs: Sequence[Samples]) -> tuple[Knowledge, int]:
+def knowledge(w: World, logs: Sequence[Samples]) -> tuple[InformationGain, int]:
     """By the definition, from the rows of all parameters; and the rank."""
     _, problem, _ = identified(w, logs)
     A = problem.A[:, problem.free] * problem.scale[problem.free]
     H = A.T @ A / problem.oversampling
     unit = np.eye(len(H))
     bits = 0.5 * np.linalg.slogdet(unit + H).logabsdet / np.log(2.0)
-    return Knowledge(bits, np.trace(np.linalg.solve(unit + H, H))), LeastSquares().solve(problem).rank
+    return InformationGain(bits, np.trace(np.linalg.solve(unit + H, H))), LeastSquares().solve(problem).rank
 
 
 UNKNOWN = {
@@ -243,8 +243,8 @@ def three_logs(request: pytest.FixtureRequest) -> World:
 def test_what_a_log_adds_is_what_a_fit_without_it_lacks(three_logs: World) -> None:
     w, found = three_logs, adds(three_logs)
     whole, rank = knowledge(w, w.logs)
-    assert found.known.bits == pytest.approx(whole.bits, rel=1e-9)
-    assert found.known.determined == pytest.approx(whole.determined, rel=1e-9)
+    assert found.total.bits == pytest.approx(whole.bits, rel=1e-9)
+    assert found.total.determined == pytest.approx(whole.determined, rel=1e-9)
     assert [log.name for log in found.logs] == ["0.npz", "1.npz", "2.npz"]
     for number, log in enumerate(found.logs):
         rest, rank_of_rest = knowledge(w, w.logs[:number] + w.logs[number + 1 :])
@@ -304,8 +304,8 @@ def test_sensors_are_ranked_by_what_a_fit_without_them_lacks(unknown: str) -> No
 def test_half_as_many_independent_samples_tell_as_much_as_half_the_rows(three_logs: World) -> None:
     log = three_logs.logs[1]
     twice = [replace(log, oversampling=5.0), replace(log, source="again.npz", oversampling=5.0)]
-    assert adds(replace(three_logs, logs=twice)).known.bits == pytest.approx(
-        adds(replace(three_logs, logs=[log])).known.bits
+    assert adds(replace(three_logs, logs=twice)).total.bits == pytest.approx(
+        adds(replace(three_logs, logs=[log])).total.bits
     )
 
 
@@ -320,7 +320,7 @@ def test_parts_hold_every_sample_once_and_merge_into_the_whole(three_logs: World
     assert len({(part.source, part.state) for part in parts}) == len(parts)
     for log in w.logs:
         assert sum(part.samples for part in parts if part.source == log.source) == len(log)
-    whole, R = gram(w), merged((part.factor for part in parts), builder).triangle().numpy()[:-1, :-1]
+    whole, R = gram(w), merge_factors((part.factor for part in parts), builder).triangle().numpy()[:-1, :-1]
     np.testing.assert_allclose(R.T @ R, whole, rtol=0.0, atol=1e-13 * np.abs(whole).max())
 
 
@@ -329,9 +329,9 @@ def test_rows_are_as_independent_as_those_of_the_logs_they_come_from(three_logs:
     logs = [replace(log, oversampling=kappa) for log, kappa in zip(w.logs, (1.0, 4.0, 2.0), strict=True)]
     parts = compress_parts(logs, w.builder)
     rows = [sum(p.factor.rows for p in parts if p.source == log.source) for log in logs]
-    factor = merged((part.factor for part in parts), w.builder)
+    factor = merge_factors((part.factor for part in parts), w.builder)
     assert factor.oversampling == pytest.approx(sum(rows) / (rows[0] + rows[1] / 4.0 + rows[2] / 2.0))
-    assert merged([], w.builder).oversampling == 1.0
+    assert merge_factors([], w.builder).oversampling == 1.0
 
 
 def test_tables_say_how_many_are_not_shown(three_logs: World) -> None:

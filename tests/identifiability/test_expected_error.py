@@ -13,7 +13,7 @@ from torchid.estimators import LeastSquares
 from torchid.identifiability.expected_error import error_directions, expected_errors
 from torchid.identifiability.structure import structural_samples
 from torchid.problem import Evaluation, LinearProblem, RowBuilder, Samples, compress, linear_problem
-from torchid.problem.metrics import GROUPS
+from torchid.problem.metrics import ROW_GROUPS
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
@@ -45,7 +45,7 @@ def rms(robot: Robot, logs: list[Samples], phi: np.ndarray) -> dict[str, float]:
     ]
     found = Evaluation(robot, CONTACTS).metrics(silent, phi)
     by_joint = np.array([[m.by_joint_rms[joint] for joint in robot.joint_names] for m in found], dtype=float)
-    out = {group: float(np.sqrt(np.mean([m.rms[group] ** 2 for m in found]))) for group in GROUPS}  # type: ignore[operator]
+    out = {group: float(np.sqrt(np.mean([m.rms[group] ** 2 for m in found]))) for group in ROW_GROUPS}  # type: ignore[operator]
     return out | {"joint_torque": float(np.sqrt(np.square(by_joint).mean(0)).mean())}
 
 
@@ -71,7 +71,7 @@ def test_the_noise_of_the_sensors_that_predictions_are_compared_with_is_as_expec
     robot: Robot, logs: list[Samples]
 ) -> None:
     generator = torch.Generator().manual_seed(3)
-    evaluation, squares, draws = Evaluation(robot, CONTACTS), dict.fromkeys(GROUPS, 0.0), 30
+    evaluation, squares, draws = Evaluation(robot, CONTACTS), dict.fromkeys(ROW_GROUPS, 0.0), 30
     without_floors = replace(NOISE, base_force=0.0, base_moment=0.0)
     for _ in range(draws):
         noisy = []
@@ -80,12 +80,12 @@ def test_the_noise_of_the_sensors_that_predictions_are_compared_with_is_as_expec
             assert log.wrench is not None
             torque = NOISE.joint_torque * torch.randn(log.torque.shape, generator=generator, dtype=torch.float64)
             wrench = torch.randn(log.wrench.shape, generator=generator, dtype=torch.float64)
-            noisy.append(replace(log, torque=torque, wrench=wrench * torch.from_numpy(NOISE.wrench)))
+            noisy.append(replace(log, torque=torque, wrench=wrench * torch.from_numpy(NOISE.wrench_std)))
         for group, value in evaluation.metrics(noisy, np.zeros((1, robot.nominal.size)))[0].rms.items():
             assert value is not None
             squares[group] += value**2 / draws
     expected = expected_errors(evaluation.builder, logs, np.zeros((1, robot.nominal.size)), without_floors)
-    for group in GROUPS:
+    for group in ROW_GROUPS:
         assert expected.sensors[group] == pytest.approx(np.sqrt(squares[group]), rel=0.03), group
         assert expected.total[group] == expected.sensors[group]
     with_floors = expected_errors(evaluation.builder, logs, np.zeros((1, robot.nominal.size)), NOISE).sensors

@@ -18,12 +18,12 @@ from welded import SENSORS, machine
 
 from torchid.config import load_config
 from torchid.errors import ConfigError
-from torchid.identifiability.confounding import APART, total_mass
+from torchid.identifiability.confounding import INFLATION_LIMIT, total_mass
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
-from torchid.parameters import COMPONENTS
-from torchid.problem import ExtraTerms, RowBuilder, Samples, bind
-from torchid.problem.chunks import by_state
+from torchid.parameters import WRENCH_COMPONENTS
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import free_parameters
 from torchid.problem.extras import CHANNELS
 from torchid.robot import Robot
@@ -44,7 +44,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     oracle = Oracle.of(robot)
     logs = [make_log(oracle, [("sole", 6), ("fin", 3)], STATES, 80, rng, name) for name in ("a.npz", "b.npz")]
     found = Miscalibration.random(logs[0], rng)
-    return robot, oracle, [bind(found.read(log), robot, CONTACTS) for log in logs]
+    return robot, oracle, [bind_log(found.read(log), robot, CONTACTS) for log in logs]
 
 
 def sensors_of(robot: Robot) -> SensorSet:
@@ -54,7 +54,7 @@ def sensors_of(robot: Robot) -> SensorSet:
 def noisy(samples: Samples, robot: Robot, generator: torch.Generator) -> Samples:
     """With the noise that is stated."""
     torque, wrench = value(samples.torque), value(samples.wrench)
-    std = torch.from_numpy(NOISE.dofs(robot.n, robot.dofs)), torch.from_numpy(NOISE.wrench)
+    std = torch.from_numpy(NOISE.dof_std(robot.n, robot.n_dofs)), torch.from_numpy(NOISE.wrench_std)
 
     def noise(x: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
         return x + scale * torch.randn(x.shape, generator=generator, dtype=torch.float64)
@@ -66,10 +66,10 @@ def stacked(builder: RowBuilder, robot: Robot, logs: list[Samples]) -> tuple[Arr
     """All rows [K | extras], the extras of each log in columns of their own, the right-hand side, and the labels."""
     labels = [(log.source, x.label) for log in logs for x in builder.extras if x.per_log]
     labels += [("", x.label) for x in builder.extras if not x.per_log]
-    count, M = builder.columns.count, builder.columns.from_parameters()
+    count, M = builder.columns.count, builder.columns.parameter_map()
     blocks, right = [], []
     for log in logs:
-        for state, index in by_state(log):
+        for state, index in chunks_by_state(log):
             for support, rows in builder.rows(log[index], state):
                 wide = np.zeros((len(rows), builder.width))
                 wide[:, list(support)] = rows[:, :-1].numpy()
@@ -142,7 +142,7 @@ def test_95_percent_intervals_of_offsets_hold_the_truth_that_often(tmp_path: Pat
     robot, rng = slide(tmp_path), np.random.default_rng(9)
     terms = ExtraTerms(offsets={"joint_torque": "log"})
     sensors = named_sensors("joints", robot.n, 0, NOISE)
-    logs = [bind(make_log(Oracle.of(robot), [], [[]], 8, rng, f"{k}.npz"), robot, ()) for k in range(5)]
+    logs = [bind_log(make_log(Oracle.of(robot), [], [[]], 8, rng, f"{k}.npz"), robot, ()) for k in range(5)]
     generator, hits = torch.Generator().manual_seed(1), []
     for _ in range(200):
         found = fit(robot, (), sensors, terms, [noisy(log, robot, generator) for log in logs])
@@ -178,11 +178,11 @@ def test_an_offset_and_a_weight_are_as_far_apart_as_the_acceleration_is_from_con
     s = a + 9.81
     log = Log("lift.npz", np.arange(200) * 0.01, ("lift",), 0 * a, 0 * a, a, 2.0 * s + 7.0)
     sensors = named_sensors("joints", 1, 0)
-    (found,) = fit(robot, (), sensors, ExtraTerms(offsets={"joint_torque": "all"}), [bind(log, robot, ())]).extras
+    (found,) = fit(robot, (), sensors, ExtraTerms(offsets={"joint_torque": "all"}), [bind_log(log, robot, ())]).extras
     if acceleration:
         assert found.inflation == pytest.approx(np.sqrt((s**2).mean()) / a.std(), rel=1e-6)
         assert found.value == pytest.approx(7.0, abs=1e-6)
-    assert found.separable == (acceleration > 9.81 / APART)
+    assert found.separable == (acceleration > 9.81 / INFLATION_LIMIT)
     if not found.separable:
         assert found.confounded_with == ("arm m",)
         assert (found.standard_error == np.inf) == (acceleration == 0.0)
@@ -214,7 +214,7 @@ def standing(lifted: bool) -> Fit:
         base_angular_acceleration_base=zero, contact_names=tuple(foot.frame for foot in FEET), contact_active=active,
         contact_wrench_local=wrench.reshape(N, 2, 6),
     )  # fmt: skip
-    samples = bind(in_world(oracle, log), robot, FEET)
+    samples = bind_log(in_world(oracle, log), robot, FEET)
     return fit(robot, FEET, named_sensors("full", n, 2), ExtraTerms(offsets={"contact_force": "log"}), [samples])
 
 
@@ -266,12 +266,12 @@ def test_a_filter_that_smears_the_switching_of_contacts_leaves_offsets_exact(rec
     smeared = (read[1].contact_share > 0.01) & (read[1].contact_share < 0.99)
     assert smeared.mean() > 0.01
     terms = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log"))
-    before, after = (fit(robot, CONTACTS, sensors_of(robot), terms, [bind(x, robot, CONTACTS)]) for x in read)
+    before, after = (fit(robot, CONTACTS, sensors_of(robot), terms, [bind_log(x, robot, CONTACTS)]) for x in read)
     assert after.assembly.problem.oversampling > 3.0
     true = dict(zip((f"offset of {name}" for name in robot.joint_names), off.torque, strict=True))
     for c, contact in enumerate(CONTACTS):
         for k in range(len(contact.components)):
-            true[f"offset of {contact.frame} {COMPONENTS[k]}"] = off.wrench[c, k]
+            true[f"offset of {contact.frame} {WRENCH_COMPONENTS[k]}"] = off.wrench[c, k]
     told = [x for x in after.extras if x.separable and x.extra.label in true]
     assert len(told) >= 9
     for x in told:

@@ -12,8 +12,12 @@ from contact_states import BOTH, FEET, FLIGHT, LEFT, RIGHT, biped, bipeds
 from synthetic import G1, PANDA, SOLO12, TIAGO, UR5, Array, Oracle, load
 
 from torchid import parameters
-from torchid.identifiability.base_parameters import BaseParameters, base_parameters, unseen
-from torchid.identifiability.rank import structural_rank
+from torchid.identifiability.base_parameters import (
+    BaseParameters,
+    base_parameters,
+    structural_rank,
+    unobservable_parameters,
+)
 from torchid.identifiability.structure import standing_samples, standing_states, structural_problem, structural_samples
 from torchid.problem.contact_state import State
 from torchid.regressor import motion_from_state
@@ -89,7 +93,7 @@ def test_joint_torques_of_an_arm_that_cannot_move_tell_nothing() -> None:
     robot = load(UR5, fixed_base=True)
     sensors = named_sensors("joints", robot.n, 1)
     base = base_parameters(structural_problem(robot, [Contact("tool0", "flat")], sensors, [(True,)]))
-    assert (base.rank, base.hidden.shape) == (0, (10 + 12 * robot.n, 12 * len(robot.bodies)))
+    assert (base.rank, base.null_space.shape) == (0, (10 + 12 * robot.n, 12 * len(robot.bodies)))
 
 
 def test_samples_are_the_states_and_reproducible() -> None:
@@ -139,7 +143,7 @@ INERTIA = set(parameters.PARAMETERS[parameters.INERTIA])
 
 def hidden_inertia(name: str, base: BaseParameters) -> list[str]:
     """Feet whose six inertia numbers are part of no sum."""
-    lines = dict(line.split(": ") for line in unseen(base, biped(name)[0].body_names))
+    lines = dict(line.split(": ") for line in unobservable_parameters(base, biped(name)[0].body_names))
     return [foot for foot in feet_of(name) if set(lines.get(foot, "").split(", ")) >= INERTIA]
 
 
@@ -169,7 +173,7 @@ def test_so_no_sensor_set_tells_it(name: str, sensors: str) -> None:
 def test_stepping_tells_all_that_flight_does(name: str, sensors: str) -> None:
     robot, _ = biped(name)
     base = seen(name, sensors, [BOTH, LEFT, RIGHT], friction=True)
-    assert unseen(base, robot.body_names) == []
+    assert unobservable_parameters(base, robot.body_names) == []
     assert base.rank == 10 + 9 * robot.n
     assert base.gap > 1e12
 

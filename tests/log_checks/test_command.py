@@ -19,7 +19,7 @@ from repository import ROOT, SHARED
 from torchid.cli import main
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log, write_log
-from torchid.report.log_checks import hygiene_figure
+from torchid.report.log_checks import log_check_figure
 
 HUMAN, ARM = SHARED / "human_squats", SHARED / "kuka_lwr4"
 ELSEWHERE = pytest.mark.skipif(not SHARED.is_dir(), reason=f"recorded logs are not in {SHARED}")
@@ -97,8 +97,8 @@ def test_one_sample_of_an_arm_with_its_velocity_and_acceleration_needs_no_deriva
 
 def test_an_overview_gives_the_range_of_every_channel_and_names_only_what_there_is(folder: Path) -> None:
     clean, spiked = (check(read_log(folder / f"sway_{name}.npz")) for name in ("train", "test"))
-    assert not hygiene_figure([clean]).axes[0].get_legend()
-    (axes,) = hygiene_figure([spiked]).axes
+    assert not log_check_figure([clean]).axes[0].get_legend()
+    (axes,) = log_check_figure([spiked]).axes
     legend = axes.get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == ["condemned"]

@@ -17,11 +17,11 @@ from motions import value
 from torchid.cli import main
 from torchid.errors import LogError, TorchidWarning
 from torchid.estimators import Estimate, LeastSquares
-from torchid.log_checks import without_condemned
-from torchid.log_checks.check import check, excluded
+from torchid.log_checks import drop_condemned
+from torchid.log_checks.check import check, excluded_stamps
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.preprocess import preprocess
-from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.sensing import SensorNoise, named_sensors
 
 SPIKES = (200, 431, 700, 1011)
@@ -37,7 +37,7 @@ def spiked() -> Log:
 
 
 def processed(log: Log) -> Samples:
-    return bind(preprocess(log, CUTOFF), demo_robot(), CONTACTS)
+    return bind_log(preprocess(log, CUTOFF), demo_robot(), CONTACTS)
 
 
 def fitted(samples: Samples) -> Estimate:
@@ -50,7 +50,7 @@ def quietly_excluding(log: Log) -> Samples:
     checked = check(log, demo_robot(), CONTACTS, CUTOFF)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
-        return without_condemned(processed(checked.repaired), checked, CUTOFF, derived=True)
+        return drop_condemned(processed(checked.repaired), checked, CUTOFF, derived=True)
 
 
 def test_without_condemned_samples_the_parameters_are_those_of_the_clean_log() -> None:
@@ -97,7 +97,7 @@ def test_a_pose_that_was_mostly_not_measured_makes_a_log_useless(tmp_path: Path)
 def test_samples_are_left_out_over_the_reach_of_the_filter_and_two_more(cutoff: float) -> None:
     log = changed(demo_log(), "joint_torque", lambda t: t.__setitem__((650, 4), 300.0))
     checked = check(log)
-    gone = demo_log().time[excluded(checked, demo_log().time, cutoff, derived=True)]
+    gone = demo_log().time[excluded_stamps(checked, demo_log().time, cutoff, derived=True)]
     margin = 1.0 / cutoff + 0.02
     assert abs(gone[0] - (6.5 - margin)) < 0.0101
     assert abs(gone[-1] - (6.5 + margin)) < 0.0101
@@ -106,13 +106,13 @@ def test_samples_are_left_out_over_the_reach_of_the_filter_and_two_more(cutoff: 
 def test_a_log_that_is_not_processed_loses_its_condemned_samples_alone() -> None:
     log = changed(preprocess(demo_log()), "joint_torque", lambda t: t.__setitem__((slice(650, 653), 4), 300.0))
     checked = check(log)
-    assert np.flatnonzero(excluded(checked, log.time, None, derived=False)).tolist() == [650, 651, 652]
-    assert np.flatnonzero(excluded(checked, log.time, None, derived=True)).tolist() == list(range(648, 655))
+    assert np.flatnonzero(excluded_stamps(checked, log.time, None, derived=False)).tolist() == [650, 651, 652]
+    assert np.flatnonzero(excluded_stamps(checked, log.time, None, derived=True)).tolist() == list(range(648, 655))
 
 
 def test_a_clean_log_is_returned_as_it_is_without_a_word() -> None:
     samples, checked = processed(demo_log()), check(demo_log(), demo_robot(), CONTACTS, CUTOFF)
-    assert without_condemned(samples, checked, CUTOFF, derived=True) is samples
+    assert drop_condemned(samples, checked, CUTOFF, derived=True) is samples
 
 
 def test_what_is_left_out_is_told_with_the_reasons() -> None:
@@ -120,13 +120,13 @@ def test_what_is_left_out_is_told_with_the_reasons() -> None:
     with pytest.warns(
         TorchidWarning, match=r"sway_train.npz: \d+ of 1250 samples excluded: .*spike at samples 200, 431"
     ):
-        without_condemned(processed(checked.repaired), checked, CUTOFF, derived=True)
+        drop_condemned(processed(checked.repaired), checked, CUTOFF, derived=True)
 
 
 def test_a_log_that_is_not_usable_is_refused_in_one_line() -> None:
     log = replace(demo_log(), joint_position=np.degrees(demo_log().joint_position))
     with pytest.raises(LogError, match=r"not usable: joint_position: unit; accepted: .*exclude_condemned: false"):
-        without_condemned(processed(demo_log()), check(log), CUTOFF, derived=True)
+        drop_condemned(processed(demo_log()), check(log), CUTOFF, derived=True)
 
 
 def test_identify_and_evaluate_count_what_they_leave_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

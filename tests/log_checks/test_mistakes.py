@@ -11,10 +11,10 @@ from motions import value
 from walking import MACHINES, robot_of, truth
 
 from torchid.log_checks import NOTE
-from torchid.log_checks.contacts import slip
-from torchid.log_checks.mistakes import exchanges
-from torchid.log_checks.model import bound, filtered
-from torchid.log_checks.scales import gains, motion_cutoff, stretch
+from torchid.log_checks.contacts import measure_foot_slip
+from torchid.log_checks.mistakes import exchanged_names
+from torchid.log_checks.model import bind_some_samples, preprocess_pieces
+from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
 
 BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
 #: Cells of the whole table that are not named, and why: see docs/checking.md.
@@ -63,20 +63,20 @@ def test_factors_of_torques_and_of_time_are_recovered() -> None:
     machine = MACHINES["arm"]
     case, robot = case_of(machine, "contacts"), robot_of(machine)
     slow = replace(case.log, time=3.0 * case.log.time)
-    found = stretch(slow, robot, (), value(motion_cutoff(slow)))
+    found = fit_time_scale(slow, robot, (), value(motion_cutoff_hz(slow)))
     assert found.factor == pytest.approx(1.0 / 3.0, rel=0.1)
     log = value(BY_NAME["one torque x 1.3"].make(case))
-    factors = value(gains(bound(filtered(log, 10.0), robot, (), 240), robot, ()))
+    factors = value(fit_torque_gains(bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240), robot, ()))
     assert factors.gain[1] / np.median(factors.gain) == pytest.approx(1.0 / 1.3, abs=3.0 * factors.spread[1])
 
 
 def test_feet_that_stand_do_not_move_and_tell_nothing_of_a_base_that_stands_still() -> None:
     machine = MACHINES["biped"]
     case, robot = case_of(machine, "full", heading=0.0), robot_of(machine)
-    assert value(slip(case.log, robot, machine.contacts)) < 0.02
+    assert value(measure_foot_slip(case.log, robot, machine.contacts)) < 0.02
     still = case.log.select(np.zeros(400, np.intp))
     still = replace(still, time=np.arange(400) / 200.0)
-    assert slip(still, robot, machine.contacts) is None
+    assert measure_foot_slip(still, robot, machine.contacts) is None
 
 
 @pytest.mark.parametrize(
@@ -89,12 +89,12 @@ def test_feet_that_stand_do_not_move_and_tell_nothing_of_a_base_that_stands_stil
     ],
 )
 def test_sides_are_exchanged_by_name(names: tuple[str, ...], other: tuple[str, ...]) -> None:
-    assert next(exchanges(names)) == ("left and right", other)
+    assert next(exchanged_names(names)) == ("left and right", other)
 
 
 def test_names_without_sides_have_none_to_exchange() -> None:
-    assert "left and right" not in [what for what, _ in exchanges(("shell", "roller", "elbow"))]
-    assert list(exchanges(("one",))) == []
+    assert "left and right" not in [what for what, _ in exchanged_names(("shell", "roller", "elbow"))]
+    assert list(exchanged_names(("one",))) == []
 
 
 @pytest.mark.slow

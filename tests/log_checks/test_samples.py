@@ -13,8 +13,8 @@ from motions import position, value
 from repository import SHARED
 
 from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS
-from torchid.log_checks.check import check, repaired
-from torchid.log_checks.spikes import jumps
+from torchid.log_checks.check import check, repair_log
+from torchid.log_checks.spikes import find_jumps
 from torchid.logs import Log
 
 Array = np.ndarray[Any, Any]
@@ -128,14 +128,14 @@ def test_motion_that_begins_and_ends_at_once_has_no_jumps() -> None:
     time = np.arange(3000) / 1000.0
     pulse = np.clip(time - 1.0, 0.0, 1.0)
     for values in (pulse, np.sin(2 * np.pi * pulse), np.maximum(0.0, np.sin(3 * time)), np.round(pulse, 3)):
-        assert jumps(values, 1000.0 * time, np.zeros(3000, int)) == []
+        assert find_jumps(values, 1000.0 * time, np.zeros(3000, int)) == []
 
 
 def test_a_sample_that_comes_late_is_no_jump() -> None:
     time = np.arange(2000) / 500.0
     time[1000:] += 0.4 / 500.0
-    assert jumps(np.sin(5.0 * time), 500.0 * time, np.zeros(2000, int)) == []
-    assert len(jumps(np.sin(5.0 * time), np.arange(2000.0), np.zeros(2000, int))) == 1, (
+    assert find_jumps(np.sin(5.0 * time), 500.0 * time, np.zeros(2000, int)) == []
+    assert len(find_jumps(np.sin(5.0 * time), np.arange(2000.0), np.zeros(2000, int))) == 1, (
         "it would be one with equal steps"
     )
 
@@ -143,7 +143,7 @@ def test_a_sample_that_comes_late_is_no_jump() -> None:
 def test_heavy_tailed_noise_has_no_spikes() -> None:
     rng = np.random.default_rng(2)
     for noise in (rng.laplace(size=200_000), rng.normal(size=200_000), rng.logistic(size=200_000)):
-        assert jumps(np.cumsum(0.1 * noise) + noise, np.arange(200_000.0), np.zeros(200_000, int)) == []
+        assert find_jumps(np.cumsum(0.1 * noise) + noise, np.arange(200_000.0), np.zeros(200_000, int)) == []
 
 
 @pytest.mark.parametrize("field", ["joint_position", "joint_torque"])
@@ -289,7 +289,7 @@ def test_a_repaired_log_differs_where_it_was_condemned_and_nowhere_else() -> Non
     difference = checked.repaired.joint_position != log.joint_position
     assert np.argwhere(difference).tolist() == [[HERE, 2]]
     assert abs(checked.repaired.joint_position[HERE, 2] - demo_log().joint_position[HERE, 2]) < 1e-3
-    assert repaired(demo_log(), ()) is demo_log()
+    assert repair_log(demo_log(), ()) is demo_log()
 
 
 def test_stamps_in_milliseconds_are_named() -> None:

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked
 from torchid.log_checks.check import check
-from torchid.log_checks.motion import compare
-from torchid.log_checks.weight import weight
+from torchid.log_checks.motion import compare_derivative
+from torchid.log_checks.weight import check_weight
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.quaternion import angular_velocity_base
 
@@ -72,7 +72,7 @@ def test_ratio_correlation_and_delay_of_a_derivative_are_measured(order: int) ->
     log = flying()
     derivative = value(log.joint_velocity if order == 1 else log.joint_acceleration)
     late = 1.7 * np.roll(derivative, 7, axis=0)
-    measured = value(compare(log.time, log.joint_position, late, order))
+    measured = value(compare_derivative(log.time, log.joint_position, late, order))
     np.testing.assert_allclose(measured.ratio, 1.7, rtol=0.02)
     np.testing.assert_allclose(measured.delay, 7.0, atol=0.1)
     assert (measured.correlation > 0.995).all()
@@ -306,12 +306,12 @@ def test_a_contact_whose_force_was_not_measured_is_named_and_the_others_are_judg
 
 def test_what_the_feet_carry_at_rest_is_compared_with_the_weight() -> None:
     log = carried().log
-    assert not list(weight(log, demo_robot()))
+    assert not list(check_weight(log, demo_robot()))
     for factor, name, severity in (
         (1.05, "weight", NOTE), (1.5, "weight", SUSPICIOUS), (1e-3, "unit", CONDEMNED), (1.0 / 9.81, "unit", CONDEMNED),
         (-1.0, "sign", CONDEMNED),
     ):  # fmt: skip
-        (finding,) = weight(scaled(log, "contact_wrench_world", factor), demo_robot())
+        (finding,) = check_weight(scaled(log, "contact_wrench_world", factor), demo_robot())
         assert (finding.name, finding.severity) == (name, severity)  # type: ignore[union-attr]
 
 

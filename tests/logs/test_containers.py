@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from torchid.errors import LogError, about_file
-from torchid.logs.containers import translated
+from torchid.logs.containers import reader_errors_explained
 
 
 def line_of(text: str) -> str:
     """The message made of a reader's own."""
-    with pytest.raises(LogError) as caught, about_file("walk.h5"), translated("time", "an array"):
+    with pytest.raises(LogError) as caught, about_file("walk.h5"), reader_errors_explained("time", "an array"):
         raise OSError(text)
     return str(caught.value)
 

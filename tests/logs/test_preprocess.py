@@ -30,7 +30,12 @@ from torchid.errors import InputError, LogError, TorchidWarning
 from torchid.logs import Log, read_log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import preprocess
-from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, rotate, sign_continuous
+from torchid.logs.quaternion import (
+    angular_acceleration_base,
+    angular_velocity_base,
+    make_sign_continuous,
+    rotate_to_world,
+)
 
 
 @pytest.mark.parametrize("time", [uniform(), jittered(), 1e4 + uniform()], ids=["uniform", "jittered", "late"])
@@ -130,8 +135,8 @@ def test_angular_rates_do_not_depend_on_the_length_of_the_quaternion(seed: int) 
 @given(st.lists(st.booleans(), min_size=400, max_size=400))
 def test_flipping_signs_of_quaternions_changes_nothing(flips: list[bool]) -> None:
     t = uniform(0.8)
-    quat = sign_continuous(value(moving_log(t).base_quat_xyzw))
-    flipped = sign_continuous(quat * np.where(flips, -1.0, 1.0)[:, None])
+    quat = make_sign_continuous(value(moving_log(t).base_quat_xyzw))
+    flipped = make_sign_continuous(quat * np.where(flips, -1.0, 1.0)[:, None])
     assert np.all(np.sum(flipped[1:] * flipped[:-1], axis=1) > 0)
     np.testing.assert_array_equal(flipped * np.sign(flipped[0] @ quat[0]), quat)
 
@@ -139,7 +144,7 @@ def test_flipping_signs_of_quaternions_changes_nothing(flips: list[bool]) -> Non
 def test_rotating_vectors_agrees_with_scipy() -> None:
     rotation = Rotation.random(50, random_state=np.random.default_rng(3))
     vector = np.random.default_rng(4).standard_normal((50, 3))
-    np.testing.assert_allclose(rotate(rotation.as_quat(), vector), rotation.apply(vector), atol=1e-15)
+    np.testing.assert_allclose(rotate_to_world(rotation.as_quat(), vector), rotation.apply(vector), atol=1e-15)
 
 
 def test_a_robot_without_joints_is_preprocessed() -> None:

@@ -16,9 +16,9 @@ from synthetic import load
 
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
-from torchid.problem import Evaluation, Metrics, Samples, bind
-from torchid.problem.metrics import BASE_ROWS, GROUPS
-from torchid.problem.predict import force_series, in_null_space
+from torchid.problem import Evaluation, Metrics, Samples, bind_log
+from torchid.problem.metrics import BASE_ROWS, ROW_GROUPS
+from torchid.problem.predict import force_series, null_space_part
 from torchid.report.tables import table_text
 from torchid.sensing import Contact
 
@@ -30,16 +30,16 @@ EVALUATION = Evaluation(ROBOT, [Contact(frame, "flat") for frame in SOLES])
 def samples(biped_folder: Path) -> Samples:
     """Exact forces of a robot that stands on both feet and on each one."""
     log = preprocess(read_log(biped_folder / "exact" / f"{LIFTING}.npz"), 10.0, 200.0)
-    return bind(log, ROBOT, EVALUATION.builder.contacts)
+    return bind_log(log, ROBOT, EVALUATION.builder.contacts)
 
 
 def test_the_null_space_of_the_contacts_passes_no_wrench_and_what_it_passes_it_passes_twice(samples: Samples) -> None:
     measured, _ = force_series(EVALUATION.builder, samples, ROBOT.nominal.flatten()[None])
-    torque = torch.nn.functional.pad(EVALUATION.builder.torque(samples), (6, 0)).numpy()
-    inside = in_null_space(EVALUATION.builder, samples, np.stack([measured, torque]))
+    torque = torch.nn.functional.pad(EVALUATION.builder.recorded_torque(samples), (6, 0)).numpy()
+    inside = null_space_part(EVALUATION.builder, samples, np.stack([measured, torque]))
     np.testing.assert_allclose(inside[0], inside[1], rtol=0.0, atol=1e-9)  # they differ by J_C^T lambda
     assert np.abs(measured - inside[0]).max() > 100.0
-    np.testing.assert_allclose(in_null_space(EVALUATION.builder, samples, inside), inside, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(null_space_part(EVALUATION.builder, samples, inside), inside, rtol=0.0, atol=1e-10)
 
 
 def test_errors_of_the_base_force_are_given_relative_to_its_rms_about_its_mean(samples: Samples) -> None:
@@ -61,15 +61,15 @@ def test_a_series_holds_predictions_of_every_vector_in_the_order_of_the_rows(sam
     measured, (one,) = force_series(EVALUATION.builder, samples, phi["one"][None])
     np.testing.assert_array_equal(series.true, measured)
     np.testing.assert_allclose(series.predicted["one"], one, rtol=0.0, atol=1e-10)
-    inside = in_null_space(EVALUATION.builder, samples, np.stack([measured, one]))
+    inside = null_space_part(EVALUATION.builder, samples, np.stack([measured, one]))
     np.testing.assert_allclose(series.projected_true, inside[0], rtol=0.0, atol=1e-10)
     np.testing.assert_allclose(series.projected["one"], inside[1], rtol=0.0, atol=1e-10)
 
 
 def numbered(start: int) -> Metrics:
     """Metrics in which every figure is another number."""
-    rms = {group: float(start + i) for i, group in enumerate(GROUPS)}
-    relative = {group: (start + 10.0 + i) / 100.0 for i, group in enumerate(GROUPS)}
+    rms = {group: float(start + i) for i, group in enumerate(ROW_GROUPS)}
+    relative = {group: (start + 10.0 + i) / 100.0 for i, group in enumerate(ROW_GROUPS)}
     return Metrics(rms, relative, {}, {}, (start + 20.0) / 100.0)
 
 

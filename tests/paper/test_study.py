@@ -15,7 +15,7 @@ from script_calls import call
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchid.problem import Metrics
-from torchid.problem.metrics import GROUPS
+from torchid.problem.metrics import ROW_GROUPS
 
 SETS = ("full", "contacts", "joints", "reduced")
 CONDITIONS = ("exact sensors", "white noise", "bias and gain", "delay", "joint friction", "all")
@@ -54,14 +54,14 @@ def test_every_sensor_set_meets_every_condition_on_both_training_sets(study: tup
 
 
 def test_the_true_parameters_are_the_floor_where_sensors_are_exact(error: Callable[..., float]) -> None:
-    for group in GROUPS:
+    for group in ROW_GROUPS:
         assert error("exact sensors", "all runs", TRUE, group) < 1e-3
         assert error("exact sensors", "all runs", NOMINAL, group) > 0.03
 
 
 @pytest.mark.parametrize("condition", ["exact sensors", "white noise", "delay"])
 def test_full_sensing_is_a_tenth_of_the_nominal_error_or_less(condition: str, error: Callable[..., float]) -> None:
-    for group in GROUPS:
+    for group in ROW_GROUPS:
         assert error(condition, "all runs", "full", group) < 0.1 * error(condition, "all runs", NOMINAL, group)
 
 
@@ -70,7 +70,7 @@ def test_contacts_alone_give_the_base_rows_and_not_the_joint_torques(
     condition: str, error: Callable[..., float]
 ) -> None:
     nominal, full, contacts = (
-        {group: error(condition, "all runs", sensors, group) for group in GROUPS}
+        {group: error(condition, "all runs", sensors, group) for group in ROW_GROUPS}
         for sensors in (NOMINAL, "full", "contacts")
     )
     assert contacts["base_force"] < 0.2 * nominal["base_force"]
@@ -80,7 +80,7 @@ def test_contacts_alone_give_the_base_rows_and_not_the_joint_torques(
 
 def test_joints_alone_do_not_feel_a_delay_of_the_foot_sensors(error: Callable[..., float]) -> None:
     for training in TRAINING:
-        for group in GROUPS:
+        for group in ROW_GROUPS:
             exact, late = (error(c, training, "joints", group) for c in ("exact sensors", "delay"))
             assert abs(late - exact) < 0.1 * exact + 1e-4  # the delay moves a few contact flags, nothing else
 
@@ -127,7 +127,7 @@ def test_figures_and_charts_are_written(study: tuple[Path, str]) -> None:
     assert set(events.Tags()["images"]) == {"rms", "forces", "projected"}
     joints = EventAccumulator(str(folder / "tensorboard" / "joints"))
     joints.Reload()
-    assert set(joints.Tags()["scalars"]) == {f"{training}/{group}" for training in TRAINING for group in GROUPS}
+    assert set(joints.Tags()["scalars"]) == {f"{training}/{group}" for training in TRAINING for group in ROW_GROUPS}
     assert len(joints.Scalars("all runs/base_force")) == len(CONDITIONS)
 
 
@@ -146,10 +146,10 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
 
 
 def results(**errors: tuple[float, float, float, float]) -> Results:
-    """Results of one condition with the given errors by sensors, in the order of `GROUPS`."""
+    """Results of one condition with the given errors by sensors, in the order of `ROW_GROUPS`."""
 
     def record(sensors: str, values: tuple[float, ...], draw: int, scale: float) -> Record:
-        rms: dict[str, Any] = {group: value * scale for group, value in zip(GROUPS, values, strict=True)}
+        rms: dict[str, Any] = {group: value * scale for group, value in zip(ROW_GROUPS, values, strict=True)}
         metrics = Metrics(rms, rms, {}, {}, 1.0)
         return Record("noise", "all", sensors, draw, 0, metrics, metrics)
 

@@ -50,7 +50,7 @@ def recorded(robot: Robot, contacts: Sequence[Contact], count: int, seed: int, w
         joint_position=q[:, q.shape[1] - robot.n :],
         joint_velocity=v[:, v.shape[1] - robot.n :],
         joint_acceleration=a[:, a.shape[1] - robot.n :],
-        base=BaseMotion.of(q, v, a, robot.fixed_base),
+        base=BaseMotion.from_coordinates(q, v, a, robot.fixed_base),
         torque=torch.from_numpy(torque),
         wrench=torch.from_numpy(wrench),
         wrench_in_world=world,

@@ -26,7 +26,7 @@ from true_robots import (
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
-from torchid.identifiability.rank import check_base, state_reports
+from torchid.identifiability.base_rank import require_base, state_reports
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
@@ -108,7 +108,7 @@ def test_the_result_says_that_it_is_exact_and_that_the_urdf_was_not(name: str, s
     assert estimate.residual_std < 1e-11
     assert np.sqrt(estimate.cost / estimate.nominal_cost) < 1e-12
     reports = state_reports(w.logs, RowBuilder(w.robot, w.kind.contacts, sensors_of(w, sensors)))
-    check_base(reports)
+    require_base(reports)
     assert {report.base_rank for report in reports} == {6}
     assert sum(report.samples for report in reports) == SAMPLES
 

@@ -18,8 +18,8 @@ from welded import SENSORS
 from torchid.estimators import Consistent
 from torchid.identifiability.base_parameters import base_parameters
 from torchid.identifiability.structure import structural_problem
-from torchid.problem import ExtraTerms, bind
-from torchid.problem.extras import CHANNELS, extras_of
+from torchid.problem import ExtraTerms, bind_log
+from torchid.problem.extras import CHANNELS, list_extras
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
@@ -41,7 +41,7 @@ def sensors_of(robot: Robot, name: str) -> SensorSet:
 
 
 def fitted(w: World, sensors: SensorSet, terms: ExtraTerms) -> Fit:
-    return fit(w.robot, CONTACTS, sensors, terms, [bind(log, w.robot, CONTACTS) for log in w.logs])
+    return fit(w.robot, CONTACTS, sensors, terms, [bind_log(log, w.robot, CONTACTS) for log in w.logs])
 
 
 def assert_recovered(w: World, found: Fit, terms: ExtraTerms) -> None:
@@ -118,7 +118,9 @@ def test_a_contact_and_a_limb_sensor_of_one_name_have_unknowns_of_their_own() ->
     robot = world().robot
     contacts = (Contact(SENSORS[0], "flat"),)
     sensors = with_ft_sensors(named_sensors("full", robot.n, 1, ft=len(SENSORS)), robot, SENSORS)
-    labels = [extra.label for extra in extras_of(robot, contacts, sensors, ExtraTerms(dict.fromkeys(CHANNELS, "log")))]
+    labels = [
+        extra.label for extra in list_extras(robot, contacts, sensors, ExtraTerms(dict.fromkeys(CHANNELS, "log")))
+    ]
     assert len(set(labels)) == len(labels) == robot.n + 6 * len(SENSORS) + 6
 
 
@@ -128,16 +130,18 @@ def test_terms_of_actuators_are_found_with_friction_that_turns_over_smoothly(kin
     terms = ExtraTerms(sign_width=WIDTH, **dict.fromkeys(every if kinds == "all" else (kinds,), True))
     w = world()
     logs, true = with_actuators(w, terms)
-    found = fit(w.robot, CONTACTS, sensors_of(w.robot, "full"), terms, [bind(log, w.robot, CONTACTS) for log in logs])
+    found = fit(
+        w.robot, CONTACTS, sensors_of(w.robot, "full"), terms, [bind_log(log, w.robot, CONTACTS) for log in logs]
+    )
     assert set(found.values) == set(true)
     for key, expected in true.items():
         assert found.values[key] == pytest.approx(expected, rel=EXACT, abs=1e-9), key
     assert found.estimate.residual_std < 1e-9
     without = replace(terms, armature=False, torque_offset=False, asymmetric_coulomb=False)
-    plain = fit(w.robot, CONTACTS, sensors_of(w.robot, "full"), without, [bind(x, w.robot, CONTACTS) for x in logs])
+    plain = fit(w.robot, CONTACTS, sensors_of(w.robot, "full"), without, [bind_log(x, w.robot, CONTACTS) for x in logs])
     assert plain.estimate.residual_std > 1e-3, "the terms must matter"
     sharp = fit(w.robot, CONTACTS, sensors_of(w.robot, "full"), replace(terms, sign_width=None),
-                [bind(x, w.robot, CONTACTS) for x in logs])  # fmt: skip
+                [bind_log(x, w.robot, CONTACTS) for x in logs])  # fmt: skip
     assert sharp.estimate.residual_std > 1e-3, "and so must the width"
 
 
@@ -184,7 +188,7 @@ def test_a_humanoid_with_ankle_sensors_and_an_imu_is_found_with_all_offsets_that
         log = make_log(oracle, contacts, states, 300, rng, name)
         misread.append(Miscalibration.random(log, rng))
         log = with_imu(oracle, misread[-1].read(log), "imu")
-        logs.append(bind(log, robot, FEET))
+        logs.append(bind_log(log, robot, FEET))
         assert logs[-1].base.quat_xyzw is None
     sensors = with_ft_sensors(named_sensors("joints", robot.n, 2, ft=2), robot, ANKLES)
     terms = ExtraTerms(offsets={"joint_torque": "log", "ft_force": "log", "ft_moment": "log"})
@@ -209,7 +213,7 @@ def test_a_humanoid_with_ankle_sensors_and_an_imu_is_found_with_all_offsets_that
 
 def test_parameters_bound_to_be_physical_are_found_with_the_offsets_too() -> None:
     terms, w = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log")), world()
-    logs = [bind(log, w.robot, CONTACTS) for log in w.logs]
+    logs = [bind_log(log, w.robot, CONTACTS) for log in w.logs]
     found = fit(w.robot, CONTACTS, sensors_of(w.robot, "full+limbs"), terms, logs, Consistent())
     for key, expected in w.true(found.builder, terms).items():
         assert found.values[key] == pytest.approx(expected, abs=1.5e-3), key  # 4.2e-4: where the interior point stops

@@ -21,7 +21,7 @@ from torchid.errors import InputError, LogError, UnknownNameError
 from torchid.estimators import LeastSquares
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
-from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.problem.base_motion import base_motion
 from torchid.regressor import Regressor
 from torchid.robot import Robot
@@ -64,8 +64,8 @@ def test_a_skew_imu_off_the_base_origin_gives_the_motion_that_the_pose_gives(
     log = make_log(Oracle.of(robot), [], [[]], 50, rng)
     log = replace(log, base_angular_velocity_base=spin * value(log.base_angular_velocity_base))
     read = with_imu(Oracle.of(robot), log, frame)
-    found, size = bind(read, robot, ()), np.abs(value(read.imu_specific_force)).max()
-    assert_same_motion(found, bind(log, robot, ()), 1e-15 * max(size, 100.0))
+    found, size = bind_log(read, robot, ()), np.abs(value(read.imu_specific_force)).max()
+    assert_same_motion(found, bind_log(log, robot, ()), 1e-15 * max(size, 100.0))
     assert found.base.quat_xyzw is None
     if frame == "hips" and spin == 40.0:
         assert size > 300.0, "most of what such an IMU reads is the lever's"
@@ -77,13 +77,13 @@ def test_an_imu_beyond_a_force_torque_sensor_is_still_on_the_base(tmp_path: Path
     oracle = Oracle.of(plain)
     log = make_log(oracle, [], [[]], 20, rng)
     assert split.links["hips"][0] != 0
-    assert_same_motion(bind(with_imu(oracle, log, "hips"), split, ()), bind(log, plain, ()))
+    assert_same_motion(bind_log(with_imu(oracle, log, "hips"), split, ()), bind_log(log, plain, ()))
 
 
 @pytest.mark.parametrize("sensors", ["full", "joints", "contacts"])
 def test_parameters_are_those_found_with_the_pose(sensors: str) -> None:
     robot, oracle, log = recorded()
-    with_pose, without = (bind(x, robot, CONTACTS) for x in (log, with_imu(oracle, log, IMU)))
+    with_pose, without = (bind_log(x, robot, CONTACTS) for x in (log, with_imu(oracle, log, IMU)))
     state = states_of(log)
     expected = predicted(robot, fitted(with_pose, robot, sensors), *state)
     found = predicted(robot, fitted(without, robot, sensors), *state)
@@ -94,7 +94,7 @@ def test_parameters_are_those_found_with_the_pose(sensors: str) -> None:
 
 def test_neither_heading_nor_place_nor_velocity_is_asked_for() -> None:
     robot, oracle, log = recorded()
-    samples = bind(with_imu(oracle, log, IMU), robot, CONTACTS)
+    samples = bind_log(with_imu(oracle, log, IMU), robot, CONTACTS)
     assert samples.rotation_world_base is None
     K = Regressor(robot)(*samples.coordinates())
     expected = Regressor(robot)(*map(torch.from_numpy, states_of(log)))
@@ -105,15 +105,15 @@ def test_gravity_comes_from_the_imu_even_where_the_recorded_orientation_is_off()
     """The orientation turns world wrenches and nothing else."""
     robot, oracle, log = recorded()
     off = np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1))
-    samples = bind(replace(with_imu(oracle, log, IMU), base_quat_xyzw=off), robot, CONTACTS)
-    assert_same_motion(samples, bind(log, robot, CONTACTS))
+    samples = bind_log(replace(with_imu(oracle, log, IMU), base_quat_xyzw=off), robot, CONTACTS)
+    assert_same_motion(samples, bind_log(log, robot, CONTACTS))
 
 
 def test_wrenches_along_world_axes_with_an_imu_and_an_orientation_are_turned_into_the_frames() -> None:
     robot, oracle, log = recorded()
     both = with_imu(oracle, in_world(oracle, log), IMU, keep=["base_quat_xyzw"])
     true = oracle.forces(*states_of(log))
-    found = predicted(robot, fitted(bind(both, robot, CONTACTS), robot, "full"), *states_of(log))
+    found = predicted(robot, fitted(bind_log(both, robot, CONTACTS), robot, "full"), *states_of(log))
     assert worst(found, true) < 1e-11
 
 
@@ -122,7 +122,7 @@ def test_a_bolted_robot_needs_neither_imu_nor_pose_and_takes_no_notice_of_them(t
     log = make_log(Oracle.of(robot), [], [[]], 10, rng)
     still = np.zeros((10, 3))
     read = replace(log, imu_frame="hand", imu_specific_force=still, imu_angular_velocity=still)
-    plain, with_readings = bind(log, robot, ()), bind(read, robot, ())
+    plain, with_readings = bind_log(log, robot, ()), bind_log(read, robot, ())
     for x, y in zip(plain.coordinates(), with_readings.coordinates(), strict=True):
         torch.testing.assert_close(x, y, rtol=0.0, atol=0.0)
 
@@ -158,7 +158,7 @@ def test_raw_readings_differentiated_by_preprocessing_follow_the_analytic_motion
 
 def refusal(log: Log, robot: Robot, kind: type[InputError] = LogError) -> str:
     with pytest.raises(kind) as caught:
-        bind(log, robot, CONTACTS)
+        bind_log(log, robot, CONTACTS)
     message = str(caught.value)
     assert "\n" not in message
     assert message.startswith("synthetic.npz: ")

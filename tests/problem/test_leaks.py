@@ -14,7 +14,7 @@ from synthetic import Array, load
 from torchid.estimators import Estimate, LeastSquares
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
-from torchid.problem import RowBuilder, bind, compress, linear_problem
+from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors
 
 CONTACTS = [Contact(frame, "flat") for frame in SOLES]
@@ -30,7 +30,7 @@ def log(biped_folder: Path) -> Log:
 
 
 def estimate(log: Log, sensors: SensorSet) -> Estimate:
-    samples = bind(preprocess(log, 10.0, 200.0), ROBOT, CONTACTS, required=sensors)
+    samples = bind_log(preprocess(log, 10.0, 200.0), ROBOT, CONTACTS, required=sensors)
     builder = RowBuilder(ROBOT, CONTACTS, sensors)
     return LeastSquares(1e-4).solve(linear_problem(compress([samples], builder), builder, ROBOT))
 

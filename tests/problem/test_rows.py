@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, DRONE, G1, PANDA, ROBOTS, SOLO12, Array, load, random_states
 
 from torchid.logs import Log
-from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
+from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.predict import force_series
 from torchid.regressor import FrameJacobian, Regressor
@@ -89,7 +89,7 @@ def recorded(
         **{"contact_wrench_world" if world else "contact_wrench_local": wrench},
         **base,
     )
-    return bind(log, robot, contacts), (q, v, a)
+    return bind_log(log, robot, contacts), (q, v, a)
 
 
 def local_wrenches(robot: Robot, contacts: Sequence[Contact], samples: Samples) -> torch.Tensor:
@@ -118,8 +118,8 @@ def reference(
         sensors.wrench[places, components],
         robot.base_rows,
         noise.joint_torque,
-        torch.from_numpy(noise.wrench[components]),
-        torch.from_numpy(noise.base[: robot.base_rows]),
+        torch.from_numpy(noise.wrench_std[components]),
+        torch.from_numpy(noise.base_std[: robot.base_rows]),
     )
     K = Regressor(robot)(*tensors).contiguous()
     torque = torch.where(torch.from_numpy(sensors.torque), samples.torque, torch.nan)
@@ -127,7 +127,7 @@ def reference(
     groups = project(J[:, places, components], samples.active[:, places], K, torque, wrench)
     assert sum(len(group.index) for group in groups) == len(samples)
     X = torch.cat([torch.cat([group.K, group.f[..., None]], dim=2).flatten(0, 1) for group in groups]).numpy()
-    least = min(noise.joint_torque, *noise.wrench, *noise.base)
+    least = min(noise.joint_torque, *noise.wrench_std, *noise.base_std)
     force = np.hypot(np.linalg.norm(samples.torque), np.linalg.norm(samples.wrench))
     size = np.append(np.linalg.norm(K.flatten(0, 1).numpy(), axis=0), force) / least
     return X.T @ X, np.maximum(size, 1e-3 * size.max()), len(X)

@@ -9,9 +9,9 @@ import pytest
 from synthetic import ANYMAL, Oracle, load, make_log
 
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError
-from torchid.identifiability.rank import StateReport, check_base, state_reports
-from torchid.problem import RowBuilder, bind
-from torchid.sensing import Contact, SensorNoise, SensorSet, check_contacts, chosen_sensors, named_sensors
+from torchid.identifiability.base_rank import StateReport, require_base, state_reports
+from torchid.problem import RowBuilder, bind_log
+from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, validate_contacts
 
 FEET = [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]
 JOINTS = ("hip", "knee", "ankle")
@@ -28,7 +28,7 @@ def test_a_contact_pushes_only_as_its_kind_can() -> None:
 
 
 def test_contacts_of_the_robot_pass_unchanged() -> None:
-    assert check_contacts(load(ANYMAL), FEET) == tuple(FEET)
+    assert validate_contacts(load(ANYMAL), FEET) == tuple(FEET)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_a_contact_that_cannot_be_is_refused_by_its_place(
     contacts: list[Contact], error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message) as raised:
-        check_contacts(load(ANYMAL), contacts, "experiment.yaml")
+        validate_contacts(load(ANYMAL), contacts, "experiment.yaml")
     assert "experiment.yaml" in str(raised.value)
 
 
@@ -98,10 +98,10 @@ def test_a_sensor_that_does_not_exist_is_refused_by_the_nearest_names(
 
 def test_base_rows_are_trusted_to_one_contact_sensors_noise_unless_told() -> None:
     noise = SensorNoise(contact_force=3.0, contact_moment=0.4)
-    np.testing.assert_array_equal(noise.wrench, [3.0, 3.0, 3.0, 0.4, 0.4, 0.4])
-    np.testing.assert_array_equal(noise.base, noise.wrench)
+    np.testing.assert_array_equal(noise.wrench_std, [3.0, 3.0, 3.0, 0.4, 0.4, 0.4])
+    np.testing.assert_array_equal(noise.base_std, noise.wrench_std)
     told = SensorNoise(contact_force=3.0, base_force=7.0, base_moment=0.6)
-    np.testing.assert_array_equal(told.base, [7.0, 7.0, 7.0, 0.6, 0.6, 0.6])
+    np.testing.assert_array_equal(told.base_std, [7.0, 7.0, 7.0, 0.6, 0.6, 0.6])
 
 
 # --------------------------------------------------------------------------------------------------------- the base
@@ -117,7 +117,7 @@ def reports(torques: bool, first_foot: bool) -> list[StateReport]:
     wrench = np.zeros((4, 6), dtype=bool)
     wrench[0, :3] = first_foot
     sensors = SensorSet(np.full(robot.n, torques), wrench)
-    return state_reports([bind(log, robot, FEET)], RowBuilder(robot, FEET, sensors))
+    return state_reports([bind_log(log, robot, FEET)], RowBuilder(robot, FEET, sensors))
 
 
 def test_torque_sensors_see_the_base_in_every_contact_state() -> None:
@@ -129,7 +129,7 @@ def test_torque_sensors_see_the_base_in_every_contact_state() -> None:
     assert flight.base_singular_value == pytest.approx(1.0, abs=1e-14)
     assert four.base_singular_value is not None
     assert 1e-6 < four.base_singular_value < 1.0
-    check_base([three, four, flight])
+    require_base([three, four, flight])
 
 
 def test_one_measured_foot_among_four_sees_nothing_of_the_base_but_in_flight() -> None:
@@ -140,7 +140,7 @@ def test_one_measured_foot_among_four_sees_nothing_of_the_base_but_in_flight() -
     with pytest.raises(
         BaseLostError, match="RF_FOOT \\+ LH_FOOT \\+ RH_FOOT \\(30 samples\\): rank 0 of 6; "
     ) as raised:
-        check_base([three, four, flight])
+        require_base([three, four, flight])
     assert "LF_FOOT + RF_FOOT + LH_FOOT + RH_FOOT (20 samples): rank 0 of 6" in str(raised.value)
     assert "none" not in str(raised.value)
     assert "accepted:" in str(raised.value)
@@ -149,16 +149,16 @@ def test_one_measured_foot_among_four_sees_nothing_of_the_base_but_in_flight() -
 def test_who_asks_to_go_on_is_warned() -> None:
     lost = reports(torques=False, first_foot=True)
     with pytest.warns(BaseLostWarning, match="30 samples.*out of reach"):
-        check_base(lost, "warn")
+        require_base(lost, "warn")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_base([lost[2]], "warn")
+        require_base([lost[2]], "warn")
 
 
 def test_a_bolted_base_cannot_be_lost() -> None:
     robot = load(ANYMAL, fixed_base=True)
     log = make_log(Oracle.of(robot), [(foot.frame, 3) for foot in FEET], [[True] * 4], 5, np.random.default_rng(1))
-    (report,) = state_reports([bind(log, robot, FEET)], RowBuilder(robot, FEET, named_sensors("contacts", 12, 4)))
+    (report,) = state_reports([bind_log(log, robot, FEET)], RowBuilder(robot, FEET, named_sensors("contacts", 12, 4)))
     assert report.base_rank is None
     assert report.base_singular_value is None
-    check_base([report])
+    require_base([report])

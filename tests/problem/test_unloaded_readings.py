@@ -16,10 +16,10 @@ from unknowns import fit
 
 from torchid.identifiability.confounding import disagreements
 from torchid.logs import Log
-from torchid.logs.preprocess import UNLOADED_MARGIN_S, preprocess, unloaded
-from torchid.parameters import COMPONENTS
-from torchid.problem import ExtraTerms, RowBuilder, Samples, bind, compress_parts
-from torchid.problem.compression import Part, unloaded_channels
+from torchid.logs.preprocess import UNLOADED_MARGIN_S, find_unloaded, preprocess
+from torchid.parameters import WRENCH_COMPONENTS
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
+from torchid.problem.compression import Part, unloaded_offset_equations
 from torchid.sensing import SensorNoise, named_sensors
 
 EVERY = {"contact_force": "log", "contact_moment": "log"}
@@ -45,7 +45,7 @@ def swinging() -> tuple[Log, Miscalibration]:
 
 
 def bound(log: Log) -> Samples:
-    return bind(log, world().robot, CONTACTS)
+    return bind_log(log, world().robot, CONTACTS)
 
 
 def builder_of(terms: ExtraTerms = OFFSETS, name: str = "full") -> RowBuilder:
@@ -80,7 +80,7 @@ def test_a_reading_counts_from_the_margin_away_from_the_last_contact_to_the_marg
     time = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.02, 800))
     active = np.stack([np.sin(3.0 * time) > 0.0, time < 0.0, time > 0.0], axis=1)
     far = np.abs(time[:, None] - time[active[:, 0]]).min(axis=1) > UNLOADED_MARGIN_S
-    found = unloaded(time, active)
+    found = find_unloaded(time, active)
     np.testing.assert_array_equal(found[:, 0], far)
     assert 0.2 < far.mean() < 0.45
     assert found[:, 1].all()
@@ -103,7 +103,7 @@ def test_a_filter_leaves_readings_in_the_air_as_they_were_recorded(settings: dic
     )  # fmt: skip
     found = value(bound(preprocess(log, **settings)).unloaded).numpy()
     assert set(np.unique(found[np.isfinite(found)])) == {60.0}
-    assert np.isfinite(found).mean() == pytest.approx(unloaded(time, active).mean(), abs=0.02)
+    assert np.isfinite(found).mean() == pytest.approx(find_unloaded(time, active).mean(), abs=0.02)
 
 
 def test_a_contact_whose_offset_is_not_asked_for_has_no_equation_in_the_air() -> None:
@@ -112,7 +112,7 @@ def test_a_contact_whose_offset_is_not_asked_for_has_no_equation_in_the_air() ->
         assert not of_air(log, terms)
     robot = world().robot
     joints = RowBuilder(robot, CONTACTS, named_sensors("joints", robot.n, 3, NOISE, len(robot.ft_names)), OFFSETS)
-    assert not list(unloaded_channels(joints, bound(log)))
+    assert not list(unloaded_offset_equations(joints, bound(log)))
 
 
 # ------------------------------------------------------------------------------------------------ what they say
@@ -129,14 +129,14 @@ def test_a_mean_counts_as_exactly_as_its_readings_are_many_and_outliers_do_not_m
         read[-20, 0] += spikes
         samples = bound(replace(log, contact_wrench_local=read))
         count = int(torch.isfinite(value(samples.unloaded)[:, 0, 0]).sum())
-        for channel in unloaded_channels(builder, samples):
+        for channel in unloaded_offset_equations(builder, samples):
             contact, axis = builder.extras[channel.offset].contact or (0, 0)
-            sigma = NOISE.wrench[axis] / np.sqrt(count)
+            sigma = NOISE.wrench_std[axis] / np.sqrt(count)
             assert abs(channel.mean - off[contact, axis]) < 4.0 * sigma
             assert 0.95 * sigma < channel.deviation < 2.5 * sigma
         slow = read + np.linspace(0.0, 40.0, len(read))[:, None, None]
-    drifting = [x.deviation for x in unloaded_channels(builder, bound(replace(log, contact_wrench_local=slow)))]
-    assert min(drifting) > 3.0 * NOISE.wrench[3] / np.sqrt(count), "a drift is no noise of single readings"
+    drifting = [x.deviation for x in unloaded_offset_equations(builder, bound(replace(log, contact_wrench_local=slow)))]
+    assert min(drifting) > 3.0 * NOISE.wrench_std[3] / np.sqrt(count), "a drift is no noise of single readings"
 
 
 def test_offsets_and_scales_are_exact_with_readings_in_the_air() -> None:
@@ -200,7 +200,10 @@ def test_a_clamp_at_0_is_recognized_and_a_coarse_sensor_about_0_is_not_taken_for
 def test_a_sensor_that_is_off_in_another_way_in_the_air_is_named_with_both_numbers() -> None:
     robot = world().robot
     sensors = named_sensors("full", robot.n, len(CONTACTS), NOISE, len(robot.ft_names))
-    for change, named in ((0.0, set()), (35.0, {f"offset of {CONTACTS[0].frame} {name}" for name in COMPONENTS})):
+    for change, named in (
+        (0.0, set()),
+        (35.0, {f"offset of {CONTACTS[0].frame} {name}" for name in WRENCH_COMPONENTS}),
+    ):
         samples = bound(in_the_air(change, only=(0,)))
         blind = fit(robot, CONTACTS, sensors, ALL, [replace(samples, unloaded=None)])
         parts = compress_parts([samples], blind.builder, threads=1)

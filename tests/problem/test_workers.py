@@ -9,7 +9,7 @@ import torch
 from synthetic import SOLO12, load
 
 from torchid.problem import RowBuilder
-from torchid.problem.chunks import share_out
+from torchid.problem.chunks import run_in_workers
 from torchid.sensing import Contact, named_sensors
 
 
@@ -24,7 +24,7 @@ def test_a_failure_of_one_worker_stops_the_others_at_their_next_task() -> None:
             done.append(task)
 
     with pytest.raises(RuntimeError, match="broken"):
-        share_out(range(200), run, 2)
+        run_in_workers(range(200), run, 2)
     assert len(done) < 20
 
 
@@ -35,7 +35,7 @@ def test_every_task_is_done_once_with_one_thread_each_and_without_gradients(work
     def run(tasks: object) -> list[tuple[int, int, bool]]:
         return [(task, torch.get_num_threads(), torch.is_grad_enabled()) for task in tasks]
 
-    found = sorted(x for part in share_out(range(7), run, workers) for x in part)
+    found = sorted(x for part in run_in_workers(range(7), run, workers) for x in part)
     assert found == [(task, 1, False) for task in range(7)]
     assert torch.get_num_threads() == before
 

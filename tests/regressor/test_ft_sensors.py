@@ -18,10 +18,10 @@ from welded import REAL, SENSORS, machine
 from torchid import parameters
 from torchid.errors import LogError, UnknownNameError
 from torchid.estimators import LeastSquares
-from torchid.identifiability.rank import state_reports
-from torchid.parameters import COMPONENTS
-from torchid.problem import RowBuilder, Samples, bind, compress, linear_problem
-from torchid.problem.chunks import by_state
+from torchid.identifiability.base_rank import state_reports
+from torchid.parameters import WRENCH_COMPONENTS
+from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import force_series
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
@@ -144,7 +144,7 @@ def recorded(robot: Robot, seed: int, samples: int = 200) -> tuple[Oracle, Sampl
     oracle, rng = Oracle.of(robot), np.random.default_rng(seed)
     oracle.perturb(rng, 0.2)
     contacts = [(contact.frame, len(contact.components)) for contact in CONTACTS]
-    return oracle, bind(make_log(oracle, contacts, STATES, samples, rng), robot, CONTACTS)
+    return oracle, bind_log(make_log(oracle, contacts, STATES, samples, rng), robot, CONTACTS)
 
 
 def jacobian(oracle: Oracle, samples: Samples, contact: Contact) -> Array:
@@ -161,11 +161,11 @@ def test_rows_are_whitened_combinations_of_k_that_no_unmeasured_force_enters(
     robot = load(urdf, None, fixed_base, SENSORS)
     oracle, samples = recorded(robot, 4, 40)
     rng = np.random.default_rng(seed)  # components of sensors in limbs, one by one
-    sensors = SensorSet(rng.random(robot.dofs) < 0.7, rng.random((3, 6)) < 0.5)
+    sensors = SensorSet(rng.random(robot.n_dofs) < 0.7, rng.random((3, 6)) < 0.5)
     builder = RowBuilder(robot, CONTACTS, sensors)
-    M, base, noise = builder.columns.from_parameters(), robot.base_rows, sensors.noise
-    std = np.append(noise.base[:base], noise.dofs(robot.n, robot.dofs))
-    for state, index in by_state(hide(samples, sensors)):
+    M, base, noise = builder.columns.parameter_map(), robot.base_rows, sensors.noise
+    std = np.append(noise.base_std[:base], noise.dof_std(robot.n, robot.n_dofs))
+    for state, index in chunks_by_state(hide(samples, sensors)):
         part = hide(samples, sensors)[index]
         rows, W = (x.numpy() for x in builder.rows_by_sample(part, state))
         K = dense(robot, *(x.numpy() for x in part.coordinates())).reshape(len(part), len(std), -1)
@@ -181,7 +181,7 @@ def test_rows_are_whitened_combinations_of_k_that_no_unmeasured_force_enters(
                 seen = sensors.wrench[c, list(contact.components)]
                 force = samples.wrench[index][:, c, list(contact.components)].numpy()
                 f += np.einsum("bki,bk->bi", J[:, seen], force[:, seen])
-                var = noise.wrench[list(contact.components)][seen] ** 2
+                var = noise.wrench_std[list(contact.components)][seen] ** 2
                 cov += np.einsum("bki,k,bkj->bij", J[:, seen], var, J[:, seen])
                 unmeasured.append(J[:, ~seen])
         A = np.concatenate(unmeasured, axis=1)
@@ -264,7 +264,7 @@ def test_a_sensor_that_was_not_recorded_is_refused_where_it_is_needed(urdf: Path
     log = make_log(Oracle.of(robot), [], [[]], 5, np.random.default_rng(8))
     sensors = with_ft_sensors(named_sensors("joints", robot.n, 0, ft=len(SENSORS)), robot, SENSORS)
     with pytest.raises(LogError) as caught:
-        bind(replace(log, **change), robot, (), sensors)
+        bind_log(replace(log, **change), robot, (), sensors)
     assert str(caught.value).startswith(f"synthetic.npz: {found}")
 
 
@@ -272,8 +272,8 @@ def test_one_reading_that_is_not_a_number_is_named_with_its_sensor_and_sample(ur
     robot = load(urdf, None, False, SENSORS)
     log = make_log(Oracle.of(robot), [], [[]], 5, np.random.default_rng(9))
     assert log.ft_wrench is not None
-    log.ft_wrench[3, log.ft_names.index("ankle_ft"), COMPONENTS.index("my")] = np.nan
+    log.ft_wrench[3, log.ft_names.index("ankle_ft"), WRENCH_COMPONENTS.index("my")] = np.nan
     sensors = with_ft_sensors(named_sensors("joints", robot.n, 0, ft=len(SENSORS)), robot, ["ankle_ft"])
     with pytest.raises(LogError, match=r"ft_wrench 'ankle_ft.my'.*sample 3 \(1 in all\)"):
-        bind(log, robot, (), sensors)
-    bind(log, robot, (), named_sensors("joints", robot.n, 0, ft=len(SENSORS)))
+        bind_log(log, robot, (), sensors)
+    bind_log(log, robot, (), named_sensors("joints", robot.n, 0, ft=len(SENSORS)))

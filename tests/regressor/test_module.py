@@ -30,7 +30,7 @@ from torchid.errors import UnknownNameError
 from torchid.regressor import FrameJacobian, Regressor, motion_from_state
 from torchid.regressor.columns import reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import body_states, joint_motion
-from torchid.regressor.regressor import all_wrench_columns, joint_directions, joint_row, joint_rows
+from torchid.regressor.regressor import all_wrench_columns, joint_row, joint_rows, joint_screw_axes
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
@@ -157,7 +157,7 @@ def reduced_regressor(robot: Robot, *state: Array) -> Array:
     joints = joint_motion(tree, motion := motion_from_state(*tensors(*state), robot.n, robot.fixed_base))
     states = body_states(tree, motion, joints)
     wrenches = all_wrench_columns(states, layout)
-    directions = joint_directions(tree, states)
+    directions = joint_screw_axes(tree, states)
     rows = [wrenches] if tree.base_rows else []
     for row in joint_rows(tree, layout):
         full = wrenches.new_zeros(1, layout.count, wrenches.shape[-1])

@@ -20,7 +20,7 @@ from synthetic import ANYMAL, G1, PANDA, ROBOTS, ROMEO, TALOS, Array, Oracle, lo
 from torchid import parameters
 from torchid.errors import TorchidWarning
 from torchid.estimators import Conditions, Consistent, violations
-from torchid.problem import RowBuilder, bind, compress, linear_problem
+from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.linear import parameter_scale
 from torchid.report import identified_urdf
 from torchid.robot import Robot
@@ -78,7 +78,7 @@ def robot_of(name: str, folder: Path, fixed_base: bool = False) -> Robot:
 def perturbed(robot: Robot, seed: int = 1) -> Array:
     """Other parameters, (L, 12), as possible as the URDF's, with friction at every joint."""
     rng = np.random.default_rng(seed)
-    phi = parameters.perturbed(robot.nominal, 0.2, rng)
+    phi = parameters.perturb_parameters(robot.nominal, 0.2, rng)
     phi[1:, parameters.FRICTION] = rng.uniform(0.1, 2.0, (len(phi) - 1, 2))
     return phi
 
@@ -287,7 +287,7 @@ def test_a_consistent_fit_of_poor_data_is_taken_by_every_reader(name: str, foot:
     log = make_log(Oracle.of(robot), [(foot, 3)], [[True], [False]], 60, rng)
     assert log.joint_torque is not None
     log = replace(log, joint_torque=log.joint_torque + 10.0 * rng.normal(size=log.joint_torque.shape))
-    problem = linear_problem(compress([bind(log, robot, contacts)], builder), builder, robot)
+    problem = linear_problem(compress([bind_log(log, robot, contacts)], builder), builder, robot)
     conditions = Conditions(1e-3)
     phi = Consistent(1e-4, conditions=conditions).solve(problem).phi.reshape(-1, parameters.PER_BODY)
     scale = parameter_scale(robot.nominal)

@@ -114,7 +114,7 @@ def many(count: int = 400) -> Array:
 def test_a_perturbed_body_differs_by_factors_within_the_bounds(error: float) -> None:
     true = many()
     factors = []
-    for phi, other in zip(true, parameters.perturbed(true, error, np.random.default_rng(0)), strict=True):
+    for phi, other in zip(true, parameters.perturb_parameters(true, error, np.random.default_rng(0)), strict=True):
         (mass, com, inertia), (m, c, I) = (parameters.mass_com_inertia(x) for x in (phi, other))  # noqa: E741
         scale = np.trace(I) / np.trace(inertia)
         np.testing.assert_allclose(I, scale * inertia, rtol=0.0, atol=1e-9 * np.trace(inertia))
@@ -130,13 +130,13 @@ def test_a_perturbed_body_differs_by_factors_within_the_bounds(error: float) -> 
 @pytest.mark.parametrize("error", [0.2, 0.99])
 def test_a_perturbed_body_could_exist_as_well_as_the_true_one(error: float) -> None:
     for seed in range(5):
-        other = parameters.perturbed(many(), error, np.random.default_rng(seed))
+        other = parameters.perturb_parameters(many(), error, np.random.default_rng(seed))
         assert np.linalg.eigvalsh(parameters.pseudo_inertia(other)).min() > 0.0
 
 
 def test_a_plate_stays_a_plate_and_no_body_becomes_impossible() -> None:
     plate = np.pad(parameters.inertial_vector(2.0, np.zeros(3), np.diag([1.0, 2.0, 3.0])), (0, 2))[None]
-    other = parameters.perturbed(plate, 0.5, np.random.default_rng(0))
+    other = parameters.perturb_parameters(plate, 0.5, np.random.default_rng(0))
     assert abs(parameters.consistency_margin(other)[0]) < 1e-12
     assert (other[0, parameters.FIRST_MOMENT] == 0.0).all()
 
@@ -145,7 +145,7 @@ def test_massless_bodies_and_friction_are_not_perturbed() -> None:
     true = many(20)
     true[3:6, parameters.INERTIAL] = 0.0
     before = true.copy()
-    other = parameters.perturbed(true, 0.3, np.random.default_rng(0))
+    other = parameters.perturb_parameters(true, 0.3, np.random.default_rng(0))
     np.testing.assert_array_equal(other[3:6], true[3:6])
     np.testing.assert_array_equal(other[:, parameters.FRICTION], true[:, parameters.FRICTION])
     np.testing.assert_array_equal(true, before)
@@ -154,6 +154,6 @@ def test_massless_bodies_and_friction_are_not_perturbed() -> None:
 
 def test_the_same_draw_perturbs_alike_and_another_differently() -> None:
     true = many(5)
-    first, again, other = (parameters.perturbed(true, 0.2, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    first, again, other = (parameters.perturb_parameters(true, 0.2, np.random.default_rng(seed)) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert (first[:, 0] != other[:, 0]).all()

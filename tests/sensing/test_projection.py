@@ -87,7 +87,7 @@ def test_a_projection_projects_no_further() -> None:
 def test_the_metric_of_a_projection_matters() -> None:
     """A light body's parameters move least where its own pseudo-inertia measures them."""
     broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
-    measure = parameters.perturbed(GOOD, 0.3, np.random.default_rng(0))
+    measure = parameters.perturb_parameters(GOOD, 0.3, np.random.default_rng(0))
     near = {
         "euclidean": project(broken, SCALE, Conditions()),
         "pullback": project(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD),

@@ -11,19 +11,19 @@ from torchid.identifiability.structure import structural_problem, structural_sam
 from torchid.sensing import Contact, SensorNoise
 from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
 from torchid.sensor_planning.demands import demands
-from torchid.sensor_planning.ranking import SetRanking, best_first, exchanged
-from torchid.sensor_planning.search import Component, all_minimal_sets, components
+from torchid.sensor_planning.ranking import SetRanking, improve_by_exchange, rank_sets
+from torchid.sensor_planning.search import DemandGroup, all_minimal_sets, demand_groups
 
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
 STATES = ((True,) * 4,)
 
 
 @cache
-def leg() -> tuple[SetRanking, Component, list[tuple[float, tuple[Candidate, ...]]]]:
+def leg() -> tuple[SetRanking, DemandGroup, list[tuple[float, tuple[Candidate, ...]]]]:
     """Ranking, demands and all minimal sets, best first, of one leg of a quadruped whose other feet are measured."""
     robot = load(SOLO12)
     offered = candidates(robot, FEET, per="axis")
-    part = components(demands(robot, FEET, STATES, offered), offered)[0]
+    part = demand_groups(demands(robot, FEET, STATES, offered), offered)[0]
     others = [c for c in offered if c.contact is not None and c not in part.candidates]
     everything = structural_problem(robot, FEET, sensor_set(robot, FEET, offered), STATES)
     logs = structural_samples(robot, FEET, STATES, 40)
@@ -31,14 +31,14 @@ def leg() -> tuple[SetRanking, Component, list[tuple[float, tuple[Candidate, ...
     ranking = SetRanking(robot, FEET, logs, part.candidates, others, SensorNoise(), prior)
     sets = all_minimal_sets(part.demands, part.candidates)
     assert sets is not None
-    return ranking, part, best_first(ranking, sets)
+    return ranking, part, rank_sets(ranking, sets)
 
 
 def test_every_start_leads_to_the_best_of_all_minimal_sets() -> None:
     ranking, part, ranked = leg()
     assert ranked[0][0] > ranked[-1][0] + 1.0, "sets must differ for the test to mean anything"
     for _, start in ranked:
-        climbed = exchanged(ranking, part, start, frozenset(), frozenset())
+        climbed = improve_by_exchange(ranking, part, start, frozenset(), frozenset())
         assert [bits for bits, _ in climbed] == sorted((bits for bits, _ in climbed), reverse=True)
         assert {chosen for _, chosen in climbed} <= {chosen for _, chosen in ranked}
         assert climbed[0][0] == pytest.approx(ranked[0][0], rel=1e-9)
@@ -48,6 +48,6 @@ def test_what_is_kept_stays_and_what_is_excluded_is_not_taken() -> None:
     ranking, part, ranked = leg()
     worst, best = ranked[-1][1], ranked[0][1]
     kept = frozenset(c for c in worst if c not in best)
-    assert all(kept <= set(chosen) for _, chosen in exchanged(ranking, part, worst, kept, frozenset()))
+    assert all(kept <= set(chosen) for _, chosen in improve_by_exchange(ranking, part, worst, kept, frozenset()))
     barred = frozenset(c for c in best if c not in worst)
-    assert all(not barred & set(chosen) for _, chosen in exchanged(ranking, part, worst, frozenset(), barred))
+    assert all(not barred & set(chosen) for _, chosen in improve_by_exchange(ranking, part, worst, frozenset(), barred))

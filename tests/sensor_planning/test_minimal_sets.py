@@ -18,7 +18,7 @@ from torchid.errors import SensorError
 from torchid.sensing import Contact
 from torchid.sensor_planning.candidates import candidates
 from torchid.sensor_planning.demands import demands
-from torchid.sensor_planning.search import all_minimal_sets, cheapest_set, components, inequalities, least_cost
+from torchid.sensor_planning.search import all_minimal_sets, bound_cost, cheapest_set, demand_groups, inequalities
 
 machines = pytest.mark.parametrize("name", MACHINES)
 
@@ -28,7 +28,7 @@ def test_all_sets_without_a_sensor_to_spare_are_those_that_trying_every_set_find
     machine, (robot, choice, sufficient) = MACHINES[name], tried(name)
     assert len(choice) <= 12
     wanted = demands(robot, machine.contacts, machine.states, choice)
-    parts = [all_minimal_sets(part.demands, part.candidates) for part in components(wanted, choice)]
+    parts = [all_minimal_sets(part.demands, part.candidates) for part in demand_groups(wanted, choice)]
     assert all(sets is not None for sets in parts)
     found = [frozenset().union(*sets) for sets in product(*parts)]  # type: ignore[arg-type]
     assert len(set(found)) == len(found)
@@ -65,7 +65,7 @@ def test_rank_inequalities_prove_the_least_cost_where_one_demand_has_too_many_co
     wanted = demands(robot, machine.contacts, machine.states, choice)
     if combinations is None:
         monkeypatch.setattr("torchid.sensor_planning.search._DEVICES", -1)
-        assert {least_cost(demand, choice).bound for demand in wanted} == {0.0}
+        assert {bound_cost(demand, choice).bound for demand in wanted} == {0.0}
     else:
         monkeypatch.setattr("torchid.sensor_planning.search._COMBINATIONS", combinations)
     expected = (subsets(len(choice)) @ prices)[sufficient].min()
@@ -83,7 +83,7 @@ def test_kept_sensors_stay_excluded_ones_go_and_the_rest_is_the_cheapest_again(n
     for kept, gone in ((0, len(choice) - 1), (len(choice) - 1, 0), (1, 2)):
         allowed = sufficient & member[:, kept] & ~member[:, gone]
         if not allowed.any():
-            with pytest.raises(SensorError, match="unseen"):
+            with pytest.raises(SensorError, match="undetermined"):
                 cheapest_set(wanted, choice, keep=[choice[kept]], exclude=[choice[gone]])
             continue
         least = cheapest_set(wanted, choice, keep=[choice[kept]], exclude=[choice[gone]])
@@ -138,7 +138,7 @@ def test_the_bound_is_the_least_cost_on_any_small_tree(machine: Machine, seed: i
     assert (least.cost, least.proven) == (expected, True)
     assert least.lower_bound == pytest.approx(expected)
     for demand in wanted:
-        alone = least_cost(demand, choice)
+        alone = bound_cost(demand, choice)
         assert alone.bound == sum(c.cost for c in alone.chosen) == cheapest_set([demand], choice).cost
         assert alone.bound <= expected
     if len(wanted) == 1:
@@ -150,7 +150,7 @@ def test_too_many_candidates_to_enumerate_are_refused_and_too_little_time_leaves
     hands = [Contact("left_rubber_hand", "flat"), Contact("right_rubber_hand", "flat")]
     choice = candidates(robot, hands, per="axis", costs={"left_elbow_joint": 1.3, "joint_torque": 1.1})
     wanted = demands(robot, hands, states_of("11", "10"), choice)
-    (part,) = components(wanted, choice)
+    (part,) = demand_groups(wanted, choice)
     assert len(part.candidates) == 3 + 2 * 7 + 12
     assert all_minimal_sets(part.demands, part.candidates) is None
     hurried = cheapest_set(wanted, choice, seconds=0.0)

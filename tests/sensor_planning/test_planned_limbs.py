@@ -14,11 +14,11 @@ from torchid import parameters
 from torchid.errors import UnknownNameError
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors, with_ft_sensors
-from torchid.sensor_planning.candidates import candidates, chosen_from, sensor_set
-from torchid.sensor_planning.check import check_set
+from torchid.sensor_planning.candidates import candidates, contained_candidates, sensor_set
 from torchid.sensor_planning.demands import demands
-from torchid.sensor_planning.planner import Question, plan_sensors
-from torchid.sensor_planning.ranking import MotionStack, sparse_set
+from torchid.sensor_planning.observability import assess_sensors
+from torchid.sensor_planning.planner import PlanningProblem, plan_sensors
+from torchid.sensor_planning.ranking import MotionStack, irredundant_set
 
 LEG = Machine(
     {"leg": ("base", (RANDOM, RANDOM, RANDOM, "weld", RANDOM, RANDOM)), "arm": ("base", (RANDOM, "weld"))},
@@ -51,7 +51,7 @@ def test_sets_and_candidates_go_back_and_forth(leg: Robot) -> None:
     sensors = sensor_set(leg, LEG.contacts, chosen)
     assert sensors.torque.shape == (leg.n + 12,)
     assert [name for name, taken in zip(leg.dof_names, sensors.torque, strict=True) if taken] == ["j_leg2", "j_leg4.my"]
-    assert chosen_from(LEG.contacts, sensors, offered) == chosen
+    assert contained_candidates(LEG.contacts, sensors, offered) == chosen
 
 
 def test_a_sensor_counts_where_a_contact_lies_beyond_it_and_nowhere_else(leg: Robot) -> None:
@@ -64,26 +64,26 @@ def test_a_sensor_counts_where_a_contact_lies_beyond_it_and_nowhere_else(leg: Ro
     assert demand.missing(alone) == 0, "six readings in the leg make up for the foot's wrench"
     sensors = with_ft_sensors(named_sensors("joints", leg.n, 1, ft=2), leg, ["j_leg4"])
     sensors.torque[: leg.n] = False
-    (check,) = check_set(leg, LEG.contacts, LEG.states, sensors, offered)
+    (check,) = assess_sensors(leg, LEG.contacts, LEG.states, sensors, offered)
     assert (check.generic.rank, check.lost) == (6, None)
     sensors.torque[leg.dof_names.index("j_leg4.fx")] = False
-    (check,) = check_set(leg, LEG.contacts, LEG.states, sensors, offered)
+    (check,) = assess_sensors(leg, LEG.contacts, LEG.states, sensors, offered)
     assert check.generic.rank == 5
     assert check.lost is not None
-    assert {"j_leg1", "leg6", "j_leg4"} <= {c.name for c in check.lost.cures}
-    assert "j_arm2" not in {c.name for c in check.lost.cures}
+    assert {"j_leg1", "leg6", "j_leg4"} <= {c.name for c in check.lost.remedies}
+    assert "j_arm2" not in {c.name for c in check.lost.remedies}
 
 
 def test_the_planner_keeps_excludes_and_prices_them(leg: Robot) -> None:
     offered = candidates(leg, LEG.contacts, ft_sensors=leg.ft_names, costs={"contact": 2.0, "ft_sensor": 0.5})
     by_name = {c.name: c for c in offered}
     prior = np.ones(12 * len(leg.bodies))
-    found = plan_sensors(Question(leg, LEG.contacts, LEG.states, offered, prior))
+    found = plan_sensors(PlanningProblem(leg, LEG.contacts, LEG.states, offered, prior))
     assert (found.cost, found.proven, [c.name for c in found.chosen]) == (3.0, True, ["j_leg4"])
     assert found.removals[0].base_rank == 0
-    without = Question(leg, LEG.contacts, LEG.states, offered, prior, exclude=frozenset({by_name["j_leg4"]}))
+    without = PlanningProblem(leg, LEG.contacts, LEG.states, offered, prior, exclude=frozenset({by_name["j_leg4"]}))
     assert [c.name for c in plan_sensors(without).chosen] == ["leg6"]
-    kept = Question(leg, LEG.contacts, LEG.states, offered, prior, keep=frozenset({by_name["j_arm2"]}))
+    kept = PlanningProblem(leg, LEG.contacts, LEG.states, offered, prior, keep=frozenset({by_name["j_arm2"]}))
     assert plan_sensors(kept).cost == 6.0
 
 
@@ -105,7 +105,7 @@ def test_how_a_limb_is_split_at_a_weld_is_not_asked_of_the_stack(tmp_path: Path,
     assert stack.rank(c for c in offered if c.kind != "ft_sensor") == plain.full
     in_limbs = [c for c in offered if c.kind == "ft_sensor"]
     assert 0 < stack.rank(in_limbs) <= plain.full
-    chosen = sparse_set(stack)
+    chosen = irredundant_set(stack)
     assert stack.rank(chosen) == plain.full
     assert len(chosen) < len(offered)
 

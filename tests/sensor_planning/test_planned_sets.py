@@ -16,9 +16,9 @@ from torchid.identifiability.structure import standing_samples, standing_states,
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.regressor import FrameJacobian
 from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
-from torchid.sensor_planning.check import check_set
-from torchid.sensor_planning.planner import Question, SensorPlan, plan_sensors
-from torchid.sensor_planning.ranking import MotionStack, sparse_set
+from torchid.sensor_planning.observability import assess_sensors
+from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, plan_sensors
+from torchid.sensor_planning.ranking import MotionStack, irredundant_set
 
 EXACT = 1e-8
 PER_STATE = 250
@@ -38,7 +38,7 @@ def plan(name: str, per: str) -> SensorPlan:
         w.robot, w.kind.contacts, sensor_set(w.robot, w.kind.contacts, offered), steps(w.kind)
     )
     prior = everything.scale * everything.free
-    return plan_sensors(Question(w.robot, w.kind.contacts, steps(w.kind), offered, prior))
+    return plan_sensors(PlanningProblem(w.robot, w.kind.contacts, steps(w.kind), offered, prior))
 
 
 def sets(name: str, per: str) -> list[tuple[Candidate, ...]]:
@@ -143,13 +143,13 @@ def test_fewer_sensors_than_every_sample_needs_recover_unseen_motion_too(name: s
     w = world(name)
     offered = candidates(w.robot, w.kind.contacts, per="axis")
     stack = MotionStack(w.robot, w.kind.contacts, steps(w.kind), offered)
-    chosen = sparse_set(stack)
+    chosen = irredundant_set(stack)
     assert len(chosen) <= 4
     assert stack.rank(chosen) == stack.full == 10 + 7 * w.robot.n
     for spared in chosen:
         assert stack.rank([c for c in chosen if c is not spared]) < stack.full
     sensors = sensor_set(w.robot, w.kind.contacts, chosen)
-    checks = check_set(w.robot, w.kind.contacts, steps(w.kind)[:1], sensors, offered, samples=8)
+    checks = assess_sensors(w.robot, w.kind.contacts, steps(w.kind)[:1], sensors, offered, samples=8)
     assert checks[0].generic.rank < 6
     phi = fit(w, sensors, stepping_logs(name)).phi
     assert error(w, phi) < EXACT

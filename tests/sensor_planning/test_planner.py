@@ -20,11 +20,17 @@ from torchid.problem.contact_state import State
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors
 from torchid.sensing.projection import null_space
-from torchid.sensor_planning.candidates import Candidate, candidates, chosen_from, sensor_set
-from torchid.sensor_planning.check import LostBase, base_values, check_set, simplest_basis, wrench_words
+from torchid.sensor_planning.candidates import Candidate, candidates, contained_candidates, sensor_set
 from torchid.sensor_planning.demands import demands
-from torchid.sensor_planning.planner import branches, needs
-from torchid.sensor_planning.search import all_minimal_sets, cheapest_set, components, least_cost
+from torchid.sensor_planning.observability import (
+    LostBase,
+    assess_sensors,
+    base_values,
+    describe_wrench,
+    simple_wrench_basis,
+)
+from torchid.sensor_planning.planner import branches, contact_requirements
+from torchid.sensor_planning.search import all_minimal_sets, bound_cost, cheapest_set, demand_groups
 
 SOLES = (Contact("left_ankle_roll_link", "flat"), Contact("right_ankle_roll_link", "flat"))
 HAND = Contact("left_rubber_hand", "point")
@@ -52,7 +58,7 @@ def test_a_standing_humanoid_needs_six_readings_per_leg_and_none_in_arms_or_wais
     wanted = demands(g1(), SOLES, STANDING, choice)
     least = cheapest_set(wanted, choice)
     assert (least.cost, least.lower_bound, least.proven) == (12.0, 12.0, True)
-    parts = components(wanted, choice)
+    parts = demand_groups(wanted, choice)
     assert [len(part.candidates) for part in parts] == [12, 12]
     for part, side in zip(parts, ("left_", "right_"), strict=True):
         assert all(c.name.startswith(side) and "shoulder" not in c.name for c in part.candidates)
@@ -61,7 +67,7 @@ def test_a_standing_humanoid_needs_six_readings_per_leg_and_none_in_arms_or_wais
 
 def test_a_foots_force_torque_sensor_may_be_traded_for_the_six_torques_of_its_leg_and_for_nothing_else() -> None:
     choice = candidates(g1(), SOLES)
-    for part in components(demands(g1(), SOLES, STANDING, choice), choice):
+    for part in demand_groups(demands(g1(), SOLES, STANDING, choice), choice):
         device, torques = sorted(all_minimal_sets(part.demands, part.candidates) or (), key=len)
         assert [c.kind for c in device] == ["contact"]
         assert [c.kind for c in torques] == ["joint_torque"] * 6
@@ -75,8 +81,10 @@ def test_a_quadruped_on_point_feet_needs_three_readings_per_leg_whatever_its_gai
     choice = candidates(robot, contacts)
     least = cheapest_set(demands(robot, contacts, gait, choice), choice)
     assert (least.cost, least.lower_bound, least.proven) == (12.0, 12.0, True)
-    found = needs(robot, contacts, gait)
-    assert [(need.needed, need.proven, need.contacts) for need in found] == [(3, True, (foot,)) for foot in feet]
+    found = contact_requirements(robot, contacts, gait)
+    assert [(need.fewest_readings, need.proven, need.contacts) for need in found] == [
+        (3, True, (foot,)) for foot in feet
+    ]
     assert all(len(need.joints) == 3 and len(need.branches) == 1 for need in found)
 
 
@@ -101,7 +109,7 @@ def test_two_hands_on_a_rail_share_the_waist_and_need_less_by_axes_than_by_torqu
         wanted = demands(g1(), hands, STANDING, choice)
         assert [demand.contacts for demand in wanted] == [(0, 1)]
         least = cheapest_set(wanted, choice)
-        assert (least.proven, least_cost(wanted[0], choice).bound) == (True, least.cost)
+        assert (least.proven, bound_cost(wanted[0], choice).bound) == (True, least.cost)
         assert sees_the_base(g1(), hands, STANDING, [sensor_set(g1(), hands, least.chosen)]).all()
         costs[per] = least.cost
     # Three waist torques answer for the base's rotation; for its translation, three forces at each hand. No three
@@ -113,7 +121,7 @@ def test_six_torques_of_a_planar_leg_do_not_replace_a_foots_force_torque_sensor(
     robot, _, _ = tried("a planar leg")
     contacts = MACHINES["a planar leg"].contacts
     torques = [c for c in candidates(robot, contacts) if c.kind == "joint_torque"]
-    with pytest.raises(SensorError, match=r"3 of 6 dimensions of leg6 unseen; accepted: ") as refused:
+    with pytest.raises(SensorError, match=r"3 of 6 dimensions of leg6 undetermined; accepted: ") as refused:
         cheapest_set(demands(robot, contacts, states_of("1"), torques), torques)
     assert "\n" not in str(refused.value)
 
@@ -136,7 +144,7 @@ def test_a_bolted_base_demands_nothing() -> None:
     wanted = demands(robot, contacts, states_of("1"), choice)
     assert wanted == []
     assert cheapest_set(wanted, choice).chosen == ()
-    assert check_set(robot, contacts, states_of("1"), sensor_set(robot, contacts, ()), choice) == []
+    assert assess_sensors(robot, contacts, states_of("1"), sensor_set(robot, contacts, ()), choice) == []
 
 
 # --------------------------------------------------------------------------------------- limbs, candidates, prices
@@ -180,9 +188,9 @@ def test_candidates_are_named_priced_and_turned_into_masks_and_back() -> None:
         "left_rubber_hand.fx", "left_rubber_hand.fy", "left_rubber_hand.fz",
     ]  # fmt: skip
     for chosen in (device[1:3], device[:1], ()):
-        assert chosen_from(contacts, sensor_set(robot, contacts, chosen), device) == chosen
-    assert chosen_from(contacts, sensor_set(robot, contacts, axis[1:3]), device) == ()
-    assert chosen_from(contacts, named_sensors("contacts", robot.n, 2), device) == device[2:]
+        assert contained_candidates(contacts, sensor_set(robot, contacts, chosen), device) == chosen
+    assert contained_candidates(contacts, sensor_set(robot, contacts, axis[1:3]), device) == ()
+    assert contained_candidates(contacts, named_sensors("contacts", robot.n, 2), device) == device[2:]
 
 
 def test_what_cannot_be_a_candidate_or_a_price_is_refused_in_one_line() -> None:
@@ -220,24 +228,24 @@ def test_without_any_sensor_of_a_minimal_set_the_base_is_lost_as_told_and_each_c
     contacts, states = (*SOLES, HAND), states_of("110", "011")
     choice = candidates(g1(), contacts)
     chosen = cheapest_set(demands(g1(), contacts, states, choice), choice).chosen
-    complete = check_set(g1(), contacts, states, sensor_set(g1(), contacts, chosen), choice)
+    complete = assess_sensors(g1(), contacts, states, sensor_set(g1(), contacts, chosen), choice)
     assert [(check.generic.rank, check.lost) for check in complete] == [(6, None), (6, None)]
     for removed in chosen[1::2]:
         left = tuple(c for c in chosen if c != removed)
         sensors = sensor_set(g1(), contacts, left)
-        checks = check_set(g1(), contacts, states, sensors, choice, samples=16)
+        checks = assess_sensors(g1(), contacts, states, sensors, choice, samples=16)
         lost = [(check.state, check.lost) for check in checks if check.lost is not None]
         assert lost
         for state, what in lost:
             assert isinstance(what, LostBase)
             kept = bases(g1(), contacts, state, sensors, what.posture)
             size = what.directions.shape[1]
-            assert size == len(what.words) == 6 - np.linalg.matrix_rank(kept, tol=1e-6) > 0
+            assert size == len(what.descriptions) == 6 - np.linalg.matrix_rank(kept, tol=1e-6) > 0
             np.testing.assert_allclose(what.directions.T @ what.directions, np.eye(size), atol=1e-12)
             np.testing.assert_allclose(what.directions.T @ kept, 0.0, atol=1e-9)
-            assert sum(dimensions for _, dimensions in what.culprits) == 1
-            assert removed in what.cures
-            for cure in (removed, what.cures[0], what.cures[-1]):
+            assert sum(dimensions for _, dimensions in what.unmet_groups) == 1
+            assert removed in what.remedies
+            for cure in (removed, what.remedies[0], what.remedies[-1]):
                 cured = sensor_set(g1(), contacts, (*left, cure))
                 assert sees_the_base(g1(), contacts, (state,), [cured]).all(), cure.name
 
@@ -247,12 +255,16 @@ def test_a_planar_leg_loses_what_moves_out_of_its_plane() -> None:
     contacts = MACHINES["a planar leg"].contacts
     choice = candidates(robot, contacts, per="axis")
     torques = [c for c in choice if c.kind == "joint_torque"]
-    (check,) = check_set(robot, contacts, states_of("1"), sensor_set(robot, contacts, torques), choice)
-    assert (check.generic.rank, check.coincident) == (3, ())
+    (check,) = assess_sensors(robot, contacts, states_of("1"), sensor_set(robot, contacts, torques), choice)
+    assert (check.generic.rank, check.dependent) == (3, ())
     assert check.lost is not None
-    assert sorted(check.lost.words) == ["force along (0, 1, 0)", "moment about (0, 0, 1)", "moment about (1, 0, 0)"]
-    assert check.lost.culprits == ((("leg6",), 3),)
-    assert names(check.lost.cures) == ["leg6.fy", "leg6.mx", "leg6.mz"]
+    assert sorted(check.lost.descriptions) == [
+        "force along (0, 1, 0)",
+        "moment about (0, 0, 1)",
+        "moment about (1, 0, 0)",
+    ]
+    assert check.lost.unmet_groups == ((("leg6",), 3),)
+    assert names(check.lost.remedies) == ["leg6.fy", "leg6.mx", "leg6.mz"]
 
 
 def test_straight_legs_make_three_pitch_torques_act_alike() -> None:
@@ -261,18 +273,18 @@ def test_straight_legs_make_three_pitch_torques_act_alike() -> None:
     bent = random_postures(g1(), 50, np.random.default_rng(5))
     recorded = {STANDING[0]: np.vstack([bent, np.zeros((1, g1().n))])}
     sensors = sensor_set(g1(), SOLES, torques)
-    (check,) = check_set(g1(), SOLES, STANDING, sensors, choice, postures=recorded)
+    (check,) = assess_sensors(g1(), SOLES, STANDING, sensors, choice, postures=recorded)
     assert (check.generic.rank, check.lost) == (6, None)
     assert check.zero.rank < 6
-    assert check.coincident == tuple(
+    assert check.dependent == tuple(
         tuple(f"{side}_{joint}_joint" for joint in ("hip_pitch", "knee", "ankle_pitch")) for side in ("left", "right")
     )
     assert check.recorded is not None
     assert check.recorded.least == pytest.approx(check.zero.least)
     values = base_values(RowBuilder(g1(), SOLES, sensors), STANDING[0], bent)[:, -1].numpy()
     assert check.recorded.median == pytest.approx(np.median([*values, check.zero.least]), rel=1e-9)
-    (measured,) = check_set(g1(), SOLES, STANDING, named_sensors("contacts", g1().n, 2), choice)
-    assert (measured.zero.rank, measured.coincident) == (6, ())
+    (measured,) = assess_sensors(g1(), SOLES, STANDING, named_sensors("contacts", g1().n, 2), choice)
+    assert (measured.zero.rank, measured.dependent) == (6, ())
 
 
 def test_the_numbers_of_a_check_do_not_depend_on_the_size_of_its_chunks() -> None:
@@ -287,7 +299,7 @@ def test_the_numbers_of_a_check_do_not_depend_on_the_size_of_its_chunks() -> Non
 def test_flight_sees_the_whole_base_without_a_sensor(tmp_path: Path) -> None:
     machine = Machine({"leg": ("base", ("x", "z"))}, (Contact("leg2", "point"),), states_of("0"))
     robot = machine.robot(tmp_path)
-    (check,) = check_set(robot, machine.contacts, machine.states, sensor_set(robot, machine.contacts, ()), ())
+    (check,) = assess_sensors(robot, machine.contacts, machine.states, sensor_set(robot, machine.contacts, ()), ())
     assert (check.name, check.generic.rank, check.zero.rank, check.generic.least) == ("none", 6, 6, pytest.approx(1.0))
 
 
@@ -302,12 +314,12 @@ def test_flight_sees_the_whole_base_without_a_sensor(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrench_is_put_in_words(wrench: tuple[float, ...], text: str) -> None:
-    assert wrench_words(np.array(wrench, dtype=float)) == text
+    assert describe_wrench(np.array(wrench, dtype=float)) == text
 
 
 @pytest.mark.parametrize("kept", [(0, 4), (2, 3, 5), (0, 1, 2, 3, 4, 5)])
 def test_lost_axes_are_found_again_in_a_rotated_basis(kept: tuple[int, ...]) -> None:
     axes = np.eye(6)[:, kept]
     turned = axes @ np.linalg.qr(np.random.default_rng(1).normal(size=(len(kept), len(kept))))[0]
-    found = np.array(simplest_basis(turned))
+    found = np.array(simple_wrench_basis(turned))
     np.testing.assert_allclose(found[np.lexsort(found.T)], axes.T[np.lexsort(axes)], atol=1e-12)

@@ -13,7 +13,7 @@ from torchid.problem.chunks import one_thread
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise
 from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
-from torchid.sensor_planning.ranking import SetRanking, best_first
+from torchid.sensor_planning.ranking import SetRanking, rank_sets
 
 NOISE = SensorNoise(joint_torque=0.7, contact_force=3.0, contact_moment=0.4, base_force=5.0, base_moment=1.0)
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
@@ -50,7 +50,7 @@ def test_the_most_informative_set_comes_first_and_every_step_is_told() -> None:
     sets = [offered[:3], offered, offered[:7]]
     steps: list[int] = []
     ranking = SetRanking(robot, FEET, logs, offered, (), NOISE, prior)
-    ranked = best_first(ranking, sets, lambda: steps.append(1))
+    ranked = rank_sets(ranking, sets, lambda: steps.append(1))
     assert [chosen for _, chosen in ranked] == [offered, offered[:7], offered[:3]]
     assert ranked[0][0] > ranked[1][0] > ranked[2][0] > 0.0
     assert len(steps) == len(sets)

@@ -57,7 +57,7 @@ def test_stability_json_has_the_documented_fields_of_every_motion_in_the_files_o
 def test_the_nominal_robot_is_the_true_one_with_other_inertias_and_could_exist(biped_folder: Path) -> None:
     true, nominal = load(BIPED), load(biped_folder / "nominal.urdf")
     assert nominal.joint_names == true.joint_names
-    expected = parameters.perturbed(true.nominal, 0.2, np.random.default_rng(0))
+    expected = parameters.perturb_parameters(true.nominal, 0.2, np.random.default_rng(0))
     np.testing.assert_allclose(nominal.nominal, expected, rtol=1e-9, atol=1e-12)
     ratio = nominal.nominal[:, 0] / true.nominal[:, 0]
     assert np.abs(ratio - 1.0).max() < 0.2

@@ -136,9 +136,9 @@ def test_squats_move_the_pelvis_about_as_far_as_the_centre_of_mass_is_told_to(
 def test_a_bound_that_is_broken_is_named_with_its_motion(
     found: dict[str, Any], bounds: dict[str, float], message: str
 ) -> None:
-    STOOD.check(BoundsConfig(), "m", "file.yaml")
+    STOOD.require_within(BoundsConfig(), "m", "file.yaml")
     with pytest.raises(InputError, match=f"file.yaml: motions.m: {message}"):
-        dataclasses.replace(STOOD, **found).check(BoundsConfig(**bounds), "m", "file.yaml")
+        dataclasses.replace(STOOD, **found).require_within(BoundsConfig(**bounds), "m", "file.yaml")
 
 
 # -------------------------------------------------------------------------------------------------------- other robots

@@ -19,9 +19,9 @@ from torchid.config import AnalyzeConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, SensorError, UnknownNameError, during
 from torchid.fitting.experiment import Scene, set_up_scene, with_noise
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import by_state
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import free_parameters
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
@@ -29,18 +29,18 @@ from torchid.problem.linear import parameter_scale
 from torchid.report.analysis import (
     SetAccuracy,
     accuracy_figure,
-    base_document,
-    base_text,
-    checks_document,
-    plan_document,
+    base_parameters_document,
+    base_parameters_text,
+    observability_document,
+    sensor_plan_document,
 )
 from torchid.report.figures import save_figure
 from torchid.report.tables import progress_bars
 from torchid.report.tree_figure import tree_figure
 from torchid.sensing import Contact, SensorSet
 from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
-from torchid.sensor_planning.check import StateCheck
-from torchid.sensor_planning.planner import Question, SensorPlan, check, plan_sensors
+from torchid.sensor_planning.observability import BaseObservability
+from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, assess_set, plan_sensors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,7 +57,7 @@ class ScenarioAnalysis:
     name: str
     states: tuple[State, ...]
     plan: SensorPlan
-    proposed: tuple[StateCheck, ...] | None
+    proposed: tuple[BaseObservability, ...] | None
     base: BaseParameters
 
 
@@ -174,7 +174,7 @@ def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[State, 
     if wanted is None:
         recorded: Counter[State] = Counter()
         for samples in train:
-            for state, index in by_state(samples):
+            for state, index in chunks_by_state(samples):
                 recorded[state] += len(samples[index])
         most_first = tuple(state for state, _ in recorded.most_common())
         return {"logs": most_first} if recorded else {"all_contacts": ((True,) * len(frames),)}
@@ -195,7 +195,7 @@ def _analyze_scenario(
     robot, contacts = scene.robot, scene.contacts
     estimator = scene.config.estimator
     free = free_parameters(robot, estimator.friction) & ~scene.frozen()
-    question = Question(
+    problem = PlanningProblem(
         robot=robot,
         contacts=contacts,
         states=states,
@@ -214,22 +214,22 @@ def _analyze_scenario(
         bars.update(bar, description=f"{name}: {what}", completed=step, total=steps)
 
     with _errors_at(scene.source):
-        plan = plan_sensors(question, progress)
+        plan = plan_sensors(problem, progress)
     progress("base parameters", 0, 1)
-    planned, checks = sensor_set(robot, contacts, plan.chosen), None
+    planned, proposed = sensor_set(robot, contacts, plan.chosen), None
     if request.proposed is not None:
-        checks = _checks(question, request.proposed, planned, plan.checks)
-    at_best = question.stack.problem(planned if request.proposed is None else request.proposed)
+        proposed = _assess_proposed(problem, request.proposed, planned, plan.observability)
+    at_best = problem.stack.problem(planned if request.proposed is None else request.proposed)
     base = base_parameters(replace(at_best, free=free))
     progress("done", 1, 1)
-    return ScenarioAnalysis(name, states, plan, checks, base)
+    return ScenarioAnalysis(name, states, plan, proposed, base)
 
 
-def _checks(
-    question: Question, proposed: SensorSet, planned: SensorSet, of_planned: tuple[StateCheck, ...]
-) -> tuple[StateCheck, ...]:
-    """Those of the proposed set; of the planned one, if they are the same."""
-    return of_planned if same_sensors(proposed, planned, question.contacts) else tuple(check(question, proposed))
+def _assess_proposed(
+    problem: PlanningProblem, proposed: SensorSet, planned: SensorSet, of_planned: tuple[BaseObservability, ...]
+) -> tuple[BaseObservability, ...]:
+    """Observability of the base with the proposed set, which may be the planned one."""
+    return of_planned if same_sensors(proposed, planned, problem.contacts) else tuple(assess_set(problem, proposed))
 
 
 def _sets_to_compare(
@@ -237,7 +237,7 @@ def _sets_to_compare(
 ) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
     scene, sets = request.scene, dict(request.compared)
-    recorded = {state for samples in train for state, _ in by_state(samples)}
+    recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
     for scenario in found:
         planned = sensor_set(scene.robot, scene.contacts, scenario.plan.chosen, scene.noise)
         if recorded & set(scenario.states) and not any(
@@ -260,12 +260,12 @@ def write_analysis(analysis: Analysis) -> None:
     texts, figures = [], {}
     for scenario in analysis.scenarios:
         plan, proposed = scenario.plan, scenario.proposed
-        document["scenarios"][scenario.name] = plan_document(plan) | {
-            "proposed": None if proposed is None else checks_document(proposed),
-            "base_parameters": base_document(scenario.base, names),
+        document["scenarios"][scenario.name] = sensor_plan_document(plan) | {
+            "proposed": None if proposed is None else observability_document(proposed),
+            "base_parameters": base_parameters_document(scenario.base, names),
         }
         which = "planned" if proposed is None else "proposed"
-        texts.append(base_text(f"{scenario.name}, {which} sensors", scenario.base, names))
+        texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
         figures[f"sensors-{scenario.name}"] = _picture(scene, scenario)
     if analysis.accuracies:
         document["accuracy"] = {name: found.as_dict() for name, found in analysis.accuracies.items()}
@@ -284,13 +284,13 @@ def _picture(scene: Scene, scenario: ScenarioAnalysis) -> Figure:
     sensors = sensor_set(robot, scene.contacts, plan.chosen)
     used = [c for c, *active in zip(scene.contacts, *scenario.states, strict=True) if any(active)]
     wrenches = {
-        contact.frame: [COMPONENTS[k] for k in np.flatnonzero(row)]
+        contact.frame: [WRENCH_COMPONENTS[k] for k in np.flatnonzero(row)]
         for contact, row in zip(scene.contacts, sensors.wrench, strict=True)
     }
     measured = [name for name, taken in zip(robot.dof_names, sensors.torque, strict=True) if taken]
     constrained = [joint for branch in plan.branches if branch.constrained for joint in branch.joints]
     channels = sum(candidate.channels for candidate in plan.chosen)
-    title = f"{scenario.name}: {channels} of {sum(c.channels for c in plan.question.candidates)} sensor channels"
+    title = f"{scenario.name}: {channels} of {sum(c.channels for c in plan.problem.candidates)} sensor channels"
     return tree_figure(title, robot, used, measured, wrenches, constrained)
 
 

@@ -1,13 +1,14 @@
-"""`torchid evaluate`: the parameters of a finished run on logs it never saw."""
+"""`torchid evaluate`: errors of the parameters of a finished run on further logs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
-from torchid.commands.results import forces_of
+from torchid.commands.results import draw_forces
 from torchid.config import load_config
 from torchid.errors import ConfigError, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
@@ -20,9 +21,15 @@ from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
 
 
-def evaluate(
-    run: str | Path, logs: Sequence[str | Path], device: str | None = None
-) -> tuple[dict[str, Comparison[Metrics]], Path]:
+@dataclass(frozen=True)
+class EvaluatedRun:
+    """Errors of the parameters of a run by the name of a log, and the folder that they were written to."""
+
+    metrics: dict[str, Comparison[Metrics]]
+    output: Path
+
+
+def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = None) -> EvaluatedRun:
     """Evaluate nominal and identified parameters.
 
     Results go to `RUN/evaluation/<name of the first log>` and replace an earlier evaluation of that name.
@@ -31,9 +38,6 @@ def evaluate(
         run: folder that `identify` wrote.
         logs: log files, preprocessed as the run's own were.
         device: where to compute; None: where the run did.
-
-    Returns:
-        Nominal and identified metrics by log name, and the folder they were written to.
 
     Raises:
         InputError: the folder is no run, or a log does not fit its robot.
@@ -63,21 +67,21 @@ def evaluate(
         for log in samples:
             pair = scorer.score_logs([log], compared, lambda n: bars.advance(evaluating, n))
             metrics[Path(log.source).stem] = pair
-            if not any(x is not None for x in pair[1].rms.values()):
+            if not any(x is not None for x in pair.identified.rms.values()):
                 message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
                 warn(message)
         document: dict[str, dict[str, object]] = {
-            name: {"identified": after.as_dict(), "nominal": before.as_dict()}
-            for name, (before, after) in metrics.items()
+            name: {"identified": pair.identified.as_dict(), "nominal": pair.nominal.as_dict()}
+            for name, pair in metrics.items()
         }
         for path, count in reader.excluded.items():
             document[Path(path).stem]["excluded_samples"] = count
         with during("writing", output), new_folder(output, True, EVALUATION) as new:
             (new / "config.yaml").write_bytes(read_bytes(folder / "config.yaml", MAX_YAML))
             write_json(new / "metrics.json", document)
-            save_figure(forces_of(evaluation, samples[0], compared), new / "forces.png")
+            save_figure(draw_forces(evaluation, samples[0], compared), new / "forces.png")
             save_figure(error_figure(metrics), new / "errors.png")
-    return metrics, output
+    return EvaluatedRun(metrics, output)
 
 
 def _calibrations(experiment: Experiment, builder: RowBuilder, path: Path) -> Comparison[Calibration]:

@@ -11,8 +11,8 @@ from functools import partial
 
 from rich.progress import Progress
 
-from torchid.commands.folder import RUN, check_free, claimed
-from torchid.commands.plausibility import check_not_worse, check_plausible
+from torchid.commands.folder import RUN, check_free, claim_folder
+from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, check_training, descent_settings, training_folder
@@ -25,11 +25,11 @@ from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
+from torchid.identifiability.base_rank import StateReport, require_base, state_reports
 from torchid.identifiability.contributions import Contributions, contributions
-from torchid.identifiability.rank import StateReport, check_base, state_reports
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts
-from torchid.problem.compression import Part, folds_together, in_folds, states_together
+from torchid.problem.compression import Part, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import State, state_name
 from torchid.problem.metrics import SETS
 from torchid.report.tables import progress_bars
@@ -60,7 +60,7 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
     trains = config.estimator.name == "sgd"
-    with claimed(training_folder(config.output)) if trains else nullcontext():
+    with claim_folder(training_folder(config.output)) if trains else nullcontext():
         check_training(config, resume, source)
         check_free(config.output, config.overwrite, RUN, (source, *inputs_of(config)))
         return _identify(config, source, resume)
@@ -92,12 +92,12 @@ def _prepare(config: ExperimentConfig, source: object, clock: _Clock, bars: Prog
         logs = _read(reader, experiment, bars)
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
-        check_base(states, config.sensors.on_base_lost)
+        require_base(states, config.sensors.on_base_lost)
         noise = experiment.estimate_noise(logs["train"], experiment.sensors)
         experiment = with_noise(experiment, noise)
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
-        blocks = in_folds(logs["train"], builder)
+        blocks = split_into_folds(logs["train"], builder)
         parts = _compressed(builder, blocks, bars)
     with clock("ridge"):
         experiment, ridge = _with_ridge(experiment, parts, blocks, builder, conditions, bars)
@@ -124,7 +124,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
         training, solve = None, None
         with clock("solve"):
             if experiment.config.estimator.name == "sgd":
-                check_plausible(fitter.fit(ready.parts), experiment)
+                require_plausible(fitter.fit(ready.parts), experiment)
                 training = Training(experiment)
                 evaluate = partial(_identified_metrics, evaluation, logs)
                 solve = partial(training.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
@@ -132,17 +132,17 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             fit, robust = _robust(fit, experiment, fitter, blocks, bars)
             ready.parts = []
             estimate, problem = fit.estimate, fit.assembly.problem
-            mass = check_plausible(fit, experiment)
+            mass = require_plausible(fit, experiment)
             warn_of_confounded(fit.extras, source)
             warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
-            whole = folds_together(fit.parts, builder)
+            whole = merge_folds(fit.parts, builder)
             alone = _by_state(fitter, whole)
             added = _contributions(experiment, builder, whole, logs["train"], problem, bars)
         with clock("evaluate"):
             fits = (fit, *fitter.fit_without_folds(fit.parts))
             compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
-            scorer, of_blocks = Scorer(evaluation, builder), states_together(fit.parts, builder)
+            scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
             metrics, validation = _metrics(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
         run = Identification(
@@ -163,7 +163,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             validation=validation,
             ridge=ready.ridge,
         )
-        check_not_worse(run.worse, experiment)
+        require_not_worse(run.worse, experiment)
         bars.add_task("writing", total=None)
         write_run(run, evaluation, (logs["test"] or logs["train"])[0], compared, training)
     return run

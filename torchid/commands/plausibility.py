@@ -1,4 +1,4 @@
-"""The stop for fits that no robot can have left, and what the checks of the training logs say of the reason."""
+"""Refuse fits that no robot can have produced; the checks of the training logs say why."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from torchid import parameters
-from torchid.commands.check import log_to_check
+from torchid.commands.check import read_log_to_check
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
@@ -18,7 +18,7 @@ from torchid.log_checks.findings import SEVERITIES
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
-from torchid.problem.metrics import ADVICE, Worse, verdict
+from torchid.problem.metrics import ADVICE, WorseThanNominal, describe_worse
 from torchid.robot import Robot
 from torchid.rounding import is_significant
 
@@ -31,8 +31,8 @@ _CLEAR = (
 )
 
 
-def implausible(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:
-    """In words what a sane person would not print of fitted parameters, None if nothing.
+def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:
+    """Why fitted parameters cannot be those of the robot, None if they can.
 
     What the data do not determine is no reason: it is not printed as a result.
 
@@ -43,20 +43,20 @@ def implausible(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robo
         robot: the robot.
     """
     gain = force_gain(problem)
-    if mass.determined and absurd(mass.value / mass.nominal):
+    if mass.determined and beyond_models(mass.value / mass.nominal):
         known = f"{mass.value:.4g} ± {mass.standard_error:.2g} kg where the URDF weighs {mass.nominal:.4g} kg"
-        return f"the fit's total mass is {known}{_told(mass.value / mass.nominal)}"
-    if gain is not None and absurd(gain):
-        return f"the measured forces are {gain:.3g} times what the URDF's bodies need{_told(gain)}"
+        return f"the fit's total mass is {known}{_sign_note(mass.value / mass.nominal)}"
+    if gain is not None and beyond_models(gain):
+        return f"the measured forces are {gain:.3g} times what the URDF's bodies need{_sign_note(gain)}"
     return next(_beyond_bounds(phi.reshape(-1, PER_BODY), robot), None)
 
 
-def absurd(ratio: float) -> bool:
-    """Whether what was found cannot be so many times what the URDF says."""
+def beyond_models(ratio: float) -> bool:
+    """Whether no model of a robot is off by this factor."""
     return not 1.0 / OFF <= ratio <= OFF
 
 
-def _told(ratio: float) -> str:
+def _sign_note(ratio: float) -> str:
     return ", the opposite sign" if ratio < 0.0 else ""
 
 
@@ -116,16 +116,16 @@ _USUAL = (
 )
 
 
-def check_plausible(fit: Fit, scene: Scene) -> TotalMass:
-    """Stop at a fit that no robot can have left, and warn of one that leaves much more than the stated noise.
+def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
+    """Refuse a fit that no robot can have produced, and warn of residuals far above the stated noise.
 
     Returns:
         How well the total mass is known.
 
     Raises:
         SensorError: no parameter is in reach of the sensors.
-        ImplausibleFitError: parameters that nobody would print, or forces that no parameters explain in a log that
-            the checks condemn.
+        ImplausibleFitError: parameters that no robot has, or forces that no parameters explain in a log that the
+            checks condemn.
 
     Warns:
         NumericalWarning: forces that no parameters explain, for whatever reason.
@@ -136,19 +136,19 @@ def check_plausible(fit: Fit, scene: Scene) -> TotalMass:
             scene.source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs"
         )
     mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance)
-    absurd = implausible(fit.assembly.problem, estimate.phi, mass, scene.robot)
+    reason = implausibility(fit.assembly.problem, estimate.phi, mass, scene.robot)
     unexplained = _unexplained(fit)
-    if absurd is None and unexplained is None:
+    if reason is None and unexplained is None:
         return mass
     log, finding = next(_findings(scene), (None, None))
-    if finding is not None and (absurd is not None or finding.condemns_all):
-        told = f"{log}: {finding.field}: {finding.found}"
+    if finding is not None and (reason is not None or finding.condemns_all):
+        checks = f"{log}: {finding.field}: {finding.found}"
         raise ImplausibleFitError(
-            scene.source, "logs", f"{absurd or unexplained}; torchid check finds in {told}", finding.advice
+            scene.source, "logs", f"{reason or unexplained}; torchid check finds in {checks}", finding.advice
         )
-    if absurd is not None:
+    if reason is not None:
         raise ImplausibleFitError(
-            scene.source, "logs", absurd, f"data and URDF that fit each other; usual reasons: {_USUAL}"
+            scene.source, "logs", reason, f"data and URDF that fit each other; usual reasons: {_USUAL}"
         )
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
@@ -156,8 +156,8 @@ def check_plausible(fit: Fit, scene: Scene) -> TotalMass:
     return mass
 
 
-def check_not_worse(found: list[Worse], scene: Scene) -> None:
-    """Stop where the URDF's parameters predict better and the checks condemn a training log; else say so.
+def require_not_worse(found: list[WorseThanNominal], scene: Scene) -> None:
+    """Refuse a fit that predicts worse than the URDF if the checks condemn a training log; else warn.
 
     Raises:
         ImplausibleFitError: the parameters of a log that is not usable.
@@ -167,17 +167,17 @@ def check_not_worse(found: list[Worse], scene: Scene) -> None:
     """
     if not found:
         return
-    told, advice = verdict(found), ADVICE
+    message, advice = describe_worse(found), ADVICE
     log, finding = next(_findings(scene), (None, None))
     if finding is not None:
-        told, advice = f"{told}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
+        message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
         if finding.condemns_all:
-            raise ImplausibleFitError(scene.source, "logs", told, advice)
-    warn(f"{scene.source}: {told}; {advice}", NumericalWarning)
+            raise ImplausibleFitError(scene.source, "logs", message, advice)
+    warn(f"{scene.source}: {message}; {advice}", NumericalWarning)
 
 
 def _unexplained(fit: Fit) -> str | None:
-    """In words how much more than noise the best parameters leave, None if they do not."""
+    """By how much residuals exceed the noise, in words; None if they do not."""
     estimate, problem = fit.estimate, fit.assembly.problem
     left = np.sqrt(estimate.cost / max(estimate.rows, 1))  # not corrected for the fit, which may be far from the best
     if left > _UNEXPLAINED:
@@ -189,16 +189,16 @@ def _unexplained(fit: Fit) -> str | None:
 
 
 def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
-    """What training logs suffer from as a whole or in a good part, the most telling first."""
+    """Findings on a large part of a training log, the most severe first."""
     files = scene.config.logs
     if files is None:
         return
     found = []
     for path in files.train:
         try:
-            log = log_to_check(path, files.topics, scene.config.preprocessing)
+            log = read_log_to_check(path, files.topics, scene.config.preprocessing)
             checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
-        except InputError:  # larger than memory: nothing is known of it
+        except InputError:  # larger than memory: it is not checked
             continue
         grave = (one for one in checked.findings if one.severity in SEVERITIES[:2])
         found += [(path.name, one) for one in grave if one.mask(len(checked.log)).mean() > _PART]

@@ -20,12 +20,12 @@ from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary
+from torchid.identifiability.base_rank import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
-from torchid.identifiability.rank import StateReport
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, Metrics, Samples
-from torchid.problem.metrics import SETS, WHITENED, Worse, verdict, worse_than_nominal
+from torchid.problem.metrics import SETS, WHITENED, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.predict import force_series
 from torchid.report import identified_urdf, parameters_document
 from torchid.report.figures import (
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 from torchid.report.tensorboard import RunEvents
 
 _PLOTTED_SAMPLES = 3000
-LEFT_OUT = "blocks left out of the fit"
-"""How tables call the training samples that cross-validation predicts."""
+HELD_OUT = "blocks left out of the fit"
+"""Name of the training samples that cross-validation predicts, in messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,9 +95,9 @@ class Identification:
         return [asdict(x) | {"body": None if x.body is None else names[x.body]} for x in self.violations]
 
     @cached_property
-    def worse(self) -> list[Worse]:
+    def worse(self) -> list[WorseThanNominal]:
         """Groups of rows where the URDF predicts better, on blocks left out of the fit or on the test logs."""
-        sets = {} if self.validation is None else {LEFT_OUT: (self.validation.nominal, self.validation.identified)}
+        sets = {} if self.validation is None else {HELD_OUT: (self.validation.nominal, self.validation.identified)}
         return worse_than_nominal(sets | ({"test logs": self.metrics["test"]} if "test" in self.metrics else {}))
 
     def state_entries(self) -> list[dict[str, object]]:
@@ -129,7 +129,7 @@ def write_run(
     """
     config, robot = run.experiment.config, run.experiment.robot
     figures = {
-        "forces": forces_of(evaluation, plotted, compared),
+        "forces": draw_forces(evaluation, plotted, compared),
         "errors": error_figure(run.metrics),
         "parameters": parameter_figure(
             robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
@@ -153,7 +153,7 @@ def write_run(
         training.forget()
 
 
-def forces_of(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> Figure:
+def draw_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> Figure:
     """The figure of forces of a log's first samples: nominal, identified, and measured as the latter calibrates it.
 
     Each prediction is as far from what was measured as from readings that are calibrated for it.
@@ -171,7 +171,7 @@ def forces_of(evaluation: Evaluation, samples: Samples, compared: Comparison[Cal
 
 
 def metrics_document(run: Identification) -> dict[str, object]:
-    """What `metrics.json` holds: errors of the identified parameters, and of the nominal ones beside them."""
+    """What `metrics.json` holds: errors of the identified and of the nominal parameters."""
     estimate, robot = run.estimate, run.experiment.robot
     document: dict[str, object] = {}
     for name in SETS:
@@ -200,7 +200,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "cross_validation": _validation_document(run),
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
         "worse_than_nominal": [asdict(one) for one in run.worse],
-        "verdict": verdict(run.worse),
+        "verdict": describe_worse(run.worse),
         "contact_states": run.state_entries(),
         "identifiability": _identifiability_document(run),
         "seconds": run.seconds,
@@ -222,7 +222,7 @@ def _identifiability_document(run: Identification) -> dict[str, object]:
         "singular_values": estimate.singular_values.tolist(),
         "condition_number": estimate.condition_number if estimate.rank else None,
         "oversampling": estimate.oversampling,
-        **asdict(found.known),
+        **asdict(found.total),
         "verdicts": estimate.verdict_counts(),
         "logs": [asdict(log) for log in found.logs],
         "sensors": [asdict(sensor) for sensor in found.sensors],
@@ -262,14 +262,14 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
         if run.validation is not None:
             events.errors(0, {"left_out": run.validation.nominal})
             events.errors(last, {"left_out": run.validation.identified})
-        events.verdict(last, verdict(run.worse) or "nowhere worse than the URDF's parameters")
+        events.verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
         events.fit(last, estimate)
         events.identifiability(
-            last, estimate, run.contributions.known, table_text(verdict_counts_table(run.by_state, estimate))
+            last, estimate, run.contributions.total, table_text(verdict_counts_table(run.by_state, estimate))
         )
         final = {
             f"{name}_{group}": value
-            for name in reversed(SETS)  # unseen logs first: TensorBoard shows the first few
+            for name in reversed(SETS)  # test logs first: TensorBoard shows the first few
             if name in run.metrics
             for group, value in run.metrics[name].identified.relative.items()
             if value is not None

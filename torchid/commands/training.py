@@ -27,12 +27,12 @@ from torchid.commands.folder import (
     EVENTS,
     TRAINING,
     check_free,
-    clear_leftovers,
     new_folder,
+    recover_leftovers,
     refuse_inputs,
     refuse_link,
 )
-from torchid.commands.manifest import Manifest, inspect, read_manifest
+from torchid.commands.manifest import Manifest, inspect_folder, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError, InputError, SensorError, warn
@@ -44,7 +44,7 @@ from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Sam
 from torchid.problem.linear import parameter_scale
 from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
-from torchid.text import shown
+from torchid.text import excerpt
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -79,7 +79,7 @@ def load_checkpoint(folder: Path) -> dict[str, Any]:
         InputError: the file is damaged, was changed by others than `save_checkpoint`, or is none of ours.
     """
     path = folder / CHECKPOINT
-    with damage_refused(folder):
+    with refusing_damage(folder):
         _check_archive(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of pickles that are not torch's, which it then refuses
@@ -113,7 +113,7 @@ def _digest(value: Any) -> str:
 
 
 @contextmanager
-def damage_refused(folder: Path) -> Iterator[None]:
+def refusing_damage(folder: Path) -> Iterator[None]:
     """Turn whatever reading a checkpoint or taking up its state raises into one line that names the file.
 
     Raises:
@@ -124,7 +124,7 @@ def damage_refused(folder: Path) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # noqa: B902 - an unpickler, torch and its optimizers raise what they like
-        found = f"not readable ({shown(str(error) or type(error).__name__, 200)})"
+        found = f"not readable ({excerpt(str(error) or type(error).__name__, 200)})"
         raise InputError(folder / CHECKPOINT, "file", found, _ACCEPTED) from error
 
 
@@ -144,10 +144,10 @@ def _check_archive(path: Path) -> None:
 
 def _check_values(state: object) -> None:
     """Refuse tensors that are larger than what is stored of them, settings that would unfold, and endless nesting."""
-    left, seen = [state], 0
+    left, count = [state], 0
     while left:
-        value, seen = left.pop(), seen + 1
-        if seen > MAX_STATE:
+        value, count = left.pop(), count + 1
+        if count > MAX_STATE:
             raise ValueError(f"more than {MAX_STATE} values")
         if isinstance(value, dict):
             left += [*value.keys(), *value.values()]
@@ -189,7 +189,7 @@ def check_training(config: ExperimentConfig, resume: bool, source: object) -> No
             raise ConfigError(source, "--resume", found, "estimator.name: sgd, or no --resume")
         return
     refuse_link(folder)
-    clear_leftovers(folder, TRAINING)
+    recover_leftovers(folder, TRAINING)
     waiting = (folder / CHECKPOINT).is_file()
     if resume and not waiting:
         if output.exists() and not config.overwrite:
@@ -261,7 +261,7 @@ class Training:
 
     def copy_curves(self, folder: Path) -> None:
         """Copy the training's event files into the finished run's folder."""
-        found = inspect(self.folder, TRAINING)
+        found = inspect_folder(self.folder, TRAINING)
         for path in found.own if found else ():
             if fnmatchcase(path.name, EVENTS):
                 shutil.copy2(path, folder)
@@ -272,7 +272,7 @@ class Training:
         Warns:
             TorchidWarning: there is more in its folder than torchid wrote.
         """
-        if found := inspect(self.folder, TRAINING):
+        if found := inspect_folder(self.folder, TRAINING):
             found.remove()
         if self.folder.exists():
             message = f"{self.folder}: stays: it holds what torchid did not write"
@@ -299,7 +299,7 @@ class Training:
         """Start a new folder, or take up what is in it."""
         if resume and (self.folder / CHECKPOINT).is_file():
             state = load_checkpoint(self.folder)
-            with damage_refused(self.folder):
+            with refusing_damage(self.folder):
                 self._check(state, trainer)
                 trainer.load_state_dict(state["trainer"])
             self._saved = trainer.epoch

@@ -26,7 +26,7 @@ from torchid.config.sensors import (
 )
 from torchid.errors import ConfigError, warn
 from torchid.logs import Topics
-from torchid.logs.containers import bag_files
+from torchid.logs.containers import list_bag_files
 from torchid.logs.ros.topics import check_topics
 from torchid.settings import NotNegative, Positive, Seed
 
@@ -320,7 +320,7 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
             out.append(path)
             continue
         matching = path.parent.glob(path.name.replace("[", "[[]"))
-        found = sorted(file for file in matching if file.is_file() or bag_files(file))
+        found = sorted(file for file in matching if file.is_file() or list_bag_files(file))
         if not found:
             raise ConfigError(source, field, f"no file matches {path}", "a log, or a pattern of several")
         out += found

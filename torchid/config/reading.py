@@ -21,7 +21,7 @@ from torchid.errors import ConfigError, UnknownNameError, during
 from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML, read_bytes
 from torchid.logs.containers import READABLE
 from torchid.settings import accepted_values
-from torchid.text import is_plain, shown
+from torchid.text import excerpt, is_plain
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TAG = "tag:yaml.org,2002:"
@@ -68,7 +68,7 @@ def check_yaml(text: str) -> None:
         _check_tag(event)
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in count.anchored:
-                raise ValueError(f"'*{shown(str(event.anchor))}', which stands for nothing complete")
+                raise ValueError(f"'*{excerpt(str(event.anchor))}', which stands for nothing complete")
             count.add(count.anchored[event.anchor])
         elif isinstance(event, yaml.CollectionStartEvent):
             count.start(event.anchor)
@@ -88,20 +88,20 @@ def _check_tag(event: yaml.Event) -> None:
         return
     kind = tag.removeprefix(_TAG)
     if kind not in _KINDS:
-        raise ValueError(f"the tag '{shown(tag)}', which settings have no use for")
+        raise ValueError(f"the tag '{excerpt(tag)}', which settings have no use for")
     if isinstance(event, yaml.ScalarEvent) and kind in _NUMBERS:
         resolved = yaml.resolver.Resolver().resolve(yaml.ScalarNode, event.value, (True, False)).removeprefix(_TAG)
         if resolved != kind and (kind, resolved) != ("float", "int"):
-            raise ValueError(f"'{shown(event.value)}', which is no !!{kind}")
+            raise ValueError(f"'{excerpt(event.value)}', which is no !!{kind}")
 
 
 def _check_scalar(value: str) -> None:
     if len(value) > MAX_TEXT:
         raise ValueError(f"a text of {len(value)} characters, more than {MAX_TEXT}")
     if not is_plain(value.replace("\n", "")):
-        raise ValueError(f"'{shown(value)}', with a control character")
+        raise ValueError(f"'{excerpt(value)}', with a control character")
     if "${" in value:
-        raise ValueError(f"'{shown(value)}', but ${{...}} stands for nothing here")
+        raise ValueError(f"'{excerpt(value)}', but ${{...}} stands for nothing here")
 
 
 #: What YAML and OmegaConf raise at a value that is not what its tag or its place says.
@@ -183,7 +183,7 @@ def _load(kind: FileKind[T], path: Path, overrides: Sequence[str]) -> T:
             settings = _container(OmegaConf.merge(*layers))
         except (OmegaConfBaseException, TypeError) as error:
             accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
-            raise ConfigError("command line", shown(text), "does not fit the file", accepted) from error
+            raise ConfigError("command line", excerpt(text), "does not fit the file", accepted) from error
     try:
         return TypeAdapter(kind.settings).validate_python(settings)
     except ValidationError as error:
@@ -220,13 +220,13 @@ def _why(error: Exception) -> str:
     if isinstance(error, UnicodeDecodeError):
         return "no text"
     spoken = isinstance(error, (OmegaConfBaseException, yaml.YAMLError, ValueError))
-    return shown(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
+    return excerpt(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
 
 
 def _parsed(text: str) -> Settings:
     key, equals, value = text.partition("=")
     if not equals:
-        raise ConfigError("command line", shown(text), "not an override", "key.subkey=value")
+        raise ConfigError("command line", excerpt(text), "not an override", "key.subkey=value")
     try:
         check_yaml(key)
         check_yaml(value)
@@ -234,7 +234,7 @@ def _parsed(text: str) -> Settings:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         return _container(OmegaConf.from_dotlist([text]))
     except _NO_YAML as error:
-        raise ConfigError("command line", shown(text), _why(error), "key.subkey=value, in YAML") from error
+        raise ConfigError("command line", excerpt(text), _why(error), "key.subkey=value, in YAML") from error
 
 
 def _cleared(settings: Settings, given: Settings) -> Settings:
@@ -279,7 +279,7 @@ def _absolute_path(value: str, folder: Path) -> str:
     names = [len(os.fsencode(name)) for name in Path(path).parts]
     too_long = max(names) > _LONGEST_NAME or sum(names) + len(names) > _LONGEST_PATH
     if not value.strip() or not Path(path).name or not is_plain(value) or too_long:
-        raise ValueError(f"'{shown(value)}', no name for a file or folder")
+        raise ValueError(f"'{excerpt(value)}', no name for a file or folder")
     return path
 
 
@@ -315,7 +315,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
 
 def _repr(value: object) -> str:
     try:
-        return shown(repr(value))
+        return excerpt(repr(value))
     except ValueError:  # Python spells no number of more than 4300 digits
         return f"a number of more than {sys.get_int_max_str_digits()} digits"
 

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from torchid import parameters
-from torchid.errors import InputError, install
+from torchid.errors import InputError, how_to_install
 from torchid.estimators.barrier import solve_barrier
 from torchid.estimators.conditions import Conditions, check_parameters
 from torchid.estimators.conic import ConicProblem, Solution
@@ -74,7 +74,7 @@ class Consistent(Regularized):
         super().__post_init__()
         if (self.certify or self.method == "certified") and not (find_spec("cvxpy") and find_spec("clarabel")):
             found = "needs CVXPY and Clarabel, which are not installed"
-            raise InputError("estimator", "certified", found, f"{install('certified')}, or barrier alone")
+            raise InputError("estimator", "certified", found, f"{how_to_install('certified')}, or barrier alone")
 
     @rounding_reported("consistent")
     def solve(self, problem: LinearProblem) -> ConsistentEstimate:
@@ -105,7 +105,7 @@ class Consistent(Regularized):
             **(vars(plain) | {"phi": phi, "cost": problem.cost(phi)}),
             objective=solution.objective,
             unconstrained=data.unconstrained,
-            distance=problem.distance(phi, plain.phi),
+            distance=problem.prediction_distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, problem.scale),
             gap=solution.gap,
             certified_gap=certified_gap,

@@ -191,7 +191,7 @@ class Trainer:
             held_out=held_out,
             objective=self._objective(phi),
             closed_form=self._objective(self.closed_form.phi),
-            distance=self.problem.distance(phi, self.closed_form.phi),
+            distance=self.problem.prediction_distance(phi, self.closed_form.phi),
             shares={name: float(np.sqrt(x / size)) if size else 0.0 for name, x in squares.items()},
             learning_rate=rate,
             samples_per_second=self.batches.samples / elapsed,
@@ -206,7 +206,7 @@ class Trainer:
         Raises:
             InputError: too few samples, or no weight under which the loss does not diverge.
         """
-        train, blocks = self.batches, [] if self.held_out is None else self.held_out.blocks(_BLOCKS)
+        train, blocks = self.batches, [] if self.held_out is None else self.held_out.split_blocks(_BLOCKS)
         if self.held_out is None:
             train, blocks = self.batches.hold_out(_BLOCKS, _EVERY)
         if len(blocks) < _FEWEST:
@@ -227,7 +227,7 @@ class Trainer:
     def _trial(self, train: MiniBatches, residual: nn.Module | None, weight: float, epochs: int) -> Trainer:
         """A descent on some of the samples."""
         settings = replace(self.settings, residual_weight=weight, epochs=epochs, patience=None)
-        return Trainer(settings, self.problem.share(train.samples / self.batches.samples), train, residual=residual)
+        return Trainer(settings, self.problem.fraction(train.samples / self.batches.samples), train, residual=residual)
 
     def _trial_losses(
         self, train: MiniBatches, weight: float, start: Mapping[str, Tensor], blocks: Sequence[MiniBatches]
@@ -258,7 +258,7 @@ class Trainer:
             **(vars(plain) | {"phi": phi, "cost": self.problem.cost(phi)}),
             objective=self._objective(phi),
             unconstrained=self._objective(plain.phi),
-            distance=self.problem.distance(phi, plain.phi),
+            distance=self.problem.prediction_distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, self.problem.scale),
             epochs=self.epoch,
             best_epoch=self.best_epoch,

@@ -21,10 +21,10 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import Part
 from torchid.problem.extras import Extra
-from torchid.problem.predict import calibrated
-from torchid.problem.samples import check_forces
+from torchid.problem.predict import calibrate_readings
+from torchid.problem.samples import require_forces
 from torchid.robot import Robot
-from torchid.text import listed
+from torchid.text import join_names
 
 T = TypeVar("T")
 
@@ -42,7 +42,7 @@ ExtraValues = Mapping[tuple[str, str], float]
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Parameters of the bodies with the extra parameters that suit them, known or fitted anew to every new log.
+    """Parameters of the bodies with the extra parameters that fit them best, known or fitted anew to every new log.
 
     Readings of other logs of the same robot, as calibrated sensors would have recorded them::
 
@@ -78,7 +78,7 @@ class Calibration:
         if not self.changes_readings:
             return list(logs)
         extras, tree = self.builder.extras, self._on_cpu.tree
-        return [calibrated(log, extras, self._values_for(log), tree) for log in logs]
+        return [calibrate_readings(log, extras, self._values_for(log), tree) for log in logs]
 
     def parameters(self, evaluation: Evaluation) -> Array:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""
@@ -86,7 +86,7 @@ class Calibration:
 
     def columns(self, builder: RowBuilder, log: Samples) -> Tensor:
         """Parameters in a builder's columns for the rows of a log, (width,)."""
-        return builder.columns_of(np.append(self.phi, self._values_for(log))[None])[0]
+        return builder.to_columns(np.append(self.phi, self._values_for(log))[None])[0]
 
     @cached_property
     def _on_cpu(self) -> RowBuilder:
@@ -111,7 +111,7 @@ class Calibration:
         """Extra parameters of a log, with everything else known."""
         builder = self._on_cpu
         try:
-            check_forces(log, self.robot, builder.contacts, builder.sensors)
+            require_forces(log, self.robot, builder.contacts, builder.sensors)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
             warn(message)
@@ -125,7 +125,7 @@ class Calibration:
         def columns(values: Array) -> Tensor:
             extras = np.empty(len(own))
             extras[own], extras[~own] = values, shared
-            return builder.columns_of(np.append(self.phi, extras)[None])[0]
+            return builder.to_columns(np.append(self.phi, extras)[None])[0]
 
         if self.loss is None:
             return solve(compress_parts([log], builder))
@@ -169,7 +169,7 @@ def warn_of_confounded(found: Sequence[ExtraEstimate], source: object = "logs") 
         if mixed:
             named = _grouped(x.extra.label for x in mixed)
             others = _grouped(name for x in mixed for name in x.confounded_with if " of " not in name)
-            message = f"{log or source}: {named} confounded with {others or 'each other'}; do not trust either"
+            message = f"{log or source}: {named} are confounded with {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
             warn(f"{message}; {advice}", ConfoundedWarning)
 
@@ -204,7 +204,7 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
         own = [x for x in found if x.log == log]
         named = "; ".join(
             f"{x.extra.name} {x.extra.component} reads {x.in_the_air:.4g} {x.extra.unit} in the air, where "
-            f"{x.in_contact:.4g} +- {x.standard_error:.2g} suits the rest of the data"
+            f"{x.in_contact:.4g} +- {x.standard_error:.2g} fits the rest of the data"
             for x in own[:_NAMED]
         )
         more = f"; and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
@@ -220,5 +220,5 @@ def _grouped(labels: Iterable[str]) -> str:
         groups.setdefault(first, {})[last] = None
     order = sorted(groups, key=lambda first: -len(groups[first]))
     more = f"; and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
-    named = ((first, listed(list(groups[first]), _NAMED)) for first in order[:_NAMED])
+    named = ((first, join_names(list(groups[first]), _NAMED)) for first in order[:_NAMED])
     return "; ".join(f"{first} {names}" if " of" in first else f"{names} of {first}" for first, names in named) + more

@@ -1,9 +1,10 @@
-"""Base parameters: the combinations of parameters that the rows of a problem determine, and their formulas."""
+"""Base parameters: the combinations of parameters that the rows of a problem determine, their number and formulas."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -11,23 +12,22 @@ import torch
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.identifiability.rank import RankGap, rank_and_gap, unit_columns
+from torchid.errors import NumericalWarning, warn
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
-from torchid.rounding import RANK_TOLERANCE
+from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank
 
 _ROUNDING = 1e-9  # of a coefficient, columns having norm 1; joint angles written as 1.5707963 leave 1e-11
 _LEAST_PREFERENCE = 1e-2  # between 1e-1 and 1e-4 sums are shortest, and conditioning is the same
+_CLEAR_GAP = 1e3  # a rank shows by a step of many decades (14 on exact motions), not by a slope
 
 
-def drop_preference(count: int) -> Array:
-    """How gladly each of `count` parameters is regrouped into others, (count,), from 1 down to 0.01.
+class RankGap(NamedTuple):
+    """Number of singular values that count, and how clear that is: the smallest of them over the next one."""
 
-    As textbooks do it: limbs into what carries them; of a body the mass first, then first moments, then inertia.
-    """
-    bodies = max(count // parameters.PER_BODY, 1)
-    return np.concatenate(np.array_split(np.geomspace(1.0, _LEAST_PREFERENCE, count), bodies)[::-1])
+    rank: int
+    gap: float
 
 
 class BaseParameters(nn.Module):
@@ -36,7 +36,7 @@ class BaseParameters(nn.Module):
     Attributes:
         kept: (P_B,) int, ascending; base parameter i is parameter `kept[i]` and what was regrouped into it.
         combination: G, (P_B, P): the identity in the kept columns, zero in those that are not free.
-        hidden: (P_free - P_B, P), directions h with K h = 0; `hidden / scale` is orthonormal.
+        null_space: (P_free - P_B, P), directions h with K h = 0; `null_space / scale` is orthonormal.
         free: (P,) bool; the others are constants, see `forward`.
         scale: (P,), the problem's.
         rank, gap, singular_values: of the columns scaled to norm 1, see `rank_and_gap`.
@@ -53,12 +53,12 @@ class BaseParameters(nn.Module):
         singular_values: Array,
         rank_gap: RankGap,
     ) -> None:
-        """See `base_parameters`, which finds them."""
+        """Use `base_parameters`, which finds them."""
         super().__init__()
         self.kept, self.combination, self.free, self.scale = kept, combination, free, scale
         self.singular_values = singular_values
         self.rank, self.gap = rank_gap
-        self.hidden = _hidden(kept, combination, free, scale)
+        self.null_space = _null_space(kept, combination, free, scale)
         self.register_buffer("index", torch.from_numpy(kept), persistent=False)
 
     def forward(self, K: Tensor) -> Tensor:
@@ -68,19 +68,19 @@ class BaseParameters(nn.Module):
         """
         return K.index_select(-1, self.index)
 
-    def of(self, phi: Array) -> Array:
+    def reduce(self, phi: Array) -> Array:
         """Base parameters (..., P_B) of parameters (..., P)."""
         return phi @ self.combination.T
 
     def lift(self, phi_B: Array, nominal: Array) -> Array:
         """The parameters (..., P) nearest to `nominal`, (P,), in units of `scale`, with base parameters (..., P_B)."""
         step = np.zeros((*phi_B.shape[:-1], len(self.scale)))
-        step[..., self.kept] = (phi_B - self.of(nominal)) / self.scale[self.kept]
-        directions = self.hidden / self.scale
+        step[..., self.kept] = (phi_B - self.reduce(nominal)) / self.scale[self.kept]
+        directions = self.null_space / self.scale
         return nominal + self.scale * (step - step @ directions.T @ directions)
 
-    def problem(self, problem: LinearProblem) -> LinearProblem:
-        """The same problem in the base parameters, all free and seen; constants move to its right-hand side.
+    def reduce_problem(self, problem: LinearProblem) -> LinearProblem:
+        """The same problem in the base parameters, all free and observable; constants move to its right-hand side.
 
         Raises:
             ValueError: other parameters are free there.
@@ -92,7 +92,7 @@ class BaseParameters(nn.Module):
             problem,
             A=problem.A[:, self.kept],
             b=problem.b - problem.A @ constant,
-            nominal=self.of(problem.nominal),
+            nominal=self.reduce(problem.nominal),
             scale=problem.scale[self.kept],
             free=np.ones(len(self.kept), dtype=bool),
         )
@@ -105,23 +105,24 @@ def base_parameters(
     """Base parameters of a problem.
 
     Columns are scaled to norm 1, so that a finger's inertia counts as much as the torso's mass; a pivoted QR
-    factorization of their null space settles which parameters are regrouped into the others.
+    factorization of their null space settles which parameters are regrouped into the others. Source: Gautier,
+    "Numerical calculation of the base inertial parameters of robots", 1991.
 
     Args:
-        problem: its rows decide what is seen.
-        tolerance: a column below this share of the largest, in units of `problem.scale`, is not seen at all; a singular
-            value of the scaled columns below this share of the largest counts as zero.
-        preference: (P,), > 0, how gladly each parameter is regrouped into others; by default `drop_preference`.
+        problem: its rows decide what is observable.
+        tolerance: a parameter whose column is below this share of the largest, in units of `problem.scale`, is not
+            observable; a singular value of the scaled columns below this share of the largest counts as zero.
+        preference: (P,), > 0, for regrouping each parameter into others; by default `regrouping_preference`.
 
     Warns:
         NumericalWarning: the rank is a matter of the tolerance.
     """
     free, count = np.flatnonzero(problem.free), len(problem.scale)
-    columns, units = unit_columns(problem, tolerance)
+    columns, units = normalized_columns(problem, tolerance)
     _, values, Vh = scipy.linalg.svd(columns, lapack_driver="gesvd")  # gesdd can fail on dozens of null directions
     rank_gap = rank_and_gap(values, tolerance)
     null_space = Vh[rank_gap.rank :].T
-    weight = (drop_preference(count) if preference is None else preference)[free]
+    weight = (regrouping_preference(count) if preference is None else preference)[free]
     _, order = scipy.linalg.qr((null_space * weight[:, None]).T, mode="r", pivoting=True)
     hidden_count = len(free) - rank_gap.rank
     dropped, kept = order[:hidden_count], np.sort(order[hidden_count:])
@@ -134,19 +135,18 @@ def base_parameters(
     return BaseParameters(free[kept], combination, problem.free, problem.scale, values, rank_gap)
 
 
-def _hidden(kept: np.ndarray, combination: Array, free: np.ndarray, scale: Array) -> Array:
-    """Null space of G in the free parameters, orthonormal in units of `scale`."""
-    dropped = np.setdiff1d(np.flatnonzero(free), kept)
-    directions = np.zeros((len(scale), len(dropped)))
-    directions[dropped, np.arange(len(dropped))] = 1.0
-    directions[kept] = -combination[:, dropped]
-    hidden = np.zeros((len(dropped), len(scale)))
-    hidden[:, free] = np.linalg.qr(directions[free] / scale[free, None]).Q.T * scale[free]
-    return hidden
+def regrouping_preference(count: int) -> Array:
+    """Preference for regrouping each of `count` parameters into others, (count,), from 1 down to 0.01.
+
+    As textbooks do it (Gautier, Khalil): limbs into what carries them; of a body the mass first, then first moments,
+    then inertia.
+    """
+    bodies = max(count // parameters.PER_BODY, 1)
+    return np.concatenate(np.array_split(np.geomspace(1.0, _LEAST_PREFERENCE, count), bodies)[::-1])
 
 
-def relations(base: BaseParameters, body_names: Sequence[str]) -> list[str]:
-    """One sum per base parameter, such as `m[shank] + m[foot] - 0.31 Ixx[foot]`, coefficients in SI units.
+def format_base_parameters(base: BaseParameters, body_names: Sequence[str]) -> list[str]:
+    """One formula per base parameter, such as `m[shank] + m[foot] - 0.31 Ixx[foot]`, coefficients in SI units.
 
     Args:
         base: in the parameters of bodies.
@@ -160,13 +160,8 @@ def relations(base: BaseParameters, body_names: Sequence[str]) -> list[str]:
     return lines
 
 
-def _term(coefficient: float, name: str) -> str:
-    size = f"{abs(coefficient):.3g}"
-    return f" {'-' if coefficient < 0 else '+'} {name if size == '1' else f'{size} {name}'}"
-
-
-def unseen(base: BaseParameters, body_names: Sequence[str]) -> list[str]:
-    """Free parameters that are part of no sum, one line per body, such as `foot: Ixx, Ixy, Ixz, Iyy, Iyz, Izz`.
+def unobservable_parameters(base: BaseParameters, body_names: Sequence[str]) -> list[str]:
+    """Free parameters in no base parameter, one line per body, such as `foot: Ixx, Ixy, Ixz, Iyy, Iyz, Izz`.
 
     Args:
         base: in the parameters of bodies.
@@ -178,3 +173,70 @@ def unseen(base: BaseParameters, body_names: Sequence[str]) -> list[str]:
         for body, numbers in zip(body_names, lost, strict=True)
         if numbers.any()
     ]
+
+
+@one_thread()
+def structural_rank(problem: LinearProblem, tolerance: float = RANK_TOLERANCE) -> RankGap:
+    """Rank of a problem's free columns, scaled to norm 1.
+
+    Args:
+        problem: its rows decide what is observable.
+        tolerance: as in `normalized_columns` and `rank_and_gap`.
+
+    Warns:
+        NumericalWarning: the rank is a matter of the tolerance.
+    """
+    columns, _ = normalized_columns(problem, tolerance)
+    return rank_and_gap(scipy.linalg.svd(columns, compute_uv=False, lapack_driver="gesvd"), tolerance)
+
+
+def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
+    """Rank of a matrix with columns of one size.
+
+    Values below rounding count as `eps` times the largest one in the gap, which is 4.5e15 at most.
+
+    Args:
+        values: singular values, descending.
+        tolerance: a value below this share of the largest counts as zero.
+
+    Warns:
+        NumericalWarning: a gap below 1e3, so that another tolerance finds another rank.
+    """
+    rank = numerical_rank(values, tolerance)
+    if rank == 0:
+        return RankGap(0, np.inf)
+    dropped = max(float(values[rank]) if rank < len(values) else 0.0, np.finfo(float).eps * float(values[0]))
+    gap = float(values[rank - 1]) / dropped
+    if gap < _CLEAR_GAP:
+        message = f"rank {rank}: the next singular value is only {gap:.3g} times smaller than the last that counts"
+        warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning)
+    return RankGap(rank, gap)
+
+
+def normalized_columns(problem: LinearProblem, tolerance: float) -> tuple[Array, Array]:
+    """Free columns scaled to norm 1, (R, P_free), and their parameters' units, (P_free,).
+
+    A column below the share `tolerance` of the largest, in units of `problem.scale`, is not observable, and set to 0.
+    """
+    scale = problem.scale[problem.free]
+    columns = problem.A[:, problem.free] * scale
+    norms = np.linalg.norm(columns, axis=0)
+    observable = is_significant(norms, tolerance)
+    norms[~observable] = 1.0
+    return np.where(observable, columns, 0.0) / norms, scale / norms
+
+
+def _null_space(kept: np.ndarray, combination: Array, free: np.ndarray, scale: Array) -> Array:
+    """Null space of G in the free parameters, orthonormal in units of `scale`."""
+    dropped = np.setdiff1d(np.flatnonzero(free), kept)
+    directions = np.zeros((len(scale), len(dropped)))
+    directions[dropped, np.arange(len(dropped))] = 1.0
+    directions[kept] = -combination[:, dropped]
+    hidden = np.zeros((len(dropped), len(scale)))
+    hidden[:, free] = np.linalg.qr(directions[free] / scale[free, None]).Q.T * scale[free]
+    return hidden
+
+
+def _term(coefficient: float, name: str) -> str:
+    size = f"{abs(coefficient):.3g}"
+    return f" {'-' if coefficient < 0 else '+'} {name if size == '1' else f'{size} {name}'}"

@@ -1,4 +1,4 @@
-"""What each log, contact state and sensor adds: what would be lost without it."""
+"""Contributions of each log, contact state and sensor: the information that is lost without it."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import numpy as np
 
 from torchid.identifiability.information import (
     SAMPLES,
-    Knowledge,
+    InformationGain,
     SensorInformation,
+    add_information,
     prior_directions,
     sensor_information,
-    sum_of,
-    triangle,
+    triangular_factor,
 )
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import state_name
-from torchid.problem.elimination import without
-from torchid.rounding import RANK_TOLERANCE, numerical_rank
+from torchid.problem.elimination import eliminate_columns
+from torchid.rounding import numerical_rank
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """Bits and combinations, as in `Knowledge`, that are lost without a part of the data."""
+    """Bits and combinations, as in `InformationGain`, that are lost without a part of the data."""
 
     name: str
     bits: float
@@ -45,100 +45,6 @@ class PartContribution(Contribution):
 
 
 @dataclass(frozen=True)
-class Unknowns:
-    """Places of the unknowns that are not asked for, among scaled columns: those that each log has anew.
-
-    `of_all`: of those that all logs have in common, among the columns that are left then.
-    """
-
-    of_log: list[int]
-    of_all: list[int]
-
-    @classmethod
-    def of(cls, builder: RowBuilder, directions: Array) -> Unknowns:
-        """Of the columns `directions`, as `prior_directions` has them, the unknowns last."""
-        first = directions.shape[1] - len(builder.extras)
-        own = [first + number for number, extra in enumerate(builder.extras) if extra.per_log]
-        return cls(own, list(range(first, directions.shape[1] - len(own))))
-
-
-class ScaledParts:
-    """Parts of logs, and X of each with `X^T X` its information in scaled columns, correlated noise counted."""
-
-    def __init__(self, parts: Sequence[Part], directions: Array, unknowns: Unknowns) -> None:
-        self.parts, self.unknowns = parts, unknowns
-        self._factors = [
-            part.factor.triangle().numpy()[:-1, :-1] @ directions / np.sqrt(part.factor.oversampling) for part in parts
-        ]
-
-    def together(self, chosen: Sequence[int]) -> Array:
-        """X of some parts, with what is unknown in each log eliminated."""
-        by_source: dict[str, list[Array]] = {}
-        for i in chosen:
-            by_source.setdefault(self.parts[i].source if self.unknowns.of_log else "", []).append(self._factors[i])
-        nothing = np.empty((0, self._factors[0].shape[1] - len(self.unknowns.of_log)))
-        found = (without(triangle(np.concatenate(same)), self.unknowns.of_log) for same in by_source.values())
-        return triangle(np.concatenate([nothing, *found]))
-
-    @cached_property
-    def everything(self) -> Array:
-        """Singular values of all parts together."""
-        return self.singular_values(self.together(range(len(self.parts))))
-
-    def singular_values(self, X: Array) -> Array:
-        """Of what X of several logs say of the bodies' parameters, descending."""
-        return np.asarray(np.linalg.svd(without(triangle(X), self.unknowns.of_all), compute_uv=False))
-
-
-def left_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float) -> list[PartContribution]:
-    """What is lost without the parts of each name.
-
-    Args:
-        data: all parts.
-        names: of each.
-        rank_tolerance: as in `LeastSquares`.
-    """
-    groups = {name: [i for i, other in enumerate(names) if other == name] for name in dict.fromkeys(names)}
-    factors = [data.together(chosen) for chosen in groups.values()]
-    everything, out = data.everything, []
-    for (name, chosen), factor, others in zip(groups.items(), factors, _rests(data, groups, factors), strict=True):
-        rest = data.singular_values(others)
-        lost = Knowledge.of(everything**2) - Knowledge.of(rest**2)
-        rank = _rank(data.singular_values(factor), rank_tolerance)
-        rank_lost = _rank(everything, rank_tolerance) - _rank(rest, rank_tolerance)
-        samples = sum(data.parts[i].samples for i in chosen)
-        out.append(PartContribution(name, lost.bits, lost.determined, samples, rank, rank_lost))
-    return out
-
-
-def _rests(data: ScaledParts, groups: dict[str, list[int]], factors: Sequence[Array]) -> Iterator[Array]:
-    """X of all parts but those of each group."""
-    logs = [{data.parts[i].source for i in chosen} for chosen in groups.values()]
-    if not data.unknowns.of_log or sum(map(len, logs)) == len(set().union(*logs)):
-        yield from _without_each(factors)
-        return
-    for chosen in groups.values():  # groups share logs, and so their unknowns
-        yield data.together([i for i in range(len(data.parts)) if i not in set(chosen)])
-
-
-def _without_each(factors: Sequence[Array]) -> Iterator[Array]:
-    """For every factor, one of all others, from those of the ones before and after it: no pair is merged twice."""
-    nothing = factors[0][:0]
-    after = [nothing]
-    for factor in reversed(factors[1:]):
-        after.append(triangle(np.concatenate([factor, after[-1]])))
-    before = nothing
-    for factor in factors:
-        yield np.concatenate([before, after.pop()])
-        before = triangle(np.concatenate([before, factor]))
-
-
-def _rank(values: Array, tolerance: float) -> int:
-    """As `LeastSquares` counts it."""
-    return numerical_rank(values, tolerance, values.shape)
-
-
-@dataclass(frozen=True)
 class SensorContribution(Contribution):
     """Of a sensor: `kind` is "joint torque", "wrench in a limb" or "contact wrench", with all measured components."""
 
@@ -147,9 +53,9 @@ class SensorContribution(Contribution):
 
 @dataclass(frozen=True)
 class Contributions:
-    """What all data tell, and what each log, contact state (most frequent first) and sensor adds (most first)."""
+    """Of all data together, and of each log, contact state (most frequent first) and sensor (largest first)."""
 
-    known: Knowledge
+    total: InformationGain
     logs: list[PartContribution]
     states: list[PartContribution]
     sensors: list[SensorContribution]
@@ -162,13 +68,13 @@ def contributions(
     builder: RowBuilder,
     problem: LinearProblem,
     dof_names: Sequence[str],
-    rank_tolerance: float = RANK_TOLERANCE,
+    rank_tolerance: float = 1e-10,
     done: ProgressCallback | None = None,
 ) -> Contributions:
     """Leave every log, contact state and sensor out in turn.
 
-    Only the bodies' parameters are asked for: offsets and the like count as unknown, those of a log in every log anew.
-    Logs and contact states are exact, sensors as in `sensor_information`.
+    Contributions are to the bodies' parameters: offsets, scales and actuator terms are nuisance parameters. Logs and
+    contact states are exact, sensors as in `sensor_information`.
 
     Args:
         parts: of the logs.
@@ -180,38 +86,143 @@ def contributions(
         done: called with the number of samples worked through.
     """
     directions = prior_directions(builder, problem.scale * problem.free)
-    unknowns = Unknowns.of(builder, directions)
-    data = ScaledParts(parts, directions, unknowns)
-    by_log = left_out(data, [part.source for part in parts], rank_tolerance)
-    by_state = left_out(data, [state_name(builder.contacts, part.state) for part in parts], rank_tolerance)
+    nuisance = NuisanceColumns.of(builder, directions)
+    data = ScaledParts(parts, directions, nuisance)
+    by_log = leave_one_out(data, [part.source for part in parts], rank_tolerance)
+    by_state = leave_one_out(data, [state_name(builder.contacts, part.state) for part in parts], rank_tolerance)
     by_state.sort(key=lambda state: -state.samples)
-    information = _sensor_information(logs, builder, directions, unknowns, done)
-    sensors = _sensors(information.without(unknowns.of_all), builder, dof_names)
-    return Contributions(Knowledge.of(data.everything**2), by_log, by_state, sensors)
+    information = _sensor_information(logs, builder, directions, nuisance, done)
+    sensors = _sensors(information.marginal(nuisance.of_all), builder, dof_names)
+    return Contributions(InformationGain.of(data.everything**2), by_log, by_state, sensors)
+
+
+@dataclass(frozen=True)
+class NuisanceColumns:
+    """Places of the columns of nuisance parameters: offsets, scales and actuator terms.
+
+    Attributes:
+        of_log: among scaled columns, those that each log has anew.
+        of_all: those that all logs have in common, among the columns without `of_log`.
+    """
+
+    of_log: list[int]
+    of_all: list[int]
+
+    @classmethod
+    def of(cls, builder: RowBuilder, directions: Array) -> NuisanceColumns:
+        """Of the columns `directions`, as `prior_directions` has them, the nuisance parameters last."""
+        first = directions.shape[1] - len(builder.extras)
+        own = [first + number for number, extra in enumerate(builder.extras) if extra.per_log]
+        return cls(own, list(range(first, directions.shape[1] - len(own))))
+
+
+class ScaledParts:
+    """Parts of logs, and X of each with `X^T X` its information in scaled columns, correlated noise counted."""
+
+    def __init__(self, parts: Sequence[Part], directions: Array, nuisance: NuisanceColumns) -> None:
+        self.parts, self.nuisance = parts, nuisance
+        self._factors = [
+            part.factor.triangle().numpy()[:-1, :-1] @ directions / np.sqrt(part.factor.oversampling) for part in parts
+        ]
+
+    def together(self, chosen: Sequence[int]) -> Array:
+        """X of some parts, with the nuisance parameters of each log eliminated."""
+        by_source: dict[str, list[Array]] = {}
+        for i in chosen:
+            by_source.setdefault(self.parts[i].source if self.nuisance.of_log else "", []).append(self._factors[i])
+        nothing = np.empty((0, self._factors[0].shape[1] - len(self.nuisance.of_log)))
+        found = (
+            eliminate_columns(triangular_factor(np.concatenate(same)), self.nuisance.of_log)
+            for same in by_source.values()
+        )
+        return triangular_factor(np.concatenate([nothing, *found]))
+
+    @cached_property
+    def everything(self) -> Array:
+        """Singular values of all parts together."""
+        return self.singular_values(self.together(range(len(self.parts))))
+
+    def singular_values(self, X: Array) -> Array:
+        """Of X of several logs with nuisance parameters eliminated, descending."""
+        return np.asarray(
+            np.linalg.svd(eliminate_columns(triangular_factor(X), self.nuisance.of_all), compute_uv=False)
+        )
+
+
+def leave_one_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float) -> list[PartContribution]:
+    """The contribution of the parts of each name: what is lost without them.
+
+    Args:
+        data: all parts.
+        names: of each.
+        rank_tolerance: as in `LeastSquares`.
+    """
+    groups = {name: [i for i, other in enumerate(names) if other == name] for name in dict.fromkeys(names)}
+    factors = [data.together(chosen) for chosen in groups.values()]
+    everything, out = data.everything, []
+    for (name, chosen), factor, others in zip(
+        groups.items(), factors, _information_of_others(data, groups, factors), strict=True
+    ):
+        rest = data.singular_values(others)
+        lost = InformationGain.of(everything**2) - InformationGain.of(rest**2)
+        rank = _rank(data.singular_values(factor), rank_tolerance)
+        rank_lost = _rank(everything, rank_tolerance) - _rank(rest, rank_tolerance)
+        samples = sum(data.parts[i].samples for i in chosen)
+        out.append(PartContribution(name, lost.bits, lost.determined, samples, rank, rank_lost))
+    return out
+
+
+def _information_of_others(
+    data: ScaledParts, groups: dict[str, list[int]], factors: Sequence[Array]
+) -> Iterator[Array]:
+    """X of all parts but those of each group."""
+    logs = [{data.parts[i].source for i in chosen} for chosen in groups.values()]
+    if not data.nuisance.of_log or sum(map(len, logs)) == len(set().union(*logs)):
+        yield from _without_each(factors)
+        return
+    for chosen in groups.values():  # groups share logs, and so their nuisance parameters
+        yield data.together([i for i in range(len(data.parts)) if i not in set(chosen)])
+
+
+def _without_each(factors: Sequence[Array]) -> Iterator[Array]:
+    """For every factor, one of all others, from those of the ones before and after it: no pair is merged twice."""
+    nothing = factors[0][:0]
+    after = [nothing]
+    for factor in reversed(factors[1:]):
+        after.append(triangular_factor(np.concatenate([factor, after[-1]])))
+    before = nothing
+    for factor in factors:
+        yield np.concatenate([before, after.pop()])
+        before = triangular_factor(np.concatenate([before, factor]))
+
+
+def _rank(values: Array, tolerance: float) -> int:
+    """As `LeastSquares` counts it."""
+    return numerical_rank(values, tolerance, values.shape)
 
 
 def _sensor_information(
     logs: Sequence[Samples],
     builder: RowBuilder,
     directions: Array,
-    unknowns: Unknowns,
+    nuisance: NuisanceColumns,
     done: ProgressCallback | None,
 ) -> SensorInformation:
-    """As `sensor_information` has it, in scaled columns, without what is unknown in each log."""
+    """As `sensor_information` has it, in scaled columns, without the nuisance parameters of each log."""
 
     def scaled(H: Array) -> Array:
         return np.asarray(directions.T @ H @ directions)
 
-    if not unknowns.of_log:
-        return sensor_information(logs, builder, done=done).changed(scaled)
+    if not nuisance.of_log:
+        return sensor_information(logs, builder, done=done).map(scaled)
     sources = {samples.source: [other for other in logs if other.source == samples.source] for samples in logs}
     most = max(SAMPLES // len(sources), 1)
-    found = (sensor_information(same, builder, most, done).changed(scaled) for same in sources.values())
-    return sum_of([information.without(unknowns.of_log) for information in found])
+    found = (sensor_information(same, builder, most, done).map(scaled) for same in sources.values())
+    return add_information([information.marginal(nuisance.of_log) for information in found])
 
 
 def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Sequence[str]) -> list[SensorContribution]:
-    everything, out = _known(information.total), []
+    everything, out = _gain(information.total), []
     frames = [contact.frame for contact in builder.contacts]
     limbs = [name.rpartition(".")[0] for name in dof_names[builder.tree.n :: 6]]
     for kind, names, lost in (
@@ -220,10 +231,10 @@ def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Seq
         ("contact wrench", frames, information.wrenches),
     ):
         for place, H in lost.items():
-            gone = everything - _known(information.total - H)
+            gone = everything - _gain(information.total - H)
             out.append(SensorContribution(names[place], gone.bits, gone.determined, kind))
     return sorted(out, key=lambda found: -found.bits)
 
 
-def _known(H: Array) -> Knowledge:
-    return Knowledge.of(np.asarray(np.linalg.eigvalsh(H)))
+def _gain(H: Array) -> InformationGain:
+    return InformationGain.of(np.asarray(np.linalg.eigvalsh(H)))

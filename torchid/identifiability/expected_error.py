@@ -1,4 +1,4 @@
-"""How far off a fit is expected to be, before anything unseen is measured."""
+"""Expected errors of a fit: of its parameters, and of the forces that it predicts on any motion."""
 
 from __future__ import annotations
 
@@ -10,30 +10,78 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from torchid.identifiability.information import triangle
+from torchid.identifiability.information import triangular_factor
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread, spread_by_state
+from torchid.problem.chunks import one_thread, subsample_states
 from torchid.problem.contact_state import State
-from torchid.problem.metrics import GROUPS, ForceSums, figure, projected
+from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components
 from torchid.problem.predict import predicted_forces
-from torchid.rounding import RANK_TOLERANCE, is_significant
 from torchid.sensing import SensorNoise
+
+_SAMPLES = 400  # a contact state
+
+
+@dataclass(frozen=True)
+class ExpectedErrors:
+    """Rms by group of rows: of the model's own error, and of what it is compared with.
+
+    The latter is the noise of torque and contact sensors, and on the base rows that of the differentiated motion,
+    `SensorNoise.base`.
+    """
+
+    model: dict[str, float | None]
+    sensors: dict[str, float | None]
+
+    @property
+    def total(self) -> dict[str, float | None]:
+        """Expected difference between predicted and measured forces."""
+        pairs = {group: (self.model[group], self.sensors[group]) for group in ROW_GROUPS}
+        return {group: None if x is None or y is None else float(np.hypot(x, y)) for group, (x, y) in pairs.items()}
+
+
+@one_thread()
+@torch.no_grad()
+def expected_errors(
+    builder: RowBuilder, logs: Sequence[Samples], directions: Array, noise: SensorNoise
+) -> ExpectedErrors:
+    """Expected errors of predicted forces on some logs.
+
+    Args:
+        builder: of an `Evaluation`.
+        logs: whose motion the forces are predicted on.
+        directions: (M, 12 L), independent errors of the parameters, as `error_directions` gives them.
+        noise: of the sensors that recorded these logs, with its floors of the base rows.
+    """
+    columns = torch.from_numpy(triangular_factor(directions @ builder.columns.parameter_map().T)).to(builder.device)
+    base, nv = builder.tree.base_rows, builder.tree.base_rows + len(builder.columns.joint_rows)
+    model, sensors = ForceSums(nv), ForceSums(nv)
+    for samples, state, weight in subsample_states(logs, _SAMPLES):
+        samples = samples.to(builder.device)
+        terms = builder.dynamics(samples)
+        predicted = torch.stack([predicted_forces(builder, terms, phi).T for phi in columns])
+        rows = _row_noise(builder, samples, noise)
+        through_contacts = _wrench_noise(builder, samples, state, noise)
+        for sums, errors, without_contacts in (
+            (model, predicted, predicted),
+            (sensors, torch.cat([rows, through_contacts]), rows),
+        ):
+            sums.rows.add(_together(errors), weight)
+            for inside in null_space_components(builder, samples, state, without_contacts):
+                sums.projected.add(_together(inside).flatten()[:, None], weight)
+    found = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
+    return ExpectedErrors(*({group: finite_or_none(rms[group]) for group in ROW_GROUPS} for rms in found))
 
 
 @one_thread()
 def error_directions(
-    problem: LinearProblem,
-    ridge: float,
-    noise_variance: float,
-    prior_error: float,
-    rank_tolerance: float = RANK_TOLERANCE,
+    problem: LinearProblem, ridge: float, noise_variance: float, prior_error: float, rank_tolerance: float = 1e-10
 ) -> Array:
     """Independent errors of least squares with a ridge, (M, P): their outer products sum up to the error's covariance.
 
     Along each right singular vector of the scaled problem, with singular value s and r = ridge * rows, the noise of the
     rows enters by s / (s^2 + r) and the error of the nominal parameters stays by r / (s^2 + r); along directions that
-    no row sees it stays in full. This is exact for white noise and independent nominal errors of one size.
+    no row depends on it stays in full. This is exact for white noise and independent nominal errors of one size.
 
     Args:
         problem: of the training logs.
@@ -45,69 +93,15 @@ def error_directions(
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, lapack_driver="gesvd")  # see `base_parameters`
     values = np.pad(values, (0, len(scale) - len(values)))
-    values[~is_significant(values, rank_tolerance)] = 0.0
-    pull = ridge * problem.rows
+    values[values <= rank_tolerance * values.max(initial=0.0)] = 0.0
+    prior = ridge * problem.rows
     with np.errstate(invalid="ignore", divide="ignore"):
-        through = np.where(values > 0.0, values / (values**2 + pull), 0.0)
-        kept = np.where(values > 0.0, pull / (values**2 + pull), 1.0)
+        through = np.where(values > 0.0, values / (values**2 + prior), 0.0)
+        kept = np.where(values > 0.0, prior / (values**2 + prior), 1.0)
     length = np.hypot(np.sqrt(noise_variance) * through, prior_error * kept)
     directions = np.zeros((len(scale), len(problem.free)))
     directions[:, problem.free] = length[:, None] * Vh * scale
     return directions
-
-
-_SAMPLES = 400  # a contact state
-
-
-@dataclass(frozen=True)
-class ExpectedErrors:
-    """Rms by group of rows: of the model's own error, and of what it is compared with.
-
-    The latter is the noise of torque and contact sensors, and on the base rows that of the differentiated motion, which
-    the floors `SensorNoise.base` stand for.
-    """
-
-    model: dict[str, float | None]
-    sensors: dict[str, float | None]
-
-    @property
-    def total(self) -> dict[str, float | None]:
-        """What a comparison with measured forces is to show."""
-        both = {group: (self.model[group], self.sensors[group]) for group in GROUPS}
-        return {group: None if x is None or y is None else float(np.hypot(x, y)) for group, (x, y) in both.items()}
-
-
-@one_thread()
-@torch.no_grad()
-def expected_errors(
-    builder: RowBuilder, logs: Sequence[Samples], directions: Array, noise: SensorNoise
-) -> ExpectedErrors:
-    """Errors on some logs.
-
-    Args:
-        builder: of an `Evaluation`.
-        logs: whose motion the forces are predicted on.
-        directions: (M, 12 L), independent errors of the parameters, as `error_directions` gives them.
-        noise: of the sensors that recorded these logs, with its floors of the base rows.
-    """
-    columns = torch.from_numpy(triangle(directions @ builder.columns.from_parameters().T)).to(builder.device)
-    base, n_rows = builder.tree.base_rows, builder.tree.n_rows
-    model, sensors = ForceSums(n_rows), ForceSums(n_rows)
-    for samples, state, weight in spread_by_state(logs, _SAMPLES):
-        samples = samples.to(builder.device)
-        terms = builder.terms(samples)
-        predicted = torch.stack([predicted_forces(builder, terms, phi).T for phi in columns])
-        rows = _row_noise(builder, samples, noise)
-        through_contacts = _wrench_noise(builder, samples, state, noise)
-        for sums, errors, without_contacts in (
-            (model, predicted, predicted),
-            (sensors, torch.cat([rows, through_contacts]), rows),
-        ):
-            sums.rows.add(_together(errors), weight)
-            for inside in projected(builder, samples, state, without_contacts):
-                sums.projected.add(_together(inside).flatten()[:, None], weight)
-    found = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
-    return ExpectedErrors(*({group: figure(rms[group]) for group in GROUPS} for rms in found))
 
 
 def _together(errors: Tensor) -> Tensor:
@@ -117,10 +111,10 @@ def _together(errors: Tensor) -> Tensor:
 
 def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:
     """Forces (n_rows, B, n_rows) of one standard deviation of each base row's floor and each torque sensor."""
-    n, base = builder.tree.dofs, builder.tree.base_rows
-    std = np.append(noise.base[:base], noise.dofs(builder.tree.n, n))
+    n, base = builder.tree.n_dofs, builder.tree.base_rows
+    std = np.append(noise.base_std[:base], noise.dof_std(builder.tree.n, n))
     rows = torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
-    axes = builder.noise_axes(samples.rotation_world_base) if noise.by_axis else None
+    axes = builder.noise_axes(samples.rotation_world_base) if noise.base_axes_differ else None
     if axes is None:
         return rows
     force, moment, rest = rows.split([3, 3, len(std) - 6], dim=2)
@@ -134,5 +128,5 @@ def _wrench_noise(builder: RowBuilder, samples: Samples, state: State, noise: Se
     for contact, active in enumerate(state):
         if active:
             possible = list(builder.contacts[contact].components)
-            std[contact, possible] = std.new_tensor(noise.wrench[possible])
+            std[contact, possible] = std.new_tensor(noise.wrench_std[possible])
     return (builder.contact_jacobian(samples) * std[..., None]).flatten(1, 2).transpose(0, 1)

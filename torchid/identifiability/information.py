@@ -1,4 +1,4 @@
-"""How much is known of the parameters, in bits and combinations, and what of it hangs on each sensor."""
+"""Information of data about the parameters, in bits and combinations, and the part of it due to each sensor."""
 
 from __future__ import annotations
 
@@ -12,33 +12,37 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import ProgressCallback, by_state, one_thread, spread_by_state
-from torchid.problem.compression import unloaded_channels
+from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
+from torchid.problem.compression import unloaded_offset_equations
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
 from torchid.rounding import KINEMATIC_TOLERANCE
 
+DEPENDENT = 1e-9
+"""A direction that moves the whitened rows by less than this share of its size does so by rounding."""
+
 
 @dataclass(frozen=True)
-class Knowledge:
-    """What data tell beyond "each free parameter is within one scale of its nominal value".
+class InformationGain:
+    """Information gained over the prior "each free parameter is within one scale of its nominal value".
 
     With H the information of the whitened rows in units of the scales, `bits` = log2 det(I + H) / 2, by how many
     halvings the standard deviations shrink in all, and `determined` = tr((I + H)^-1 H), the number of independent
-    combinations that the data know better than the prior, counted by their share.
+    combinations that the data determine better than the prior, counted by their share. Source: both are those of
+    Bayesian linear regression; MacKay, "Bayesian interpolation", 1992.
     """
 
     bits: float
     determined: float
 
     @classmethod
-    def of(cls, information: Array) -> Knowledge:
+    def of(cls, information: Array) -> InformationGain:
         """From the eigenvalues of H, (M,), at least 0 but for rounding."""
         values = np.maximum(information, 0.0)
         return cls(float(np.log1p(values).sum() / np.log(4.0)), float((values / (1.0 + values)).sum()))
 
-    def __sub__(self, other: Knowledge) -> Knowledge:
-        return Knowledge(self.bits - other.bits, self.determined - other.determined)
+    def __sub__(self, other: InformationGain) -> InformationGain:
+        return InformationGain(self.bits - other.bits, self.determined - other.determined)
 
 
 def prior_directions(builder: RowBuilder, prior: Array) -> Array:
@@ -47,20 +51,20 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
     `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
     `prior`, (12 L,), 0 where they are known, and extras with that of their size.
     """
-    rigid = triangle((builder.columns.from_parameters() * prior).T).T
+    rigid = triangular_factor((builder.columns.parameter_map() * prior).T).T
     return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
 
 
-def triangle(X: Array) -> Array:
+def triangular_factor(X: Array) -> Array:
     """Triangular R, (min(M, N), N), with `R^T R = X^T X`."""
     return np.asarray(np.linalg.qr(X, mode="r"))
 
 
-def information_without(H: Array, unknown: Sequence[int], size: Array) -> Array:
-    """As `elimination.without`, of H = X^T X.
+def marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
+    """Information about the other columns where some are unknown: the Schur complement, as `elimination.without`.
 
     Args:
-        H: (N, N).
+        H: (N, N), X^T X.
         unknown: places of M columns.
         size: (M,), squared norms of these; what is below the share `KINEMATIC_TOLERANCE` of them is rounding.
     """
@@ -74,17 +78,17 @@ def information_without(H: Array, unknown: Sequence[int], size: Array) -> Array:
     return np.asarray(rest - along.T @ (along / values[values > KINEMATIC_TOLERANCE, None]))
 
 
-def information_in(rows: Tensor, weight: float) -> Tensor:
+def rows_information(rows: Tensor, weight: float) -> Tensor:
     """`weight X^T X`, (c, c), of the rows X of all samples together, (B, r, c)."""
     X = rows.flatten(0, 1)
     return weight * (X.T @ X)
 
 
-def unit_readings(ways: Tensor, W: Tensor) -> Tensor:
-    """Rows `ways W`, (B, c, n_rows), of norm 1, or zero where they are rounding.
+def reading_directions(ways: Tensor, W: Tensor) -> Tensor:
+    """Rows `ways W`, (B, c, nv), of norm 1, or zero where they are rounding.
 
-    A sensor that enters the generalized force of a sample by `way^T` times its reading tells what the whitened rows
-    `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
+    A sensor that enters the generalized force of a sample by `way^T` times its reading contributes what the whitened
+    rows `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
 
     Args:
         ways: (B, c, n_rows) or (c, n_rows).
@@ -97,14 +101,14 @@ def unit_readings(ways: Tensor, W: Tensor) -> Tensor:
 
 
 SAMPLES = 2000
-"""Whose rows stand for those of all, about."""
+"""Number of samples, about, whose rows represent those of all."""
 
 _CHUNK = 256  # samples whose rows are computed together
 
 
 @dataclass(frozen=True)
 class SensorInformation:
-    """Information (columns, columns) of all sensors together, and what of it is lost without each.
+    """Information (columns, columns) of all sensors together, and the part of it that is lost without each.
 
     `torques`: by place among the robot's joints; `limbs`: by place among its force/torque sensors in limbs, and
     `wrenches`: by contact, each with all its measured components.
@@ -115,23 +119,23 @@ class SensorInformation:
     limbs: Mapping[int, Array]
     wrenches: Mapping[int, Array]
 
-    def changed(self, change: Callable[[Array], Array]) -> SensorInformation:
-        """With every matrix changed by a linear map."""
+    def map(self, change: Callable[[Array], Array]) -> SensorInformation:
+        """The same with every matrix changed by a linear map."""
         return SensorInformation(
             change(self.total),
             *({place: change(H) for place, H in of.items()} for of in (self.torques, self.limbs, self.wrenches)),
         )
 
-    def without(self, unknown: Sequence[int]) -> SensorInformation:
-        """What is told of the other columns, where some are unknown."""
+    def marginal(self, unknown: Sequence[int]) -> SensorInformation:
+        """Information about the other columns, where some are unknown."""
         size = np.diag(self.total)[list(unknown)]
-        total = information_without(self.total, unknown, size)
-        found = self.changed(lambda H: total - information_without(self.total - H, unknown, size))
+        total = marginal_information(self.total, unknown, size)
+        found = self.map(lambda H: total - marginal_information(self.total - H, unknown, size))
         return replace(found, total=total)
 
 
-def sum_of(found: Sequence[SensorInformation]) -> SensorInformation:
-    """Of logs together that have nothing unknown in common but the columns."""
+def add_information(found: Sequence[SensorInformation]) -> SensorInformation:
+    """Of logs together that have no unknown in common but the columns."""
 
     def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
         return {place: np.asarray(sum(one[place] for one in matrices)) for place in matrices[0]}
@@ -149,14 +153,14 @@ def sum_of(found: Sequence[SensorInformation]) -> SensorInformation:
 def sensor_information(
     logs: Sequence[Samples], builder: RowBuilder, most: int = SAMPLES, done: ProgressCallback | None = None
 ) -> SensorInformation:
-    """Information of some logs in the builder's columns, and what of it hangs on each sensor.
+    """Information of some logs in the builder's columns, and the part of it due to each sensor.
 
-    A sensor tells of a sample what its `unit_readings` take from the whitened rows.
+    That part is, in each sample, what the sensor's `reading_directions` take from the whitened rows.
 
     Args:
         logs: bound logs.
         builder: of their rows.
-        most: samples, about, that stand for all.
+        most: samples, about, that represent all.
         done: called with the number of samples worked through.
     """
     n, base = builder.tree.n, builder.tree.base_rows
@@ -169,17 +173,17 @@ def sensor_information(
     units = torch.eye(builder.tree.n_rows, dtype=torch.float64, device=builder.device)
     torques = units[[base + joint for joint in joints]]
     total = torch.zeros(first + len(contacts), count, count, dtype=torch.float64, device=builder.device)
-    for samples, state, stands_for in _spread(logs, most):
-        weight = stands_for / samples.oversampling
+    for samples, state, represented in _spread(logs, most):
+        weight = represented / samples.oversampling
         rows, W = builder.rows_by_sample(samples.to(builder.device), state)
         K = rows[..., :-1]
-        total[0] += information_in(K, weight)
-        lost = (unit_readings(torques, W) @ K).transpose(0, 1)  # (joints, B, columns)
+        total[0] += rows_information(K, weight)
+        lost = (reading_directions(torques, W) @ K).transpose(0, 1)  # (joints, B, columns)
         total[1 : 1 + len(joints)].baddbmm_(lost.mT, lost, alpha=weight)
         for place, limb in enumerate(limbs, start=1 + len(joints)):
             C = units[(base + n + 6 * limb + np.flatnonzero(in_limbs[limb])).tolist()]
-            total[place] += information_in(_span(C.expand(len(samples), *C.shape), W) @ K, weight)
-        for contact, H in _in_the_air(builder, samples, count):
+            total[place] += rows_information(_span(C.expand(len(samples), *C.shape), W) @ K, weight)
+        for contact, H in _air_information(builder, samples, count):
             total[0] += weight * H
             total[first + contacts.index(contact)] += weight * H
         if any(state[contact] for contact in contacts):
@@ -187,7 +191,7 @@ def sensor_information(
             for place, contact in enumerate(contacts, start=first):
                 if state[contact]:
                     C = J[:, contact, np.flatnonzero(components[contact]).tolist()]
-                    total[place] += information_in(_span(C, W) @ K, weight)
+                    total[place] += rows_information(_span(C, W) @ K, weight)
         if done is not None:
             done(len(samples))
     found = total.cpu().numpy()
@@ -199,9 +203,9 @@ def sensor_information(
     )
 
 
-def _in_the_air(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
+def _air_information(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
     """Contacts, and the information (count, count) that their readings in the air hold on offsets."""
-    for channel in unloaded_channels(builder, samples):
+    for channel in unloaded_offset_equations(builder, samples):
         if not channel.gated and (place := builder.extras[channel.offset].contact):
             columns, row = channel.row(builder)
             wide = row.new_zeros(count)
@@ -210,11 +214,11 @@ def _in_the_air(builder: RowBuilder, samples: Samples, count: int) -> Iterator[t
 
 
 def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State, float]]:
-    """Chunks of about `most` samples, evenly spread over contact states and logs, and how many each stands for."""
-    states = {state for samples in logs for state, _ in by_state(samples)}
-    for samples, state, stands_for in spread_by_state(logs, max(most // max(len(states), 1), 1)):
+    """Chunks of about `most` samples, evenly spread over contact states and logs, and how many each represents."""
+    states = {state for samples in logs for state, _ in chunks_by_state(samples)}
+    for samples, state, represented in subsample_states(logs, max(most // max(len(states), 1), 1)):
         for start in range(0, len(samples), _CHUNK):
-            yield samples[start : start + _CHUNK], state, stands_for
+            yield samples[start : start + _CHUNK], state, represented
 
 
 def _span(C: Tensor, W: Tensor) -> Tensor:

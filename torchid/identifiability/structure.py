@@ -22,35 +22,51 @@ from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact, SensorSet
 
 _ANGLE, _STROKE = 1.5, 0.3  # [rad], [m] either way
-
-
-def random_postures(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Joint positions (count, n), uniform, up to 1.5 rad or 0.3 m either way."""
-    slides = (robot.joint_map[0] != 0.0).T @ robot.geometry.prismatic[1:]
-    return np.where(slides, _STROKE, _ANGLE) * rng.uniform(-1.0, 1.0, (count, robot.n))
-
-
-def at_rest(joint_position: Array, state: State) -> Samples:
-    """Samples of an upright robot at rest, at joint positions (N, n) [rad or m] in a contact state, without forces."""
-    q = torch.from_numpy(np.ascontiguousarray(joint_position, dtype=float))
-    still, base = torch.zeros_like(q), q.new_zeros(len(q), 3)
-    upright, gravity = (q.new_tensor(x).expand(len(q), -1) for x in ((0.0, 0.0, 0.0, 1.0), GRAVITY_WORLD))
-    return Samples(
-        source="postures",
-        time=q.new_zeros(len(q)),
-        joint_position=q,
-        joint_velocity=still,
-        joint_acceleration=still,
-        base=BaseMotion(upright, -gravity, base, base),
-        torque=None,
-        wrench=None,
-        wrench_in_world=False,
-        active=torch.tensor(state, dtype=torch.bool).expand(len(q), len(state)),
-    )
-
-
+_SAMPLES_PER_COLUMN = 2  # in every state: a sample gives one row or more, and some directions are rarely excited
 _WEIGHTLESS = (0.0, 0.0, 0.0)
 _AT_REST = 1e-10  # a projected velocity below this share of what was drawn is rounding, and has no sign
+
+
+def structural_problem(
+    robot: Robot,
+    contacts: Sequence[Contact],
+    sensors: SensorSet,
+    states: Sequence[State],
+    friction: bool = True,
+    samples: Sequence[Samples] | None = None,
+) -> LinearProblem:
+    """The parameters that sensors determine if the robot may move in any way that some contact states allow.
+
+    Its rank bounds that of any log from above. The right-hand side is 0: nothing is to be fitted.
+
+    Args:
+        robot: the robot.
+        contacts: the contacts in use.
+        sensors: which forces are measured.
+        states: contact states the robot may be in.
+        friction: whether friction is free.
+        samples: of these states, if they have been drawn already.
+    """
+    builder = RowBuilder(robot, contacts, sensors)
+    drawn = structural_samples(robot, contacts, states) if samples is None else samples
+    return linear_problem(compress(drawn, builder), builder, robot, friction)
+
+
+def structural_samples(
+    robot: Robot, contacts: Sequence[Contact], states: Sequence[State], count: int | None = None, seed: int = 0
+) -> list[Samples]:
+    """Random samples, see `standing_samples`, of every contact state; they serve any sensor set.
+
+    Args:
+        robot: the robot.
+        contacts: the contacts in use.
+        states: contact states the robot may be in.
+        count: samples per state; by default twice the robot's base parameters, friction included.
+        seed: of the random numbers.
+    """
+    count = count or _SAMPLES_PER_COLUMN * (10 + 9 * (len(robot.bodies) - 1))
+    rng = np.random.default_rng(seed)
+    return [standing_samples(robot, contacts, state, count, rng) for state in states]
 
 
 def standing_samples(
@@ -76,8 +92,8 @@ def standing_samples(
         joint_position=q[:, q.shape[1] - robot.n :],
         joint_velocity=v[:, rows:],
         joint_acceleration=a[:, rows:],
-        base=BaseMotion.of(q, v, a, robot.fixed_base),
-        torque=q.new_zeros(count, robot.dofs),
+        base=BaseMotion.from_coordinates(q, v, a, robot.fixed_base),
+        torque=q.new_zeros(count, robot.n_dofs),
         wrench=q.new_zeros(count, len(contacts), 6),
         wrench_in_world=False,
         active=torch.tensor(state, dtype=torch.bool).expand(count, len(contacts)),
@@ -107,14 +123,39 @@ def standing_states(
     best = torch.argsort(smallest, descending=True)[:count]
     q, v, a, J = q[best], v[best], a[best], J[best]
     inverse = torch.linalg.pinv(J, rtol=KINEMATIC_TOLERANCE)
-    v = _without(v, inverse, J)
+    v = _in_null_space(v, inverse, J)
     v = torch.where(v.abs() < _AT_REST, 0.0, v)
     drift = _drift(robot, held, q, v)
-    return q, v, _without(a, inverse, J) - (inverse @ drift[..., None])[..., 0]
+    return q, v, _in_null_space(a, inverse, J) - (inverse @ drift[..., None])[..., 0]
 
 
-def _without(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
-    """The part of x, (B, nv), that J does not see; the second pass takes the rounding of the first."""
+def resting_samples(joint_position: Array, state: State) -> Samples:
+    """Samples of an upright robot at rest, at joint positions (N, n) [rad or m] in a contact state, without forces."""
+    q = torch.from_numpy(np.ascontiguousarray(joint_position, dtype=float))
+    still, base = torch.zeros_like(q), q.new_zeros(len(q), 3)
+    upright, gravity = (q.new_tensor(x).expand(len(q), -1) for x in ((0.0, 0.0, 0.0, 1.0), GRAVITY_WORLD))
+    return Samples(
+        source="postures",
+        time=q.new_zeros(len(q)),
+        joint_position=q,
+        joint_velocity=still,
+        joint_acceleration=still,
+        base=BaseMotion(upright, -gravity, base, base),
+        torque=None,
+        wrench=None,
+        wrench_in_world=False,
+        active=torch.tensor(state, dtype=torch.bool).expand(len(q), len(state)),
+    )
+
+
+def random_postures(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+    """Joint positions (count, n), uniform, up to 1.5 rad or 0.3 m either way."""
+    slides = (robot.joint_map[0] != 0.0).T @ robot.geometry.prismatic[1:]
+    return np.where(slides, _STROKE, _ANGLE) * rng.uniform(-1.0, 1.0, (count, robot.n))
+
+
+def _in_null_space(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
+    """The part of x, (B, nv), in the null space of J; the second pass takes the rounding of the first."""
     for _ in range(2):
         x = x - (inverse @ (J @ x[..., None]))[..., 0]
     return x
@@ -150,48 +191,3 @@ def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor) -> Tenso
     )
     in_joint_frame = (rotation[:, :, None] * torch.stack([linear, alpha], dim=1)[:, None]).sum(0)
     return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))
-
-
-_SAMPLES_PER_COLUMN = 2  # in every state: a sample gives one row or more, and some directions are rarely excited
-
-
-def structural_samples(
-    robot: Robot, contacts: Sequence[Contact], states: Sequence[State], count: int | None = None, seed: int = 0
-) -> list[Samples]:
-    """Random samples, see `standing_samples`, of every contact state; they serve any sensor set.
-
-    Args:
-        robot: the robot.
-        contacts: the contacts in use.
-        states: contact states the robot may be in.
-        count: samples per state; by default twice the robot's base parameters, friction included.
-        seed: of the random numbers.
-    """
-    count = count or _SAMPLES_PER_COLUMN * (10 + 9 * (len(robot.bodies) - 1))
-    rng = np.random.default_rng(seed)
-    return [standing_samples(robot, contacts, state, count, rng) for state in states]
-
-
-def structural_problem(
-    robot: Robot,
-    contacts: Sequence[Contact],
-    sensors: SensorSet,
-    states: Sequence[State],
-    friction: bool = True,
-    samples: Sequence[Samples] | None = None,
-) -> LinearProblem:
-    """What a sensor set sees of the parameters if the robot may move as it likes in some contact states.
-
-    Its rank bounds that of any log from above. The right-hand side is 0: nothing is to be fitted.
-
-    Args:
-        robot: the robot.
-        contacts: the contacts in use.
-        sensors: which forces are measured.
-        states: contact states the robot may be in.
-        friction: whether friction is free.
-        samples: of these states, if they have been drawn already.
-    """
-    builder = RowBuilder(robot, contacts, sensors)
-    drawn = structural_samples(robot, contacts, states) if samples is None else samples
-    return linear_problem(compress(drawn, builder), builder, robot, friction)

@@ -11,31 +11,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import FieldError, about_file, current_file, during
-from torchid.logs.containers import Kind, kind_to_read, kind_to_write, open_container, save_arrays, translated
+from torchid.logs.containers import (
+    LogKind,
+    existing_log_kind,
+    new_log_kind,
+    open_container,
+    reader_errors_explained,
+    save_arrays,
+)
 from torchid.logs.log import (
     EXCLUSIVE,
-    NAMES,
+    NAME_FIELDS,
     NAN_ALLOWED,
-    NEEDED,
     REQUIRED,
+    REQUIRED_WITH,
     SHAPES,
     VARIANTS,
     FloatArray,
     Log,
     UnknownFieldError,
-    as_flags,
-    as_frame,
-    as_names,
-    as_real,
     check_finite,
     check_shape,
     check_time,
+    column_labels,
+    field_shape,
     is_quaternion,
-    labels_of,
-    shape_of,
-    unit_quaternion,
+    normalize_quaternions,
+    parse_flags,
+    parse_frame,
+    parse_names,
+    to_float64,
 )
-from torchid.logs.quaternion import rotate, rotate_back, sign_continuous
+from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.ros.read import read_bag
 from torchid.logs.ros.topics import Topics
 from torchid.logs.tables import read_table, save_table
@@ -66,16 +73,16 @@ def read_log(
         TorchidWarning: of a bag, that messages carry no time or come twice, or that a channel is NaN in some of them.
     """
     with during("reading", os.fspath(path)):
-        kind = kind_to_read(Path(path))
-        if kind is Kind.ARRAYS:
+        kind = existing_log_kind(Path(path))
+        if kind is LogKind.ARRAYS:
             raw = _arrays(Path(path))
         else:
-            raw = read_table(Path(path)) if kind is Kind.TABLE else read_bag(Path(path), topics, progress)
+            raw = read_table(Path(path)) if kind is LogKind.TABLE else read_bag(Path(path), topics, progress)
             check_fields_given(raw)
-        return checked_log(raw, allow_gaps)
+        return build_log(raw, allow_gaps)
 
 
-def checked_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
+def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
     """The log of the fields of a file, in canonical frames and orders, LogError where one is not what it should be."""
     return _canonical(_checked(raw, allow_gaps))
 
@@ -93,7 +100,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
         check_fields_given(names)
         raw: dict[str, NDArray[Any]] = {}
         for name in names:
-            with translated(name, "a plain array of numbers, truth values or text"):
+            with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
                 raw[name] = container.load(name)
     return raw
 
@@ -114,7 +121,7 @@ def _check_combination(names: Collection[str]) -> None:
     for one, other in EXCLUSIVE:
         if one in names and other in names:
             raise FieldError(one, f"given together with {other}", "one of the two")
-    for name, others in NEEDED.items():
+    for name, others in REQUIRED_WITH.items():
         missing = [other for other in others if other not in names]
         if name in names and missing:
             raise FieldError(name, f"given without {missing[0]}", f"{name} together with {missing[0]}")
@@ -126,25 +133,25 @@ def _check_combination(names: Collection[str]) -> None:
 
 def _checked(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:
     """Every field of the file in its canonical type, each checked by itself and against the sizes N, n, C."""
-    names = {name: as_names(name, raw[name]) if name in raw else () for name in NAMES}
+    names = {name: parse_names(name, raw[name]) if name in raw else () for name in NAME_FIELDS}
     check_shape("time", raw["time"], SHAPES["time"], {})
-    sizes = {"N": len(raw["time"])} | {NAMES[name]: len(labels) for name, labels in names.items()}
-    time = as_real("time", raw["time"])
+    sizes = {"N": len(raw["time"])} | {NAME_FIELDS[name]: len(labels) for name, labels in names.items()}
+    time = to_float64("time", raw["time"])
     check_time(time)
     fields: dict[str, Any] = {**names, "time": time}
     if "imu_frame" in raw:
-        fields["imu_frame"] = as_frame("imu_frame", raw["imu_frame"])
+        fields["imu_frame"] = parse_frame("imu_frame", raw["imu_frame"])
     for name, array in raw.items():
         if name in fields:
             continue
-        check_shape(name, array, shape_of(name), sizes)
-        labels = labels_of(name, names)
+        check_shape(name, array, field_shape(name), sizes)
+        labels = column_labels(name, names)
         if name == "contact_active":
-            fields[name] = as_flags(name, array, labels)
+            fields[name] = parse_flags(name, array, labels)
             continue
-        values = as_real(name, array)
+        values = to_float64(name, array)
         check_finite(name, values, allow_nan=allow_gaps or name in NAN_ALLOWED, labels=labels)
-        fields[name] = unit_quaternion(name, values, allow_gaps) if is_quaternion(name) else values
+        fields[name] = normalize_quaternions(name, values, allow_gaps) if is_quaternion(name) else values
     return fields
 
 
@@ -153,11 +160,11 @@ def _canonical(fields: dict[str, Any]) -> Log:
     if "base_quat_wxyz" in fields:
         fields["base_quat_xyzw"] = np.roll(fields.pop("base_quat_wxyz"), -1, axis=1)
     if "base_quat_xyzw" in fields:
-        quat: FloatArray = sign_continuous(fields["base_quat_xyzw"])
+        quat: FloatArray = make_sign_continuous(fields["base_quat_xyzw"])
         fields["base_quat_xyzw"] = quat
         for name, canonical in VARIANTS.items():
             if name in fields:
-                turn = rotate if name.endswith("_base") else rotate_back
+                turn = rotate_to_world if name.endswith("_base") else rotate_to_base
                 fields[canonical] = turn(quat, fields.pop(name))
     return Log(source=current_file(), **fields)
 
@@ -170,7 +177,7 @@ def write_log(log: Log, path: str | os.PathLike[str]) -> None:
     Raises:
         LogError: the extension is unknown or the file cannot be written.
     """
-    save = save_table if kind_to_write(Path(path)) is Kind.TABLE else save_arrays
+    save = save_table if new_log_kind(Path(path)) is LogKind.TABLE else save_arrays
     arrays: dict[str, NDArray[Any]] = {
         name: array
         for name, array in log.arrays().items()

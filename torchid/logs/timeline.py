@@ -16,10 +16,10 @@ from torchid.logs.log import BoolArray, FloatArray, check_time
 
 #: Samples per spline. One spline through a long log needs 22 numbers a sample for its banded matrix alone; through
 #: blocks the temporaries stay small.
-BLOCK = 4096
+SPLINE_BLOCK = 4096
 #: Samples added on both sides of a block: on a uniform grid a sample's influence fades by 0.43 per step, so nothing
 #: is left of the cut after 128.
-OVERLAP = 128
+SPLINE_OVERLAP = 128
 
 
 def spline_degree(samples: int) -> int:
@@ -28,7 +28,7 @@ def spline_degree(samples: int) -> int:
 
 
 def spline_derivatives(
-    time: FloatArray, values: FloatArray, at: FloatArray, orders: Sequence[int], block: int = BLOCK
+    time: FloatArray, values: FloatArray, at: FloatArray, orders: Sequence[int], block: int = SPLINE_BLOCK
 ) -> list[FloatArray]:
     """Derivatives of the spline through `values` (with not-a-knot ends), one array (K, ...) per order.
 
@@ -47,7 +47,7 @@ def spline_derivatives(
         first = int(np.searchsorted(at, time[start])) if start else 0
         last = int(np.searchsorted(at, time[stop])) if stop < len(time) else len(at)
         if first < last:
-            near = slice(max(0, start - OVERLAP), stop + OVERLAP)
+            near = slice(max(0, start - SPLINE_OVERLAP), stop + SPLINE_OVERLAP)
             spline = make_interp_spline(time[near], flat[near], k=degree)
             for derivative, order in zip(out, orders, strict=True):
                 derivative[first:last] = spline(at[first:last], order)
@@ -131,9 +131,9 @@ class Timeline:
         reach into the neighbourhood, and the spline is drawn through the same blocks of samples.
         """
         at = self.at[first:last]
-        beyond = OVERLAP + (0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding)
+        beyond = SPLINE_OVERLAP + (0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding)
         grid = _around(self.grid, at, beyond)
-        samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], OVERLAP)
+        samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], SPLINE_OVERLAP)
         native = self.native[samples]
         start = self.kept.start - grid.start
         return samples, replace(
@@ -185,7 +185,10 @@ def _around(stamps: FloatArray, at: FloatArray, beyond: int) -> slice:
     """Samples up to some beyond the first and last of `at`, in whole blocks of the spline."""
     first = int(np.searchsorted(stamps, at[0], side="right")) - 1 - beyond
     last = int(np.searchsorted(stamps, at[-1])) + 1 + beyond
-    return slice(max(0, first // BLOCK * BLOCK), min(len(stamps), -(-last // BLOCK) * BLOCK + OVERLAP))
+    return slice(
+        max(0, first // SPLINE_BLOCK * SPLINE_BLOCK),
+        min(len(stamps), -(-last // SPLINE_BLOCK) * SPLINE_BLOCK + SPLINE_OVERLAP),
+    )
 
 
 #: Order of the Butterworth filter, which runs forward and backward: the gain at the cutoff is 1/2.

@@ -14,7 +14,7 @@ from torchid.parameters import Array
 from torchid.problem.extras import Extra, measured_components
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import reduced_layout, reduction_matrix
-from torchid.regressor.jacobian import wrench_map
+from torchid.regressor.jacobian import wrench_transform
 from torchid.regressor.regressor import JointRow, joint_rows
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -57,7 +57,7 @@ class Columns:
         path = set(self.tree.path(body))
         return [j for j, row in enumerate(self.joint_rows) if any(moved in path for moved, _ in row.moved)]
 
-    def from_parameters(self) -> Array:
+    def parameter_map(self) -> Array:
         """Matrix M, (count, 12 L), that takes parameters to these columns: `K = K_columns @ M`."""
         nodes = self.tree.node_of
         matrix = np.zeros((self.count, len(nodes), parameters.PER_BODY))
@@ -130,7 +130,7 @@ class ContactStateLayouts:
         self.sensors = sensors
         self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
-        self.dof_std = sensors.noise.dofs(robot.n, robot.dofs)
+        self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
         self._made: dict[State, ContactStateLayout] = {}
 
     def layout(self, state: State) -> ContactStateLayout:
@@ -167,8 +167,8 @@ class ContactStateLayouts:
             bodies_below,
             range(starts[bodies_below.start], starts[bodies_below.stop]),
             tuple(self.columns.friction(body) + k for body, _, _ in moved for k in (0, 1)),
-            self._tensor(np.append(noise.base[:base_rows], self.dof_std[list(coupled)])),
-            self._tensor(noise.wrench[[k for body in bodies for _, k in body.components]]),
+            self._tensor(np.append(noise.base_std[:base_rows], self.dof_std[list(coupled)])),
+            self._tensor(noise.wrench_std[[k for body in bodies for _, k in body.components]]),
             tuple(
                 self.columns.count + number
                 for number, extra in enumerate(self.extras)
@@ -186,7 +186,7 @@ class ContactStateLayouts:
     def _contact_body(self, body: int, contacts: list[int], coupled: tuple[int, ...]) -> ContactBody:
         unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []
         for contact in contacts:
-            at_body = wrench_map(self.frames[contact][1]).T
+            at_body = wrench_transform(self.frames[contact][1]).T
             for k in self.contacts[contact].components:
                 if self._measured[contact, k]:
                     measured.append(at_body[k][None])
@@ -204,7 +204,7 @@ class ContactStateLayouts:
         return torch.tensor(values, dtype=ancestors.dtype, device=ancestors.device)
 
 
-def dof_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
+def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
     """What one unit of an unknown of a degree of freedom adds to its row, (B,)."""
     if extra.dof is None:
         raise ValueError(f"extra: found {extra.label}; accepted: one of a degree of freedom")
@@ -218,7 +218,7 @@ def dof_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
     return torch.ones_like(samples.time)
 
 
-def reading_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
+def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
     """What one unit of a contact sensor's unknown takes from its reading along a recorded axis, (B,)."""
     if extra.what == "offset":
         return samples.active[:, contact].to(samples.time) if samples.share is None else samples.share[:, contact]
@@ -251,10 +251,10 @@ def extra_columns(
     for extra in extras:
         if extra.dof is not None:
             row = W[:, tree.base_rows + layout.coupled_joints.index(extra.dof)]
-            yield row.T * dof_column(extra, samples, tree)
+            yield row.T * dof_extra_column(extra, samples, tree)
             continue
         contact, axis = extra.contact or (0, 0)
-        column, reading = W.new_zeros(W.shape[2], len(samples)), reading_column(extra, samples, contact, axis)
+        column, reading = W.new_zeros(W.shape[2], len(samples)), contact_extra_column(extra, samples, contact, axis)
         vector = range(3) if axis < 3 else range(3, 6)
         for k in vector if contact in rotations else [axis]:
             if (contact, k) in places:

@@ -17,7 +17,7 @@ from torchid.regressor.kinematics import (
     joint_motion,
     motion_from_state,
 )
-from torchid.regressor.regressor import joint_directions
+from torchid.regressor.regressor import joint_screw_axes
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
@@ -36,7 +36,7 @@ def generalized_forces(
 
     Args:
         tree: the robot's constants.
-        directions: from `joint_directions`, (6, L, B).
+        directions: from `joint_screw_axes`, (6, L, B).
         body: which body.
         wrenches: at the base origin, (6, k, B).
         joints: independent joints to give columns for, after the base's six (none for a fixed base).
@@ -50,7 +50,7 @@ def generalized_forces(
     return torch.cat([wrenches.transpose(0, 1), torque], dim=1) if tree.base_rows else torque
 
 
-def wrench_map(T: Array) -> Array:
+def wrench_transform(T: Array) -> Array:
     """Matrix (6, 6) that takes a wrench at a frame, in its axes, to the frame that `T` (4, 4) gives its pose in."""
     R, p = T[:3, :3], T[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [np.cross(np.eye(3), p) @ R, R]])
@@ -72,9 +72,9 @@ class FrameJacobian(nn.Module):
         super().__init__()
         self.tree = KinematicTree(robot)
         self._body, T_joint_frame = self.tree.frame(robot, frame)
-        unit_wrenches = wrench_map(T_joint_frame).T
+        unit_wrenches = wrench_transform(T_joint_frame).T
         self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
-        self._joints = range(robot.dofs)
+        self._joints = range(robot.n_dofs)
 
     def forward(self, q: Tensor) -> Tensor:
         """Jacobian (B, 6, nv) at coordinates `q`, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
@@ -86,5 +86,5 @@ class FrameJacobian(nn.Module):
         motion = motion_from_state(q, still, still, tree.n, not tree.base_rows, GRAVITY_WORLD)
         states = body_states(tree, motion, joint_motion(tree, motion))
         wrenches = wrenches_at_base(states, self._body, self.get_buffer("unit_wrenches"))
-        J = generalized_forces(tree, joint_directions(tree, states), self._body, wrenches, self._joints)
+        J = generalized_forces(tree, joint_screw_axes(tree, states), self._body, wrenches, self._joints)
         return J.permute(2, 0, 1)

@@ -1,4 +1,4 @@
-"""What `torchid analyze` found, as tables, text and `analysis.json`, and expected beside measured accuracy."""
+"""Results of `torchid analyze`: tables, text, `analysis.json`, and the figure of expected and measured accuracy."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from matplotlib.ticker import LogFormatter
 from rich.table import Table
 from rich.text import Text
 
-from torchid.identifiability.base_parameters import BaseParameters, relations, unseen
+from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
 from torchid.identifiability.expected_error import ExpectedErrors
 from torchid.problem import Metrics
-from torchid.problem.metrics import GROUPS, group_name
+from torchid.problem.metrics import ROW_GROUPS, group_name
 from torchid.report.figures import STYLE
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.candidates import Candidate
-from torchid.sensor_planning.check import LostBase, PostureSummary, StateCheck
+from torchid.sensor_planning.observability import BaseObservability, LostBase, PostureSummary
 from torchid.sensor_planning.planner import PartPlan, SensorPlan
 
 _WIDTH = 100
 
 
-def plan_document(plan: SensorPlan) -> dict[str, Any]:
+def sensor_plan_document(plan: SensorPlan) -> dict[str, Any]:
     """Everything the planner found, sensors by name."""
-    ask = plan.question
-    frames = [contact.frame for contact in ask.contacts]
+    problem = plan.problem
+    frames = [contact.frame for contact in problem.contacts]
     return {
-        "contact_states": [[f for f, active in zip(frames, state, strict=True) if active] for state in ask.states],
-        "criterion": ask.criterion,
-        "candidates": [{"name": c.name, "channels": c.channels, "cost": c.cost} for c in ask.candidates],
-        "keep": _names(c for c in ask.candidates if c in ask.keep),
-        "exclude": _names(c for c in ask.candidates if c in ask.exclude),
+        "contact_states": [[f for f, active in zip(frames, state, strict=True) if active] for state in problem.states],
+        "criterion": problem.criterion,
+        "candidates": [{"name": c.name, "channels": c.channels, "cost": c.cost} for c in problem.candidates],
+        "keep": _names(c for c in problem.candidates if c in problem.keep),
+        "exclude": _names(c for c in problem.candidates if c in problem.exclude),
         "sensors": _names(plan.chosen),
         "cost": plan.cost,
         "lower_bound": plan.lower_bound,
@@ -55,10 +55,10 @@ def plan_document(plan: SensorPlan) -> dict[str, Any]:
             for b in plan.branches
         ],
         "needs": [
-            {"contacts": list(n.contacts), "joints": list(n.joints), "sensors": n.needed, "proven": n.proven}
-            for n in plan.needs
+            {"contacts": list(n.contacts), "joints": list(n.joints), "sensors": n.fewest_readings, "proven": n.proven}
+            for n in plan.requirements
         ],
-        "checks": checks_document(plan.checks),
+        "checks": observability_document(plan.observability),
         "stack": {"rank": plan.stack_rank, "full": plan.stack_full},
         "without": [
             {"sensor": r.candidate.name, "base_rank": r.base_rank, "stack_rank": r.stack_rank} for r in plan.removals
@@ -66,8 +66,8 @@ def plan_document(plan: SensorPlan) -> dict[str, Any]:
     }
 
 
-def checks_document(checks: Sequence[StateCheck]) -> list[dict[str, Any]]:
-    """How a sensor set sees the base, state by state."""
+def observability_document(checks: Sequence[BaseObservability]) -> list[dict[str, Any]]:
+    """Observability of the base, state by state."""
     return [
         {
             "state": check.name,
@@ -78,36 +78,36 @@ def checks_document(checks: Sequence[StateCheck]) -> list[dict[str, Any]]:
             if check.lost is None
             else {
                 "directions": check.lost.directions.T.tolist(),
-                "words": list(check.lost.words),
+                "words": list(check.lost.descriptions),
                 "posture": check.lost.posture.tolist(),
-                "lacking": [{"contacts": list(frames), "sensors": count} for frames, count in check.lost.culprits],
-                "would_help": _names(check.lost.cures),
+                "lacking": [{"contacts": list(frames), "sensors": count} for frames, count in check.lost.unmet_groups],
+                "would_help": _names(check.lost.remedies),
             },
-            "alike_at_zero_posture": [list(names) for names in check.coincident],
+            "alike_at_zero_posture": [list(names) for names in check.dependent],
         }
         for check in checks
     ]
 
 
-def base_document(base: BaseParameters, body_names: Sequence[str]) -> dict[str, Any]:
-    """Base parameters in numbers and words."""
+def base_parameters_document(base: BaseParameters, body_names: Sequence[str]) -> dict[str, Any]:
+    """Base parameters: rank, formulas, and what is in none of them."""
     return {
         "rank": base.rank,
         "parameters": int(base.free.sum()),
         "gap": base.gap if base.rank else None,
-        "relations": relations(base, body_names),
-        "unseen": unseen(base, body_names),
+        "relations": format_base_parameters(base, body_names),
+        "unseen": unobservable_parameters(base, body_names),
     }
 
 
-def base_text(title: str, base: BaseParameters, body_names: Sequence[str]) -> str:
+def base_parameters_text(title: str, base: BaseParameters, body_names: Sequence[str]) -> str:
     """Base parameters to read, in 100 columns."""
-    seen = f"{base.rank} combinations of {int(base.free.sum())} parameters can be determined, SI units:"
-    lines = [title, "=" * len(title), "", seen, ""]
-    for relation in relations(base, body_names):
-        lines += wrap(relation, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
-    lost = unseen(base, body_names)
-    lines += ["", "In no combination, whatever the motion:", "", *(lost or ["none"])]
+    count = f"{base.rank} combinations of {int(base.free.sum())} parameters can be determined, SI units:"
+    lines = [title, "=" * len(title), "", count, ""]
+    for formula in format_base_parameters(base, body_names):
+        lines += wrap(formula, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    unobservable = unobservable_parameters(base, body_names)
+    lines += ["", "In no combination, whatever the motion:", "", *(unobservable or ["none"])]
     return "\n".join(lines) + "\n"
 
 
@@ -123,7 +123,7 @@ _MOST, _CURES, _BASE = 5, 8, 6
 _NEARLY = 1e-3  # of S_b V_x: the noise of the base's rows is a thousand times that of the sensors
 
 
-def set_text(chosen: Sequence[Candidate]) -> str:
+def join_names(chosen: Sequence[Candidate]) -> str:
     """Names of sensors, joined by commas."""
     return ", ".join(candidate.name for candidate in chosen) or "none"
 
@@ -131,14 +131,16 @@ def set_text(chosen: Sequence[Candidate]) -> str:
 def branch_table(plan: SensorPlan) -> Table:
     """Branches of the robot, which contacts constrain them, and what each group of contacts needs."""
     table = _table("Branches", "branch", "contacts beyond it", "sensors needed")
-    nothing = "" if plan.question.robot.fixed_base else "none"
+    nothing = "" if plan.problem.robot.fixed_base else "none"
     for branch in plan.branches:
-        needed = [f"{n.needed} for {' + '.join(n.contacts)}" for n in plan.needs if branch.name in n.branches]
+        needed = [
+            f"{n.fewest_readings} for {' + '.join(n.contacts)}" for n in plan.requirements if branch.name in n.branches
+        ]
         contacts = ", ".join(branch.contacts) or "free"
         table.add_row(Text(branch.name), Text(contacts), Text("; ".join(needed) or nothing))
-    for need in plan.needs:
-        if not need.branches:
-            table.add_row("(base)", Text(", ".join(need.contacts)), str(need.needed))
+    for group in plan.requirements:
+        if not group.branches:
+            table.add_row("(base)", Text(", ".join(group.contacts)), str(group.fewest_readings))
     return table
 
 
@@ -149,13 +151,13 @@ def sets_table(parts: Sequence[PartPlan]) -> Table:
         for place, (bits, chosen) in enumerate(part.ranked[:_MOST]):
             first = place == 0
             count = "" if not first else "not counted" if part.sets is None else str(len(part.sets))
-            table.add_row(Text(", ".join(part.frames) if first else ""), count, f"{bits:.1f}", Text(set_text(chosen)))
+            table.add_row(Text(", ".join(part.frames) if first else ""), count, f"{bits:.1f}", Text(join_names(chosen)))
         if len(part.ranked) > _MOST:
             table.add_row("", "", "", f"({len(part.ranked) - _MOST} more in analysis.json)")
     return table
 
 
-def check_table(title: str, checks: Sequence[StateCheck]) -> Table:
+def observability_table(title: str, checks: Sequence[BaseObservability]) -> Table:
     """rank(S_b V_x) and its smallest singular value over random postures, at position zero and over the logs'."""
     table = _table(f"{title}: rank(S_b V_x), its smallest singular value", "in contact")
     table.columns[0].ratio = 1
@@ -169,20 +171,22 @@ def check_table(title: str, checks: Sequence[StateCheck]) -> Table:
     return table
 
 
-def check_lines(checks: Sequence[StateCheck]) -> list[str]:
-    """What is lost and what would cure it, and where a set is singular."""
+def describe_losses(checks: Sequence[BaseObservability]) -> list[str]:
+    """What of the base is lost and what would bring it back, and where a set is singular."""
     lines = []
-    by_loss: dict[tuple[object, ...], list[StateCheck]] = {}
+    by_loss: dict[tuple[object, ...], list[BaseObservability]] = {}
     for check in checks:
         if check.lost is not None:
-            by_loss.setdefault((check.lost.words, check.lost.culprits, check.lost.cures), []).append(check)
+            by_loss.setdefault((check.lost.descriptions, check.lost.unmet_groups, check.lost.remedies), []).append(
+                check
+            )
     for same in by_loss.values():
         lost, where = same[0].lost, f"{len(same)} of {len(checks)} contact states"
         if lost is not None:
-            short = " and ".join(f"{' + '.join(frames)} lacks {_count(count)}" for frames, count in lost.culprits)
+            short = " and ".join(f"{' + '.join(frames)} lacks {_count(count)}" for frames, count in lost.unmet_groups)
             lines.append(f"{short} in {where}; lost is the {_words(lost)}")
-            cures = set_text(lost.cures[:_CURES]) if lost.cures else "no single candidate"
-            lines.append(f"  any of these would help: {cures}")
+            remedies = join_names(lost.remedies[:_CURES]) if lost.remedies else "no single candidate"
+            lines.append(f"  any of these would help: {remedies}")
     near = [check for check in checks if check.lost is None and check.recorded and check.recorded.least < _NEARLY]
     if near:
         least = min(check.recorded.least for check in near if check.recorded)
@@ -192,10 +196,10 @@ def check_lines(checks: Sequence[StateCheck]) -> list[str]:
     rare = sum(check.lost is None and check.generic.low < BASE_RANK_TOLERANCE for check in checks)
     if rare:
         where = f"{rare} of {len(checks)} contact states"
-        lines.append(f"warning: in {where} the base is as good as lost at one random posture in twenty or more")
+        lines.append(f"warning: in {where} the base is nearly lost at one random posture in twenty or more")
     falling = [check for check in checks if check.lost is None and check.zero.rank < check.generic.rank]
     if falling:
-        alike = dict.fromkeys(names for check in falling for names in check.coincident)
+        alike = dict.fromkeys(names for check in falling for names in check.dependent)
         cause = "; ".join(" = ".join(names) for names in alike)
         lines.append(
             "warning: the base is lost where all joints are at zero, and all but lost near it"
@@ -205,7 +209,7 @@ def check_lines(checks: Sequence[StateCheck]) -> list[str]:
 
 
 def _words(lost: LostBase) -> str:
-    return "whole base" if len(lost.words) == _BASE else f"base's {' and '.join(lost.words)}"
+    return "whole base" if len(lost.descriptions) == _BASE else f"base's {' and '.join(lost.descriptions)}"
 
 
 def _count(sensors: int) -> str:
@@ -213,7 +217,7 @@ def _count(sensors: int) -> str:
 
 
 def removal_table(plan: SensorPlan) -> Table:
-    """What is left without one sensor, by the criterion of each sample and by the stack of all."""
+    """Ranks without one sensor, by the criterion of each sample and by the stack of all."""
     title = (
         f"Without one sensor (inertial combinations: {plan.stack_rank} with this set, "
         f"{plan.stack_full} with every candidate)"
@@ -237,7 +241,7 @@ _MODEL, _EXPECTED, _MEASURED = ("o", "tab:blue"), ("s", "0.6"), ("D", "black")
 
 @dataclass(frozen=True)
 class SetAccuracy:
-    """Of a fit with one sensor set: errors that were expected, and those measured on unseen logs, if there are any."""
+    """Of a fit with one sensor set: expected errors, and those measured on the test logs, if there are any."""
 
     channels: int
     rank: int
@@ -264,7 +268,7 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
     table.add_column("channels", justify="right")
     table.add_column("rank", justify="right")
     table.add_column("", no_wrap=True)
-    for label in GROUPS.values():
+    for label in ROW_GROUPS.values():
         table.add_column(Text(label.replace(" [", "\n[")), justify="right")
     for name, found in sets.items():
         first: list[Text | str] = [Text(name), str(found.channels), str(found.rank)]
@@ -273,7 +277,7 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
             ("with noise", found.expected.total),
             ("measured", {} if found.measured is None else found.measured.rms),
         ):
-            table.add_row(*first, label, *(_figure(errors.get(group)) for group in GROUPS))
+            table.add_row(*first, label, *(_figure(errors.get(group)) for group in ROW_GROUPS))
             first = ["", "", ""]
         table.add_section()
     return table
@@ -286,10 +290,10 @@ def _figure(x: float | None) -> str:
 @matplotlib.rc_context(STYLE)
 def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
     """One panel per group of rows, with the sensor sets side by side on a logarithmic scale."""
-    figure = Figure(figsize=(2.6 * len(GROUPS) + 0.6, 3.8), layout="constrained")
-    axes = figure.subplots(1, len(GROUPS))
+    figure = Figure(figsize=(2.6 * len(ROW_GROUPS) + 0.6, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(ROW_GROUPS))
     place = np.arange(len(sets))
-    for axis, (group, label) in zip(axes, GROUPS.items(), strict=True):
+    for axis, (group, label) in zip(axes, ROW_GROUPS.items(), strict=True):
         measured = [None if found.measured is None else found.measured.rms[group] for found in sets.values()]
         for shift, name, (marker, color), heights in (
             (-0.15, "expected model error", _MODEL, [found.expected.model[group] for found in sets.values()]),

@@ -21,12 +21,13 @@ from torchid import parameters
 from torchid.errors import during
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED
+from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import Metrics
-from torchid.problem.metrics import BASE_ROWS, SHOWN, group_name
-from torchid.report.tables import MARKS, legend_of_marks
-from torchid.text import escaped
+from torchid.problem.metrics import BASE_ROWS, ERROR_GROUPS, group_name
+from torchid.report.tables import MARKS, marks_legend
+from torchid.text import escape
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -47,7 +48,7 @@ def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
     """
     with during("drawing", path), matplotlib.rc_context(STYLE):
         for text in figure.findobj(Text):
-            text.set_text(escaped(text.get_text(), "\n"))
+            text.set_text(escape(text.get_text(), "\n"))
         figure.savefig(path, dpi=130, format=kind)
 
 
@@ -98,12 +99,12 @@ def _rows_to_show(series: ForceSeries, base_rows: int, most: int) -> list[int]:
 
 
 @matplotlib.rc_context(STYLE)
-def error_figure(sets: Mapping[str, tuple[Metrics, Metrics]]) -> Figure:
+def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
     """Relative error by group of rows, URDF against identified, one panel per set of logs."""
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
-        groups = [group for group in SHOWN if nominal.relative.get(group) is not None]
+        groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         place = np.arange(len(groups))
         for shift, metrics, color, label in (
             (-0.2, nominal, _NOMINAL, "URDF"),
@@ -175,24 +176,24 @@ _LANES = 5  # logs side by side in a row; more start again at its top
 
 
 @matplotlib.rc_context(STYLE)
-def extra_figure(found: Sequence[ExtraEstimate]) -> Figure:
-    """A panel for each unit, a row for each unknown, a point for each log with its 95 % interval.
+def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
+    """Extra parameters: a panel for each unit, a row for each, a point for each log with its 95 % interval.
 
-    Hollow points cannot be told from other unknowns.
+    Hollow points are confounded with other parameters.
     """
-    units = list(dict.fromkeys(x.extra.unit for x in found))
-    logs = list(dict.fromkeys(x.log for x in found))
-    rows = {unit: list(dict.fromkeys(x.extra.label for x in found if x.extra.unit == unit))[:_ROWS] for unit in units}
+    units = list(dict.fromkeys(x.extra.unit for x in extras))
+    logs = list(dict.fromkeys(x.log for x in extras))
+    rows = {unit: list(dict.fromkeys(x.extra.label for x in extras if x.extra.unit == unit))[:_ROWS] for unit in units}
     height = 1.2 + 0.24 * sum(map(len, rows.values())) + 0.6 * len(units)
     figure = Figure(figsize=(9.0, max(height, 2.4)), layout="constrained")
     heights = [len(rows[unit]) + 1 for unit in units]
     axes = figure.subplots(len(units), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
     colors = {log: f"C{number}" for number, log in enumerate(logs)}
     for axis, unit in zip(axes[:, 0], units, strict=True):
-        shown = [x for x in found if x.extra.unit == unit and x.extra.label in rows[unit]]
-        _draw_panel(axis, shown, rows[unit], colors)
+        in_panel = [x for x in extras if x.extra.unit == unit and x.extra.label in rows[unit]]
+        _draw_panel(axis, in_panel, rows[unit], colors)
         axis.set_xlabel(f"[{unit}]" if unit != "1" else "scale less 1 [1]")
-    axes[0, 0].set_title("95 % intervals; hollow: not told from other unknowns", loc="left", fontsize=8)
+    axes[0, 0].set_title("95 % intervals; hollow: confounded with other parameters", loc="left", fontsize=8)
     # of all panels, and never hollow: a log need not have a point in every one of them
     keys = [Line2D([], [], marker="o", linestyle="", color=color) for color in colors.values()]
     names = [Path(log).name or "all logs" for log in logs]
@@ -200,12 +201,12 @@ def extra_figure(found: Sequence[ExtraEstimate]) -> Figure:
     return figure
 
 
-def _draw_panel(axis: Axes, found: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
+def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
     """Values with their intervals, the logs of a row below each other around its middle."""
-    reach = _MOST * max(abs(x.value) for x in found) or 1.0
-    logs = [log for log in colors if any(x.log == log for x in found)]
+    reach = _MOST * max(abs(x.value) for x in extras) or 1.0
+    logs = [log for log in colors if any(x.log == log for x in extras)]
     for number, log in enumerate(logs):
-        points = [x for x in found if x.log == log]
+        points = [x for x in extras if x.log == log]
         below = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
         values, place = [x.value for x in points], [rows.index(x.extra.label) + below for x in points]
         error = [min(1.96 * x.standard_error, reach) if math.isfinite(x.standard_error) else reach for x in points]
@@ -232,7 +233,7 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
             left.text(column, row, MARKS[verdict], ha="center", va="center", fontsize=8, color=color)
     left.set_xticks(range(PER_BODY), PARAMETERS, fontsize=7)
     left.set_yticks(range(len(shown)), [body_names[int(body)] for body in shown], fontsize=7)
-    left.set_title(legend_of_marks(), loc="left", fontsize=8)
+    left.set_title(marks_legend(), loc="left", fontsize=8)
     figure.colorbar(image, ax=left, label="share of the data", pad=0.01)
     values = estimate.singular_values
     right.semilogy(np.arange(1, len(values) + 1), values, ".", color="tab:blue", markersize=4)

@@ -32,7 +32,7 @@ def parameters_document(
         robot: the robot.
         estimate: of all data.
         by_state: of the data of each contact state alone.
-        extras: unknowns beside the bodies' parameters.
+        extras: offsets, scales and actuator terms.
     """
     nominal = [{"nominal": _named(phi)} for phi in robot.nominal]
     found = _bodies(robot, {"identified": estimate.phi} | _judged(estimate))
@@ -73,7 +73,7 @@ def _bodies(robot: Robot, columns: Mapping[str, np.ndarray]) -> list[dict[str, A
 
 
 def _extra(found: ExtraEstimate) -> dict[str, Any]:
-    """An unknown beside the bodies' parameters; `log` is null for one of all logs."""
+    """An offset, scale or actuator term; `log` is null for one of all logs."""
     extra = found.extra
     return {
         "what": extra.what,
@@ -92,7 +92,7 @@ def _extra(found: ExtraEstimate) -> dict[str, Any]:
 
 
 def read_shared_extras(path: Path, column: str = "value") -> dict[str, float]:
-    """Values of the unknowns of all logs, by `Extra.label`, of a run's file.
+    """Extra parameters of all logs, by `Extra.label`, of a run's file.
 
     Args:
         path: `parameters.json`.

@@ -19,12 +19,13 @@ from rich.text import Text
 
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
+from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contribution, Contributions, PartContribution
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.metrics import SHOWN
-from torchid.text import escaped, unescaped
+from torchid.problem.metrics import ERROR_GROUPS
+from torchid.text import escape, raw_stream
 
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
 
@@ -35,17 +36,17 @@ class PlainConsole(Console):
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """The segments of what is shown, of plain text."""
         for text, style, control in super().render(renderable, options):
-            yield Segment(text, style, control) if control else Segment(escaped(text, "\n"), style)
+            yield Segment(text, style, control) if control else Segment(escape(text, "\n"), style)
 
 
-def people_console(stderr: bool = False) -> Console:
-    """A console on standard output or error; the boundary's own care of these would also undo its colors."""
-    return PlainConsole(file=unescaped(sys.stderr if stderr else sys.stdout))
+def terminal_console(stderr: bool = False) -> Console:
+    """A console on standard output or error, past the boundary's escaping, which would also undo its colors."""
+    return PlainConsole(file=raw_stream(sys.stderr if stderr else sys.stdout))
 
 
 def print_tables(*tables: Table) -> None:
     """Print to standard output, at most 100 columns wide; a file or pipe gets the full 100."""
-    console = people_console()
+    console = terminal_console()
     console.width = min(console.width, 100) if console.is_terminal else 100
     for table in tables:
         console.print(table)
@@ -59,13 +60,13 @@ def table_text(table: Table) -> str:
     return captured.get()
 
 
-def error_tables(columns: Mapping[str, tuple[Metrics, Metrics]]) -> list[Table]:
+def error_tables(columns: Mapping[str, Comparison[Metrics]]) -> list[Table]:
     """Errors of predicted forces, nominal against identified, two named sets of logs to a table."""
     named = list(columns.items())
     return [_error_table(dict(named[i : i + 2])) for i in range(0, len(named), 2)]
 
 
-def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
+def _error_table(columns: Mapping[str, Comparison[Metrics]]) -> Table:
     table = Table(
         title="Error of predicted forces: rms, and share of the rms of the measured; -: not measured",
         title_justify="left",
@@ -74,16 +75,16 @@ def _error_table(columns: Mapping[str, tuple[Metrics, Metrics]]) -> Table:
     for name in columns:
         for which in ("URDF", "identified"):
             table.add_column(Text(f"{name}\n{which}"), justify="right", overflow="fold")
-    for group, label in SHOWN.items():
-        cells = [_cell(m, group) for pair in columns.values() for m in pair]
-        table.add_row(Text(label), *cells)
+    for group, label in ERROR_GROUPS.items():
+        errors = [_error_cell(m, group) for pair in columns.values() for m in pair]
+        table.add_row(Text(label), *errors)
         if group == "base_force":
             shares = [m.base_force_of_variation for pair in columns.values() for m in pair]
             table.add_row("  of its variation", *("-" if x is None else f"({100 * x:.3g} %)" for x in shares))
     return table
 
 
-def _cell(metrics: Metrics, group: str) -> str:
+def _error_cell(metrics: Metrics, group: str) -> str:
     rms, relative = metrics.rms.get(group), metrics.relative.get(group)
     if rms is None:
         return "-"
@@ -91,7 +92,7 @@ def _cell(metrics: Metrics, group: str) -> str:
 
 
 def state_table(states: Sequence[Mapping[str, Any]]) -> Table:
-    """Contact states with sample counts, rows per sample, and what is left of the base."""
+    """Contact states with sample counts, rows per sample, and the rank of the base."""
     table = Table(title="Contact states", title_justify="left")
     for heading in ("in contact", "samples", "rows each", "rank(S_b V_x)", "at full rank", "smallest s.v."):
         table.add_column(heading, justify="left" if heading == "in contact" else "right")
@@ -120,7 +121,7 @@ def noise_table(groups: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def noise_advice(suggested: Mapping[str, Any]) -> str:
-    """What to state instead of noise that residuals contradict."""
+    """Noise to state instead of values that residuals contradict."""
 
     def text(x: float | Sequence[float]) -> str:
         return f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{one:g}" for one in x) + "]"
@@ -130,7 +131,7 @@ def noise_advice(suggested: Mapping[str, Any]) -> str:
 
 
 def _shares(state: Mapping[str, Any]) -> str:
-    """Share of the samples that see the whole base, and the least rank of the others."""
+    """Share of the samples with the base at full rank, and the least rank of the others."""
     full, ranks = state["base_full_share"], state["base_rank_shares"]
     if full is None:
         return ""
@@ -138,14 +139,14 @@ def _shares(state: Mapping[str, Any]) -> str:
     return f"{100 * full:.3g} %" + (f" (least: {lowest})" if lowest < 6 else "")
 
 
-def legend_of_marks() -> str:
-    """What the marks of verdicts stand for."""
+def marks_legend() -> str:
+    """The meaning of the marks of verdicts."""
     return ", ".join(f"{mark} {verdict}" for verdict, mark in MARKS.items() if mark)
 
 
 def verdict_table(body_names: Sequence[str], verdicts: np.ndarray) -> Table:
     """A mark for the verdict, (12 L,), on every parameter of the bodies with any that is free."""
-    table = Table(title=f"Parameters: {legend_of_marks()}", title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title=f"Parameters: {marks_legend()}", title_justify="left", box=box.SIMPLE_HEAD)
     table.add_column("body", overflow="fold")
     for name in PARAMETERS:
         table.add_column(name, justify="center")
@@ -170,13 +171,13 @@ def verdict_counts_table(by_state: Mapping[str, Estimate], together: Estimate) -
     return table
 
 
-def contribution_table(found: Contributions, most: int = 12) -> Table:
-    """What the fit would lose without each log, contact state and sensor, the first of each kind."""
+def contribution_table(contributions: Contributions, most: int = 12) -> Table:
+    """Information that each log, contact state and sensor contributes, the largest of each kind."""
     table = Table(title="What each log, contact state and sensor adds: lost without it", title_justify="left")
     for heading in ("", "samples", "rank alone", "rank lost", "combinations lost", "bits lost"):
         table.add_column(heading, justify="right" if heading else "left", overflow="fold")
     kinds: dict[str, Sequence[Contribution]] = {
-        "logs": found.logs, "contact states": found.states, "sensors": found.sensors
+        "logs": contributions.logs, "contact states": contributions.states, "sensors": contributions.sensors
     }  # fmt: skip
     for kind, each in kinds.items():
         for one in sorted(each, key=lambda x: -x.bits)[:most]:
@@ -188,8 +189,8 @@ def contribution_table(found: Contributions, most: int = 12) -> Table:
         if len(each) > most:
             table.add_row(f"and {len(each) - most} more {kind}")
         table.add_section()
-    known = found.known
-    table.add_row("everything", "", "", "", f"{known.determined:.1f}", f"{known.bits:.1f}")
+    total = contributions.total
+    table.add_row("everything", "", "", "", f"{total.determined:.1f}", f"{total.bits:.1f}")
     return table
 
 
@@ -235,22 +236,22 @@ def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
 _COLUMNS, _ROWS = 4, 30
 
 
-def extra_table(found: Sequence[ExtraEstimate]) -> Table:
-    """Values with standard errors, a row for each unknown, a column for each log; all of them are in a run's files."""
-    title = "Offsets, scales and actuators, with standard errors; ?: not told from other unknowns"
+def extra_table(extras: Sequence[ExtraEstimate]) -> Table:
+    """Extra parameters with standard errors, a row for each, a column for each log; a run's files have all of them."""
+    title = "Offsets, scales and actuators, with standard errors; ?: confounded with other parameters"
     table = Table(title=title, title_justify="left")
-    logs = sorted(dict.fromkeys(x.log for x in found), key=bool)  # what holds for all logs comes first
-    labels = list(dict.fromkeys(x.extra.label for x in found))
-    by_place = {(x.extra.label, x.log): x for x in found}
+    logs = sorted(dict.fromkeys(x.log for x in extras), key=bool)  # what holds for all logs comes first
+    labels = list(dict.fromkeys(x.extra.label for x in extras))
+    by_place = {(x.extra.label, x.log): x for x in extras}
     table.add_column("", overflow="fold")
     table.add_column("unit", no_wrap=True)
     shown = logs[:_COLUMNS]
     for log in shown:
         table.add_column(Text(Path(log).name or "all logs"), justify="right", overflow="fold")
     for label in labels[:_ROWS]:
-        unit = next(x.extra.unit for x in found if x.extra.label == label)
-        cells = (by_place.get((label, log)) for log in shown)
-        table.add_row(Text(label), unit, *("" if x is None else _extra_cell(x) for x in cells))
+        unit = next(x.extra.unit for x in extras if x.extra.label == label)
+        of_logs = (by_place.get((label, log)) for log in shown)
+        table.add_row(Text(label), unit, *("" if x is None else _extra_cell(x) for x in of_logs))
     hidden = {"row": len(labels) - _ROWS, "log": len(logs) - _COLUMNS}
     rest = " and ".join(f"{count} {what}{'s' * (count > 1)}" for what, count in hidden.items() if count > 0)
     if rest:
@@ -269,7 +270,7 @@ def _extra_cell(found: ExtraEstimate) -> str:
 
 def progress_bars() -> Progress:
     """Bars that vanish when their work is done and stay silent where standard error is not a terminal."""
-    console = people_console(stderr=True)
+    console = terminal_console(stderr=True)
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:<28}"),

@@ -12,18 +12,18 @@ from matplotlib.image import imread
 from torch.utils.tensorboard import SummaryWriter
 
 from torchid.estimators import BoundEstimate, Epoch, Estimate
-from torchid.identifiability.information import Knowledge
+from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
-from torchid.problem.metrics import SETS, SHOWN
+from torchid.problem.metrics import ERROR_GROUPS, SETS
 
 _CHARTED = (*SETS, "left_out")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
 
 
 class RunEvents:
-    """Event files of one run: charts by step, train and unseen logs on one chart, figures and settings.
+    """Event files of one run: charts by step, train and test logs on one chart, figures and settings.
 
-    Steps of a descent are its epochs; a fit in one go has step 0, the URDF's parameters, and step 1, the identified.
+    Steps of a descent are its epochs; a batch fit has step 0, the URDF's parameters, and step 1, the identified.
     """
 
     def __init__(self, folder: Path, bodies: Sequence[str], descent: bool, since: int | None = None) -> None:
@@ -33,10 +33,12 @@ class RunEvents:
             folder: where it goes.
             bodies: names of the bodies.
             descent: whether steps are epochs.
-            since: step from which on what earlier event files in the folder say is void.
+            since: step from which on the contents of earlier event files in the folder are void.
         """
         self._writer = SummaryWriter(str(folder), purge_step=since)
-        groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in _CHARTED]] for group in SHOWN}
+        groups = {
+            group: ["Multiline", [f"relative_error_{name}/{group}" for name in _CHARTED]] for group in ERROR_GROUPS
+        }
         loss = {
             "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
             "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
@@ -55,7 +57,7 @@ class RunEvents:
         """Write what is still held in memory."""
         self._writer.flush()
 
-    def errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(SHOWN)) -> None:
+    def errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(ERROR_GROUPS)) -> None:
         """Errors by group of rows of one parameter vector on sets of logs."""
         for name, metrics in sets.items():
             for group in groups:
@@ -65,7 +67,7 @@ class RunEvents:
                     self._writer.add_scalar(f"rms_error_{name}/{group}", metrics.rms[group], step)
 
     def verdict(self, step: int, text: str) -> None:
-        """How the identified parameters predict what the fit has not seen, beside the URDF's."""
+        """Whether the identified parameters predict held-out blocks and test logs better than the URDF's."""
         self._writer.add_text("verdict", text, step)
 
     def eigenvalues(self, step: int, least: Mapping[str, float]) -> None:
@@ -74,7 +76,7 @@ class RunEvents:
             self._writer.add_scalar(f"eigenvalue/{body}", value, step)
 
     def epoch(self, epoch: Epoch) -> None:
-        """What an epoch of a descent says of itself."""
+        """Losses and rates of an epoch of a descent."""
         scalars = {f"loss/{name}": value for name, value in epoch.losses.items()}
         if epoch.held_out is not None:
             scalars["loss_held_out/data"] = epoch.held_out
@@ -88,7 +90,7 @@ class RunEvents:
             self._writer.add_scalar(tag, value, epoch.number)
 
     def solution(self, estimate: Estimate, samples_per_second: float) -> None:
-        """What a fit in one go says of itself, in the charts of a descent.
+        """Losses of a batch fit, in the charts of a descent.
 
         Args:
             estimate: the fit.
@@ -112,17 +114,17 @@ class RunEvents:
         for name, value in scalars.items():
             self._writer.add_scalar(f"fit/{name}", value, step)
 
-    def identifiability(self, step: int, estimate: Estimate, known: Knowledge, table: str) -> None:
-        """What the data tell of the parameters; of the singular values' chart, steps are their places.
+    def identifiability(self, step: int, estimate: Estimate, gain: InformationGain, table: str) -> None:
+        """What the data determine; in the chart of singular values, steps are their places.
 
         Args:
             step: of all other charts.
             estimate: the fit.
-            known: by all data.
+            gain: information gained from all data.
             table: of the verdicts by contact state.
         """
         scalars = {f"verdicts/{verdict}": float(count) for verdict, count in estimate.verdict_counts().items()}
-        scalars |= {"identifiability/bits": known.bits, "identifiability/combinations": known.determined}
+        scalars |= {"identifiability/bits": gain.bits, "identifiability/combinations": gain.determined}
         for tag, value in scalars.items():
             self._writer.add_scalar(tag, value, step)
         self._writer.add_text("verdicts", _preformatted(table), step)

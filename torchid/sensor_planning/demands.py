@@ -1,4 +1,4 @@
-"""What the contacts demand of the sensors for the base to survive the projection.
+"""What contacts demand of the sensors for the base to survive the projection.
 
 In a contact state, let J = [J_b | J_1 ... J_n] be the rows of the contact Jacobian, one per component that an active
 contact can exert. V_x spans the generalized velocities that move no unmeasured joint and no unmeasured component, so
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchid.identifiability.structure import at_rest, random_postures
+from torchid.identifiability.structure import random_postures, resting_samples
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.contact_state import State
@@ -30,6 +30,12 @@ from torchid.robot import Robot
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact
 from torchid.sensor_planning.candidates import Candidate, sensor_set
+
+TOLERANCE = 1e-6
+"""A share of unit vectors below this counts as zero, as in the rank of S_b V_x that this predicts.
+
+Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as independent in both.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,30 +64,32 @@ class Demand:
 
     def missing(self, chosen: Iterable[Candidate]) -> int:
         """Dimensions of the target that some candidates leave unreached; 0 if they meet the demand."""
-        return int(self.unreached(orthonormal(self.stacked(chosen))))
+        return int(self.unreached(orthonormal_basis(self.stacked(chosen))))
 
     def unreached(self, basis: Array) -> Array:
         """Dimensions of the target outside the span of orthonormal (or zero) columns (..., k, r), int (...)."""
-        return np.asarray((np.linalg.svd(outside(self.target, basis), compute_uv=False) > BASE_RANK_TOLERANCE).sum(-1))
+        return np.asarray(
+            (np.linalg.svd(orthogonal_part(self.target, basis), compute_uv=False) > BASE_RANK_TOLERANCE).sum(-1)
+        )
 
     def gains(self, basis: Array) -> dict[Candidate, int]:
         """Dimensions that each candidate adds to a span (k, r)."""
-        values = ((c, np.linalg.svd(outside(x, basis), compute_uv=False)) for c, x in self.vectors.items())
+        values = ((c, np.linalg.svd(orthogonal_part(x, basis), compute_uv=False)) for c, x in self.vectors.items())
         return {candidate: int((s > BASE_RANK_TOLERANCE).sum()) for candidate, s in values}
 
 
-def orthonormal(vectors: Array) -> Array:
+def orthonormal_basis(vectors: Array) -> Array:
     """Orthonormal basis of the span of unit columns, (..., k, w) to (..., k, min(k, w)), padded with zero columns."""
     U, values, _ = np.linalg.svd(vectors, full_matrices=False)
     return U * (values > BASE_RANK_TOLERANCE * values[..., :1])[..., None, :]
 
 
-def outside(vectors: Array, basis: Array) -> Array:
-    """What of some vectors, (k, w), is orthogonal to a span (..., k, r): (..., k, w)."""
+def orthogonal_part(vectors: Array, basis: Array) -> Array:
+    """The part of vectors (k, w) that is orthogonal to a span (..., k, r): (..., k, w)."""
     return vectors - basis @ (np.swapaxes(basis, -1, -2) @ vectors)
 
 
-def spanning(vectors: Array) -> Array:
+def span_basis(vectors: Array) -> Array:
     """Orthonormal basis (k, r) of the span of parts of unit vectors (k, w); small ones are none."""
     U, values, _ = np.linalg.svd(vectors, full_matrices=False)
     return U[:, values > BASE_RANK_TOLERANCE]
@@ -102,7 +110,7 @@ def demands(
         contacts: all contacts.
         states: which of them touch the ground together.
         candidates: sensors to choose from.
-        seed: of the random posture that stands for almost all.
+        seed: of the random posture, which represents almost all.
         joint_position: (n,) instead of that [rad or m].
     """
     if robot.fixed_base:
@@ -111,7 +119,7 @@ def demands(
         joint_position = random_postures(robot, 1, np.random.default_rng(seed))[0]
     builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, ()))
     linking = {*range(robot.n), *(dof for candidate in candidates for dof in candidate.dofs)}
-    J = builder.contact_jacobian(at_rest(joint_position[None], (False,) * len(contacts)))[0].numpy()
+    J = builder.contact_jacobian(resting_samples(joint_position[None], (False,) * len(contacts)))[0].numpy()
     above = [linking.intersection(builder.columns.joints_above(body)) for body, _ in builder.frames]
     groups = dict.fromkeys(group for state in states for group in _groups(above, state))
     joints = {group: sorted(set().union(*(above[place] for place in group)) & set(range(robot.n))) for group in groups}
@@ -121,10 +129,10 @@ def demands(
 def _groups(above: Sequence[AbstractSet[int]], state: State) -> list[tuple[int, ...]]:
     """Active contacts, grouped by shared joints among those `above` each."""
     active = [place for place, touching in enumerate(state) if touching]
-    return [tuple(active[k] for k in group) for group in connected([above[place] for place in active])]
+    return [tuple(active[k] for k in group) for group in connected_groups([above[place] for place in active])]
 
 
-def connected(sets: Sequence[AbstractSet[Hashable]]) -> list[tuple[int, ...]]:
+def connected_groups(sets: Sequence[AbstractSet[Hashable]]) -> list[tuple[int, ...]]:
     """Places of sets that are linked by common members, ascending; an empty set is alone."""
     groups: list[tuple[list[int], set[Hashable]]] = []
     for place, members in enumerate(sets):
@@ -157,4 +165,4 @@ def _demand(
             read = [rows.index((candidate.contact, k)) for k in candidate.components]
             vectors[candidate] = np.eye(len(rows))[:, read]
     frames = tuple(contacts[place].frame for place in group)
-    return Demand(group, frames, joints, tuple(place for place, _ in rows), spanning(J_group[:, :6]), vectors)
+    return Demand(group, frames, joints, tuple(place for place, _ in rows), span_basis(J_group[:, :6]), vectors)

@@ -1,4 +1,4 @@
-"""Which sensors a scenario needs: limbs, demands, search and ranking put together."""
+"""Plan the sensors of a scenario: the cheapest set with which the base is observable, the most informative of those."""
 
 from __future__ import annotations
 
@@ -13,87 +13,24 @@ from torchid.errors import SensorError
 from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import spread_by_state
+from torchid.problem.chunks import subsample_states
 from torchid.problem.contact_state import State
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.projection import base_rank
 from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set, total_cost
-from torchid.sensor_planning.check import StateCheck, base_values, check_set
 from torchid.sensor_planning.demands import demands
-from torchid.sensor_planning.ranking import MotionStack, SetRanking, best_first, exchanged, sparse_set
-from torchid.sensor_planning.search import CheapestSet, Component, all_minimal_sets, cheapest_set, components
-
-
-@dataclass(frozen=True)
-class Branch:
-    """A chain of joints between the base, a body where limbs part, and a tip.
-
-    `joints`: its independent joints, from the base outward. `contacts`: frames beyond it that some state uses.
-    """
-
-    joints: tuple[str, ...]
-    contacts: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """First and last joint."""
-        return self.joints[0] if len(self.joints) == 1 else f"{self.joints[0]} ... {self.joints[-1]}"
-
-    @property
-    def constrained(self) -> bool:
-        """Whether a contact lies beyond it; sensors in other branches say nothing about the base."""
-        return bool(self.contacts)
-
-
-@dataclass(frozen=True)
-class Need:
-    """A group of contacts that share joints, and what it takes to know the base while they touch.
-
-    `joints`: between the base and the contacts. `branches`: names of the branches these belong to. `needed`: the fewest
-    readings (joint torques, contact components) that meet this group's demand alone, a lower bound if not `proven`.
-    """
-
-    contacts: tuple[str, ...]
-    joints: tuple[str, ...]
-    branches: tuple[str, ...]
-    needed: int
-    proven: bool
-
-
-def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State]) -> tuple[Branch, ...]:
-    """All branches with joints of their own, depth first; a finger that only mimics has none."""
-    used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
-    tree = KinematicTree(robot)
-    above = {frame: {tree.body_of[node] for node in tree.path(tree.frame(robot, frame)[0])} for frame in used}
-    children, found = robot.children, []
-    for first, body in enumerate(robot.bodies[1:], start=1):
-        if body.parent > 0 and len(children[body.parent]) == 1:
-            continue
-        chain = [first]
-        while len(children[chain[-1]]) == 1:
-            chain += children[chain[-1]]
-        names = [joint.name for k in chain if (joint := robot.bodies[k].joint) is not None]
-        joints = tuple(name for name in names if name in robot.joint_names)
-        if joints:
-            found.append(Branch(joints, tuple(frame for frame in used if first in above[frame])))
-    return tuple(found)
-
-
-def needs(robot: Robot, contacts: Sequence[Contact], states: Iterable[State], seed: int = 0) -> tuple[Need, ...]:
-    """What every group of contacts needs if all joint torques and contact components could be measured."""
-    states = tuple(states)
-    limbs = branches(robot, contacts, states)
-    channels = candidates(robot, contacts, per="axis")
-    found = []
-    for demand in demands(robot, contacts, states, channels, seed):
-        least = cheapest_set([demand], channels)
-        joints = tuple(robot.joint_names[j] for j in demand.joints)
-        through = tuple(limb.name for limb in limbs if not set(limb.joints).isdisjoint(joints))
-        found.append(Need(demand.frames, joints, through, round(least.lower_bound), least.proven))
-    return tuple(found)
-
+from torchid.sensor_planning.observability import BaseObservability, assess_sensors, base_values
+from torchid.sensor_planning.ranking import (
+    MotionStack,
+    RankedSet,
+    SetRanking,
+    improve_by_exchange,
+    irredundant_set,
+    rank_sets,
+)
+from torchid.sensor_planning.search import CheapestSet, DemandGroup, all_minimal_sets, cheapest_set, demand_groups
 
 CRITERIA = ("per_sample", "stack")
 StepCallback = Callable[[str, int, int], None]
@@ -105,8 +42,8 @@ _TRIED = 4  # random postures: the rank is that of almost every one
 
 
 @dataclass(frozen=True)
-class Question:
-    """What is asked of the planner.
+class PlanningProblem:
+    """A scenario whose sensors are to be planned.
 
     Attributes:
         robot, contacts, states: the scenario.
@@ -148,12 +85,12 @@ class PartPlan:
     frames: tuple[str, ...]
     candidates: tuple[Candidate, ...]
     sets: tuple[tuple[Candidate, ...], ...] | None
-    ranked: tuple[tuple[float, tuple[Candidate, ...]], ...]
+    ranked: tuple[RankedSet, ...]
 
 
 @dataclass(frozen=True)
 class Removal:
-    """What is left without one sensor: least rank(S_b V_x) over the states, and the rank of the stack of samples."""
+    """Without one sensor: least rank(S_b V_x) over the states, and the rank of the stack of samples."""
 
     candidate: Candidate
     base_rank: int | None
@@ -161,126 +98,214 @@ class Removal:
 
 
 @dataclass(frozen=True)
-class SensorPlan:
-    """Answer of the planner.
+class Branch:
+    """A chain of joints between the base, a body where limbs part, and a tip.
 
-    Attributes:
-        question: what was asked.
-        chosen: the recommended set. Its `cost` is the least possible if `proven`; `lower_bound`: no set costs less.
-        parts: what can be planned on its own. The minimal sets of the robot are the unions of one set of each part.
-        branches: chains of joints, and which of them contacts constrain; `needs`: of every group of contacts.
-        checks: what the recommended set sees, state by state.
-        stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
-        removals: what is left without each of its sensors.
+    `joints`: its independent joints, from the base outward. `contacts`: frames beyond it that some state uses.
     """
 
-    question: Question
+    joints: tuple[str, ...]
+    contacts: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """First and last joint."""
+        return self.joints[0] if len(self.joints) == 1 else f"{self.joints[0]} ... {self.joints[-1]}"
+
+    @property
+    def constrained(self) -> bool:
+        """Whether a contact lies beyond it; sensors in other branches do not help to observe the base."""
+        return bool(self.contacts)
+
+
+@dataclass(frozen=True)
+class ContactRequirement:
+    """A group of contacts that share joints, and what it takes for the base to survive the projection.
+
+    `joints`: between the base and the contacts. `branches`: names of the branches these belong to. `fewest_readings`:
+    the fewest joint torques and contact components that meet this group's demand alone, a lower bound if not `proven`.
+    """
+
+    contacts: tuple[str, ...]
+    joints: tuple[str, ...]
+    branches: tuple[str, ...]
+    fewest_readings: int
+    proven: bool
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """The recommended sensors of a scenario, and why.
+
+    Attributes:
+        problem: that it solves.
+        chosen: the recommended set. Its `cost` is the least possible if `proven`; `lower_bound`: no set costs less.
+        parts: what can be planned on its own. The minimal sets of the robot are the unions of one set of each part.
+        branches: chains of joints, and which of them contacts constrain; `requirements`: of every group of contacts.
+        observability: of the base with the recommended set, state by state.
+        stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
+        removals: ranks without each of its sensors.
+    """
+
+    problem: PlanningProblem
     chosen: tuple[Candidate, ...]
     cost: float
     lower_bound: float
     proven: bool
     parts: tuple[PartPlan, ...]
     branches: tuple[Branch, ...]
-    needs: tuple[Need, ...]
-    checks: tuple[StateCheck, ...]
+    requirements: tuple[ContactRequirement, ...]
+    observability: tuple[BaseObservability, ...]
     stack_rank: int
     stack_full: int
     removals: tuple[Removal, ...]
 
 
-def plan_sensors(question: Question, progress: StepCallback | None = None) -> SensorPlan:
+def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorPlan:
     """The smallest sensor set for a scenario, the most informative of those.
 
     Raises:
         SensorError: no set of the candidates will do, or a criterion that does not fit the robot.
     """
-    ask, tell = question, progress or (lambda *_: None)
-    if ask.criterion not in CRITERIA:
-        raise SensorError("sensors", "criterion", f"'{ask.criterion}'", ", ".join(CRITERIA))
-    if ask.criterion == "per_sample" and ask.robot.fixed_base:
+    tell = progress or (lambda *_: None)
+    if problem.criterion not in CRITERIA:
+        raise SensorError("sensors", "criterion", f"'{problem.criterion}'", ", ".join(CRITERIA))
+    if problem.criterion == "per_sample" and problem.robot.fixed_base:
         raise SensorError("sensors", "criterion", "per_sample, with a bolted base, which cannot be lost", "stack")
-    stack = ask.stack
+    stack = problem.stack
     parts: tuple[PartPlan, ...] = ()
-    if ask.criterion == "stack":
-        chosen = sparse_set(stack, ask.keep, ask.exclude, _counted(tell, "leaving sensors out", len(ask.candidates)))
-        cost, floor = total_cost(chosen), total_cost(ask.keep)
+    if problem.criterion == "stack":
+        chosen = irredundant_set(
+            stack, problem.keep, problem.exclude, _counted(tell, "leaving sensors out", len(problem.candidates))
+        )
+        cost, floor = total_cost(chosen), total_cost(problem.keep)
         least = CheapestSet(chosen, cost, floor, cost <= floor)
     else:
-        wanted = demands(ask.robot, ask.contacts, ask.states, ask.candidates, ask.seed)
-        least = cheapest_set(wanted, ask.candidates, ask.keep, ask.exclude)
-        parts, chosen = _best_parts(ask, components(wanted, ask.candidates), least, tell)
-    sensors = sensor_set(ask.robot, ask.contacts, chosen)
+        wanted = demands(problem.robot, problem.contacts, problem.states, problem.candidates, problem.seed)
+        least = cheapest_set(wanted, problem.candidates, problem.keep, problem.exclude)
+        parts, chosen = _best_parts(problem, demand_groups(wanted, problem.candidates), least, tell)
+    sensors = sensor_set(problem.robot, problem.contacts, chosen)
     return SensorPlan(
-        question=ask,
+        problem=problem,
         chosen=chosen,
         cost=least.cost,
         lower_bound=least.lower_bound,
         proven=least.proven,
         parts=parts,
-        branches=branches(ask.robot, ask.contacts, ask.states),
-        needs=needs(ask.robot, ask.contacts, ask.states, ask.seed),
-        checks=tuple(check(ask, sensors)),
+        branches=branches(problem.robot, problem.contacts, problem.states),
+        requirements=contact_requirements(problem.robot, problem.contacts, problem.states, problem.seed),
+        observability=tuple(assess_set(problem, sensors)),
         stack_rank=stack.rank(chosen),
         stack_full=stack.full,
-        removals=tuple(_removals(ask, chosen, tell)),
+        removals=tuple(_removals(problem, chosen, tell)),
     )
 
 
-def check(question: Question, sensors: SensorSet) -> list[StateCheck]:
-    """Whether a sensor set sees the base in every state of a scenario; over the postures of its logs as well."""
-    ask = question
+def assess_set(problem: PlanningProblem, sensors: SensorSet) -> list[BaseObservability]:
+    """Observability of the base with a sensor set, by contact state, over the postures of the logs as well."""
     pieces: dict[State, list[Array]] = {}
-    for samples, state, _ in spread_by_state(ask.logs, _POSTURES):
+    for samples, state, _ in subsample_states(problem.logs, _POSTURES):
         pieces.setdefault(state, []).append(samples.joint_position.numpy())
     postures = {state: np.concatenate(found) for state, found in pieces.items()}
-    return check_set(ask.robot, ask.contacts, ask.states, sensors, ask.candidates, seed=ask.seed, postures=postures)
+    return assess_sensors(
+        problem.robot,
+        problem.contacts,
+        problem.states,
+        sensors,
+        problem.candidates,
+        seed=problem.seed,
+        postures=postures,
+    )
+
+
+def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State]) -> tuple[Branch, ...]:
+    """All branches with joints of their own, depth first; a finger that only mimics has none."""
+    used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
+    tree = KinematicTree(robot)
+    above = {frame: {tree.body_of[node] for node in tree.path(tree.frame(robot, frame)[0])} for frame in used}
+    children, found = robot.children, []
+    for first, body in enumerate(robot.bodies[1:], start=1):
+        if body.parent > 0 and len(children[body.parent]) == 1:
+            continue
+        chain = [first]
+        while len(children[chain[-1]]) == 1:
+            chain += children[chain[-1]]
+        names = [joint.name for k in chain if (joint := robot.bodies[k].joint) is not None]
+        joints = tuple(name for name in names if name in robot.joint_names)
+        if joints:
+            found.append(Branch(joints, tuple(frame for frame in used if first in above[frame])))
+    return tuple(found)
+
+
+def contact_requirements(
+    robot: Robot, contacts: Sequence[Contact], states: Iterable[State], seed: int = 0
+) -> tuple[ContactRequirement, ...]:
+    """Of every group of contacts, if all joint torques and contact components could be measured."""
+    states = tuple(states)
+    limbs = branches(robot, contacts, states)
+    channels = candidates(robot, contacts, per="axis")
+    found = []
+    for demand in demands(robot, contacts, states, channels, seed):
+        least = cheapest_set([demand], channels)
+        joints = tuple(robot.joint_names[j] for j in demand.joints)
+        through = tuple(limb.name for limb in limbs if not set(limb.joints).isdisjoint(joints))
+        found.append(ContactRequirement(demand.frames, joints, through, round(least.lower_bound), least.proven))
+    return tuple(found)
 
 
 def _best_parts(
-    ask: Question, parts: Sequence[Component], least: CheapestSet, tell: StepCallback
+    problem: PlanningProblem, parts: Sequence[DemandGroup], least: CheapestSet, tell: StepCallback
 ) -> tuple[tuple[PartPlan, ...], tuple[Candidate, ...]]:
     """Every part with its minimal sets, and the union of their most informative cheapest sets.
 
     Parts are ranked in turn, with the best sets of those before and the first sets of those after.
     """
     chosen = frozenset(least.chosen)
-    logs = ask.logs or ask.stack.samples
+    logs = problem.logs or problem.stack.samples
     out = []
     for part in parts:
         frames = tuple(dict.fromkeys(frame for demand in part.demands for frame in demand.frames))
         ours = frozenset(part.candidates)
-        keep, exclude = ask.keep & ours, ask.exclude & ours
+        keep, exclude = problem.keep & ours, problem.exclude & ours
         sets = all_minimal_sets(part.demands, part.candidates, keep, exclude)
         first = tuple(c for c in part.candidates if c in chosen)
-        ranking = SetRanking(ask.robot, ask.contacts, logs, part.candidates, tuple(chosen - ours), ask.noise, ask.prior)
+        ranking = SetRanking(
+            robot=problem.robot,
+            contacts=problem.contacts,
+            logs=logs,
+            candidates=part.candidates,
+            others=tuple(chosen - ours),
+            noise=problem.noise,
+            prior=problem.prior,
+        )
         what = f"ranking sets, {', '.join(frames)}"
         if sets is None:
             tell(what, 0, 1)
-            ranked = exchanged(ranking, part, first, keep, exclude)
+            ranked = improve_by_exchange(ranking, part, first, keep, exclude)
         else:
             bound = total_cost(first) * (1.0 + _EXACT)
             cheapest = [s for s in sets if total_cost(s) <= bound]
-            ranked = best_first(ranking, cheapest, _counted(tell, what, len(cheapest)))
-        chosen = (chosen - ours) | frozenset(ranked[0][1])
+            ranked = rank_sets(ranking, cheapest, _counted(tell, what, len(cheapest)))
+        chosen = (chosen - ours) | frozenset(ranked[0].sensors)
         out.append(PartPlan(frames, part.candidates, None if sets is None else tuple(sets), tuple(ranked)))
-    return tuple(out), tuple(c for c in ask.candidates if c in chosen)
+    return tuple(out), tuple(c for c in problem.candidates if c in chosen)
 
 
-def _removals(ask: Question, chosen: Sequence[Candidate], tell: StepCallback) -> Iterable[Removal]:
+def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], tell: StepCallback) -> Iterable[Removal]:
     step = _counted(tell, "leaving sensors out", len(chosen))
     for candidate in chosen:
         fewer = [c for c in chosen if c is not candidate]
-        yield Removal(candidate, _base_rank(ask, fewer), ask.stack.rank(fewer))
+        yield Removal(candidate, _base_rank(problem, fewer), problem.stack.rank(fewer))
         step()
 
 
-def _base_rank(ask: Question, chosen: Sequence[Candidate]) -> int | None:
+def _base_rank(problem: PlanningProblem, chosen: Sequence[Candidate]) -> int | None:
     """Least rank(S_b V_x) over the states, each at almost every posture; None for a bolted base."""
-    if ask.robot.fixed_base:
+    if problem.robot.fixed_base:
         return None
-    postures = random_postures(ask.robot, _TRIED, np.random.default_rng(ask.seed))
-    builder = RowBuilder(ask.robot, ask.contacts, sensor_set(ask.robot, ask.contacts, chosen))
-    return min(int(base_rank(base_values(builder, state, postures)).max()) for state in ask.states)
+    postures = random_postures(problem.robot, _TRIED, np.random.default_rng(problem.seed))
+    builder = RowBuilder(problem.robot, problem.contacts, sensor_set(problem.robot, problem.contacts, chosen))
+    return min(int(base_rank(base_values(builder, state, postures)).max()) for state in problem.states)
 
 
 def _counted(tell: StepCallback, what: str, steps: int) -> Callable[[], None]:

@@ -1,4 +1,4 @@
-"""Information of sensor sets over all samples of a motion, many sets from one pass."""
+"""Rank and information of sensor sets over all samples of a motion, many sets from one pass."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,18 +15,23 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.errors import SensorError
-from torchid.identifiability.information import information_in, prior_directions, unit_readings
-from torchid.identifiability.rank import structural_rank
+from torchid.identifiability.base_parameters import structural_rank
+from torchid.identifiability.information import prior_directions, reading_directions, rows_information
 from torchid.identifiability.structure import structural_problem, structural_samples
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread, share_out, spread_by_state, worker_count
+from torchid.problem.chunks import one_thread, run_in_workers, subsample_states, worker_count
 from torchid.problem.contact_state import State
 from torchid.robot import Robot
-from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensor_planning.candidates import Candidate, sensor_set
-from torchid.sensor_planning.search import Component
+from torchid.sensor_planning.search import DemandGroup
+
+_ROUNDING_SHARE = 1e-9  # a share of the largest column in units of the scales, or of unit columns, that is rounding
+_SAMPLES = 96  # a contact state: bits change by less than 1 % with four times as many
+_ROUNDING = 1e-13
+_ROUNDS = 12
+_SAME_COST = 1e-9
 
 
 class MotionStack:
@@ -51,7 +57,7 @@ class MotionStack:
         self.samples = structural_samples(robot, contacts, states, seed=seed)
 
     def problem(self, sensors: SensorSet, friction: bool = True) -> LinearProblem:
-        """What a sensor set sees of the samples, as `structural_problem`."""
+        """The problem of the samples with a sensor set, as `structural_problem`."""
         return structural_problem(self.robot, self.contacts, sensors, self.states, friction, self.samples)
 
     def rank(self, chosen: Iterable[Candidate]) -> int:
@@ -65,38 +71,13 @@ class MotionStack:
         return self.rank(self.candidates)
 
 
-def _splits(robot: Robot) -> Array:
-    """Changes of all parameters, (12 L, M), that take inertia from the body before a weld and add it to that beyond."""
-    found = [np.zeros((robot.nominal.size, 0))]
-    for index, body in enumerate(robot.bodies):
-        joint = body.joint
-        if joint is None or joint.kind != "fixed" or body.massless or robot.bodies[joint.parent].massless:
-            continue
-        changes = np.zeros((*robot.nominal.shape, parameters.INERTIAL.stop))
-        changes[index, parameters.INERTIAL] = np.eye(parameters.INERTIAL.stop)
-        X = parameters.change_of_frame(joint.T_parent_joint @ joint.T_joint_link)
-        changes[joint.parent, parameters.INERTIAL] = -X
-        found.append(changes.reshape(robot.nominal.size, -1))
-    return np.hstack(found)
-
-
-def _rank_of(changes: Array, problem: LinearProblem) -> int:
-    """Rank of what a problem's rows see of some changes of its parameters, (P, M), each of the size of one of them."""
-    least = KINEMATIC_TOLERANCE * np.linalg.norm(problem.A * problem.scale, axis=0).max(initial=0.0)
-    sizes = (np.abs(changes) / problem.scale[:, None]).max(axis=0, initial=0.0)
-    columns = problem.A @ (changes / np.maximum(sizes, np.finfo(float).tiny))
-    norms = np.linalg.norm(columns, axis=0)
-    seen = columns[:, norms > least] / norms[norms > least]
-    return int(np.linalg.matrix_rank(seen, tol=KINEMATIC_TOLERANCE)) if seen.size else 0
-
-
-def sparse_set(
+def irredundant_set(
     stack: MotionStack,
     keep: Iterable[Candidate] = (),
     exclude: Iterable[Candidate] = (),
     done: Callable[[], None] | None = None,
 ) -> tuple[Candidate, ...]:
-    """Sensors with which the stack still has the rank of all candidates, and none of which can be spared for it.
+    """Sensors with which the stack still has the rank of all candidates, and none of which is redundant for it.
 
     The dearest are dropped first; a cheaper set of another kind may exist.
 
@@ -117,18 +98,11 @@ def sparse_set(
     return tuple(chosen)
 
 
-_SAMPLES = 96  # a contact state: bits change by less than 1 % with four times as many
-_ROUNDING = 1e-13
+class RankedSet(NamedTuple):
+    """A sensor set with its information [bits]."""
 
-
-@dataclass(frozen=True)
-class _StateRows:
-    """Of B samples with all sensors: rows that hang on each candidate, Q (B, c, n_rows) and Q R (B, c, P)."""
-
-    weight: float
-    owners: list[int]
-    Q: Tensor
-    QR: Tensor
+    bits: float
+    sensors: tuple[Candidate, ...]
 
 
 class SetRanking:
@@ -167,14 +141,14 @@ class SetRanking:
         directions = torch.from_numpy(prior_directions(builder, prior))
         self._states: list[_StateRows] = []
         self._information = torch.eye(directions.shape[1], dtype=torch.float64)
-        for samples, state, stands_for in spread_by_state(logs, _SAMPLES):
-            weight = stands_for / samples.oversampling
+        for samples, state, represented in subsample_states(logs, _SAMPLES):
+            weight = represented / samples.oversampling
             rows, W = builder.rows_by_sample(samples, state)
             R = rows[..., :-1] @ directions
-            self._information += information_in(R, weight)
+            self._information += rows_information(R, weight)
             owners, ways = self._ways(builder, samples, state)
             if owners:
-                Q = unit_readings(ways, W)
+                Q = reading_directions(ways, W)
                 self._states.append(_StateRows(weight, owners, Q, Q @ R))
 
     def _ways(self, builder: RowBuilder, samples: Samples, state: State) -> tuple[list[int], Tensor]:
@@ -205,14 +179,14 @@ class SetRanking:
                 gram = Q @ Q.mT
                 gram.diagonal(dim1=1, dim2=2).add_(_ROUNDING)  # channels that read alike, or nothing
                 lost = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows.QR[:, gone], upper=False)
-                information = information - information_in(lost, rows.weight)
+                information = information - rows_information(lost, rows.weight)
         return float(0.5 * torch.linalg.slogdet(information).logabsdet / np.log(2.0))
 
 
-def best_first(
+def rank_sets(
     ranking: SetRanking, sets: Sequence[tuple[Candidate, ...]], done: Callable[[], None] | None = None
-) -> list[tuple[float, tuple[Candidate, ...]]]:
-    """Sets with their bits, most informative first; `done` is told of each, from several threads."""
+) -> list[RankedSet]:
+    """Sets with their bits, most informative first; `done` is called after each, from several threads."""
 
     def run(places: Iterator[int]) -> list[tuple[float, int]]:
         found = []
@@ -223,22 +197,18 @@ def best_first(
         return found
 
     workers = min(worker_count(torch.device("cpu")), max(len(sets), 1))
-    found = sorted(chain.from_iterable(share_out(range(len(sets)), run, workers)))
-    return [(-bits, sets[place]) for bits, place in found]
+    found = sorted(chain.from_iterable(run_in_workers(range(len(sets)), run, workers)))
+    return [RankedSet(-bits, sets[place]) for bits, place in found]
 
 
-_ROUNDS = 12
-_SAME_COST = 1e-9
-
-
-def exchanged(
+def improve_by_exchange(
     ranking: SetRanking,
-    part: Component,
+    part: DemandGroup,
     first: Sequence[Candidate],
     keep: AbstractSet[Candidate],
     exclude: AbstractSet[Candidate],
-) -> list[tuple[float, tuple[Candidate, ...]]]:
-    """Sets found from a sufficient one by exchanging one sensor at a time, uphill in information, best first.
+) -> list[RankedSet]:
+    """Sets reached from a sufficient one by exchanging one sensor at a time, uphill in information, best first.
 
     Args:
         ranking: of the part's candidates.
@@ -247,12 +217,12 @@ def exchanged(
         keep: sensors that stay.
         exclude: sensors that cannot be taken.
     """
-    best = (ranking.bits(first), tuple(first))
+    best = RankedSet(ranking.bits(first), tuple(first))
     climbed = [best]
     for _ in range(_ROUNDS):
-        neighbours = [(ranking.bits(found), found) for found in _neighbours(part, best[1], keep, exclude)]
-        higher = max(neighbours, key=lambda pair: pair[0], default=best)
-        if higher[0] <= best[0]:
+        neighbours = [RankedSet(ranking.bits(found), found) for found in _neighbours(part, best.sensors, keep, exclude)]
+        higher = max(neighbours, key=lambda ranked: ranked.bits, default=best)
+        if higher.bits <= best.bits:
             break
         best = higher
         climbed.append(best)
@@ -260,7 +230,7 @@ def exchanged(
 
 
 def _neighbours(
-    part: Component, chosen: Sequence[Candidate], keep: AbstractSet[Candidate], exclude: AbstractSet[Candidate]
+    part: DemandGroup, chosen: Sequence[Candidate], keep: AbstractSet[Candidate], exclude: AbstractSet[Candidate]
 ) -> Iterator[tuple[Candidate, ...]]:
     """Sufficient sets that differ by one sensor of the same cost."""
     for gone in chosen:
@@ -270,3 +240,38 @@ def _neighbours(
                 found = tuple(c for c in part.candidates if (c in chosen and c is not gone) or c is new)
                 if not any(demand.missing(found) for demand in part.demands):
                     yield found
+
+
+@dataclass(frozen=True)
+class _StateRows:
+    """Of B samples with all sensors: rows that hang on each candidate, Q (B, c, nv) and Q R (B, c, P)."""
+
+    weight: float
+    owners: list[int]
+    Q: Tensor
+    QR: Tensor
+
+
+def _splits(robot: Robot) -> Array:
+    """Changes of all parameters, (12 L, M), that take inertia from the body before a weld and add it to that beyond."""
+    found = [np.zeros((robot.nominal.size, 0))]
+    for index, body in enumerate(robot.bodies):
+        joint = body.joint
+        if joint is None or joint.kind != "fixed" or body.massless or robot.bodies[joint.parent].massless:
+            continue
+        changes = np.zeros((*robot.nominal.shape, parameters.INERTIAL.stop))
+        changes[index, parameters.INERTIAL] = np.eye(parameters.INERTIAL.stop)
+        X = parameters.change_of_frame(joint.T_parent_joint @ joint.T_joint_link)
+        changes[joint.parent, parameters.INERTIAL] = -X
+        found.append(changes.reshape(robot.nominal.size, -1))
+    return np.hstack(found)
+
+
+def _rank_of(changes: Array, problem: LinearProblem) -> int:
+    """Rank of the effect on a problem's rows of changes of its parameters, (P, M), each scaled to the size of one."""
+    least = _ROUNDING_SHARE * np.linalg.norm(problem.A * problem.scale, axis=0).max(initial=0.0)
+    sizes = (np.abs(changes) / problem.scale[:, None]).max(axis=0, initial=0.0)
+    columns = problem.A @ (changes / np.maximum(sizes, np.finfo(float).tiny))
+    norms = np.linalg.norm(columns, axis=0)
+    visible = columns[:, norms > least] / norms[norms > least]
+    return int(np.linalg.matrix_rank(visible, tol=_ROUNDING_SHARE)) if visible.size else 0

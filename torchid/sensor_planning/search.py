@@ -1,4 +1,4 @@
-"""The cheapest sensor set, with a proof that no cheaper one exists, and all sets without a sensor to spare."""
+"""The cheapest sensor set, with a proof that no cheaper one exists, and all minimal sets."""
 
 from __future__ import annotations
 
@@ -15,112 +15,62 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from torchid.errors import SensorError
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
-from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.candidates import Candidate, total_cost
-from torchid.sensor_planning.demands import Demand, connected, orthonormal, outside, spanning
+from torchid.sensor_planning.demands import (
+    TOLERANCE,
+    Demand,
+    connected_groups,
+    orthogonal_part,
+    orthonormal_basis,
+    span_basis,
+)
 
 _DEVICES, _COMBINATIONS, _BATCH = 5, 100_000, 4096
-
-
-@dataclass(frozen=True)
-class LeastCost:
-    """No set that meets the demand costs less than `bound`; `chosen`, the best set found, costs that if it is exact."""
-
-    bound: float
-    chosen: tuple[Candidate, ...]
-
-
-def least_cost(demand: Demand, candidates: Sequence[Candidate]) -> LeastCost:
-    """The cheapest of the candidates that meet one demand, which they can; without a set if there are too many.
-
-    Sensors of several components are taken or left in all ways; the rest is a choice among single vectors.
-    """
-    ours = [c for c in candidates if c in demand.vectors]
-    devices = [c for c in ours if demand.vectors[c].shape[1] > 1]
-    single = sorted((c for c in ours if c not in devices), key=lambda c: c.cost)
-    if len(devices) > _DEVICES:
-        return LeastCost(0.0, ())
-    cost, best = np.array([c.cost for c in single]), LeastCost(math.inf, ())
-    for taken in chain.from_iterable(combinations(devices, count) for count in range(len(devices) + 1)):
-        basis = orthonormal(demand.stacked(taken))
-        target, vectors = outside(demand.target, basis), outside(demand.stacked(single), basis)
-        bound, places = _least_of_vectors(spanning(target), vectors, cost)
-        bound += total_cost(taken)
-        if bound < best.bound:
-            best = LeastCost(bound, (*taken, *(single[k] for k in places)))
-    return best
-
-
-def _least_of_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float, Sequence[int]]:
-    """Bound and places of the choice among vectors (k, N), by ascending cost (N,), that spans a target (k, d)."""
-    d, length = target.shape[1], np.linalg.norm(vectors, axis=0)
-    if d == 0:
-        return 0.0, ()
-    places = np.flatnonzero(length > BASE_RANK_TOLERANCE)
-    vectors, cost = vectors[:, places] / length[places], cost[places]
-    rest = outside(vectors, target)
-    length = np.linalg.norm(rest, axis=0)
-    inside = length <= BASE_RANK_TOLERANCE
-    rest = (spanning(rest).T @ rest) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
-    best, chosen, budget = math.inf, np.zeros(0, dtype=int), _COMBINATIONS
-    for g in range(len(rest) + 1):
-        floor = float(cost[: d + g].sum()) if d + g <= len(cost) else math.inf
-        budget -= math.comb(int((~inside).sum()), g) if g < len(rest) else 1
-        if floor >= best or budget < 0:
-            return min(best, floor), places[chosen].tolist()
-        for flat in _flats(rest, inside, g, d + g):
-            basis = _cheapest_basis(vectors, flat)
-            if len(basis) == d + g and cost[basis].sum() < best:
-                best, chosen = float(cost[basis].sum()), np.array(basis)
-    return best, places[chosen].tolist()
-
-
-def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.ndarray]:
-    """Members (N,) bool of flats of dimension g that have at least so many."""
-    if g == len(rest):
-        yield np.ones(rest.shape[1], dtype=bool)
-        return
-    generators = combinations(np.flatnonzero(~inside).tolist(), g)
-    while some := list(islice(generators, _BATCH)):
-        picked = np.array(some, dtype=int).reshape(len(some), g)
-        basis = orthonormal(rest[:, picked].transpose(1, 0, 2))  # (some, dimensions, g)
-        member = (np.linalg.norm(outside(rest, basis), axis=1) <= BASE_RANK_TOLERANCE) | inside
-        yield from np.unique(member[member.sum(1) >= least], axis=0)
-
-
-def _cheapest_basis(vectors: Array, flat: np.ndarray) -> list[int]:
-    """Places of independent vectors among the members (N,) bool of a flat, the first ones first."""
-    basis, chosen = np.zeros((len(vectors), 0)), []
-    for place in np.flatnonzero(flat).tolist():
-        left = outside(vectors[:, [place]], basis)
-        length = np.linalg.norm(left)
-        if length > BASE_RANK_TOLERANCE:
-            basis = np.hstack([basis, left / length])
-            chosen.append(place)
-    return chosen
-
-
 _MEMORY = 2**22  # numbers in one batch of the enumeration
+_EXACT = 1e-7  # relative; what a solver of integer programs rounds
 
 
 @dataclass(frozen=True)
-class Component:
-    """Demands that compete for the same candidates: a part of the problem that can be solved on its own."""
+class CheapestSet:
+    """A sufficient set, by the order of the candidates; `proven` if its cost is `lower_bound`, the least possible."""
 
-    demands: tuple[Demand, ...]
-    candidates: tuple[Candidate, ...]
+    chosen: tuple[Candidate, ...]
+    cost: float
+    lower_bound: float
+    proven: bool
 
 
-def components(demands: Sequence[Demand], candidates: Sequence[Candidate]) -> list[Component]:
-    """Independent parts. A candidate in none of them is never needed."""
-    acting = [demand.vectors.keys() & set(candidates) for demand in demands]
-    return [
-        Component(
-            tuple(demands[place] for place in places),
-            tuple(c for c in candidates if any(c in acting[place] for place in places)),
-        )
-        for places in connected(acting)
-    ]
+@one_thread()
+def cheapest_set(
+    demands: Sequence[Demand],
+    candidates: Sequence[Candidate],
+    keep: Iterable[Candidate] = (),
+    exclude: Iterable[Candidate] = (),
+    seconds: float = 60.0,
+) -> CheapestSet:
+    """The cheapest set of candidates that meets every demand.
+
+    Args:
+        demands: from `torchid.sensor_planning.demands.demands`.
+        candidates: to choose from.
+        keep: in the set, needed or not.
+        exclude: not in the set.
+        seconds: after these, the best set found is returned with the bound reached, unproven.
+
+    Raises:
+        SensorError: as `usable_candidates`.
+    """
+    kept, usable = usable_candidates(demands, candidates, keep, exclude)
+    deadline = time.monotonic() + seconds
+    solved = [_cheapest_part(part, kept, deadline) for part in demand_groups(demands, usable)]
+    chosen = kept.union(*(result.chosen for result in solved))
+    beside = total_cost(kept.difference(*(result.chosen for result in solved)))
+    return CheapestSet(
+        tuple(c for c in candidates if c in chosen),
+        total_cost(chosen),
+        beside + sum(result.lower_bound for result in solved),
+        all(result.proven for result in solved),
+    )
 
 
 @one_thread()
@@ -133,7 +83,7 @@ def all_minimal_sets(
 ) -> list[tuple[Candidate, ...]] | None:
     """Every sufficient set that would not suffice without any one of its candidates (but the kept ones).
 
-    Meant for the demands and candidates of one `Component`: the sets of a robot are all unions of one set of each.
+    Meant for the demands and candidates of one `DemandGroup`: the sets of a robot are all unions of one set of each.
 
     Args:
         demands: to be met.
@@ -175,8 +125,8 @@ def usable_candidates(
         SensorError: they do not suffice, or one is both kept and excluded.
     """
     kept, excluded = frozenset(keep), frozenset(exclude)
-    for both in kept & excluded:
-        raise SensorError("sensors", "keep", f"'{both.name}', which is also excluded", "one or the other")
+    for contradiction in kept & excluded:
+        raise SensorError("sensors", "keep", f"'{contradiction.name}', which is also excluded", "one or the other")
     usable = tuple(c for c in candidates if c not in excluded)
     lacking = [
         f"{short} of {demand.target.shape[1]} dimensions of {' + '.join(demand.frames)}"
@@ -184,28 +134,60 @@ def usable_candidates(
         if (short := demand.missing(usable))
     ]
     if lacking:
-        found = f"all of them leave {'; '.join(lacking)} unseen"
+        found = f"all of them leave {'; '.join(lacking)} undetermined"
         raise SensorError(
             "sensors", "candidates", found, "more candidates: joints on the way there, contact components"
         )
     return kept, usable
 
 
-def _sufficient(
-    demands: Sequence[Demand], free: Sequence[Candidate], kept: AbstractSet[Candidate], member: Array
-) -> Array:
-    """Which sets meet every demand, (N,) bool, for membership (N, len(free)) of candidates beside the kept ones."""
-    result = np.ones(len(member), dtype=bool)
-    for demand in demands:
-        ours = [k for k, c in enumerate(free) if c in demand.vectors]
-        owner = np.repeat(ours, [demand.vectors[free[k]].shape[1] for k in ours]).astype(int)
-        always, vectors = demand.stacked(kept), demand.stacked(free)
-        for some in np.array_split(np.flatnonzero(result), 1 + len(member) * vectors.size // _MEMORY):
-            masked = vectors * member[some][:, None, owner]
-            fixed = np.broadcast_to(always, (len(some), *always.shape))
-            basis = orthonormal(np.concatenate([fixed, masked], axis=2))
-            result[some] = demand.unreached(basis) == 0
-    return result
+@dataclass(frozen=True)
+class DemandGroup:
+    """Demands that compete for the same candidates: a part of the problem that can be solved on its own."""
+
+    demands: tuple[Demand, ...]
+    candidates: tuple[Candidate, ...]
+
+
+def demand_groups(demands: Sequence[Demand], candidates: Sequence[Candidate]) -> list[DemandGroup]:
+    """Independent parts. A candidate in none of them is never needed."""
+    acting = [demand.vectors.keys() & set(candidates) for demand in demands]
+    return [
+        DemandGroup(
+            tuple(demands[place] for place in places),
+            tuple(c for c in candidates if any(c in acting[place] for place in places)),
+        )
+        for places in connected_groups(acting)
+    ]
+
+
+@dataclass(frozen=True)
+class CostBound:
+    """No set that meets the demand costs less than `bound`; `chosen`, the best set found, costs that if it is exact."""
+
+    bound: float
+    chosen: tuple[Candidate, ...]
+
+
+def bound_cost(demand: Demand, candidates: Sequence[Candidate]) -> CostBound:
+    """The cheapest of the candidates that meet one demand, which they can; without a set if there are too many.
+
+    Sensors of several components are taken or left in all ways; the rest is a choice among single vectors.
+    """
+    ours = [c for c in candidates if c in demand.vectors]
+    devices = [c for c in ours if demand.vectors[c].shape[1] > 1]
+    single = sorted((c for c in ours if c not in devices), key=lambda c: c.cost)
+    if len(devices) > _DEVICES:
+        return CostBound(0.0, ())
+    cost, best = np.array([c.cost for c in single]), CostBound(math.inf, ())
+    for taken in chain.from_iterable(combinations(devices, count) for count in range(len(devices) + 1)):
+        basis = orthonormal_basis(demand.stacked(taken))
+        target, vectors = orthogonal_part(demand.target, basis), orthogonal_part(demand.stacked(single), basis)
+        bound, places = _least_of_vectors(span_basis(target), vectors, cost)
+        bound += total_cost(taken)
+        if bound < best.bound:
+            best = CostBound(bound, (*taken, *(single[k] for k in places)))
+    return best
 
 
 def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: AbstractSet[Candidate]) -> Iterator[Array]:
@@ -218,7 +200,7 @@ def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: Abstra
         Rows (n + 1,): weights of the n candidates, then the right-hand side.
     """
     ours = [c for c in candidates if c in demand.vectors]
-    start = orthonormal(demand.stacked(c for c in ours if c in chosen))
+    start = orthonormal_basis(demand.stacked(c for c in ours if c in chosen))
     short = int(demand.unreached(start))
     for contact in demand.contacts:
         rows = np.array(demand.rows) == contact
@@ -226,7 +208,7 @@ def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: Abstra
         for order in (ours, ours[::-1]):
             basis = start
             for candidate in sorted(order, key=lambda c: c in there):
-                wider = orthonormal(np.hstack([basis, demand.vectors[candidate]]))
+                wider = orthonormal_basis(np.hstack([basis, demand.vectors[candidate]]))
                 if demand.unreached(wider) == short:
                     basis = wider
             gains = demand.gains(basis)
@@ -234,56 +216,10 @@ def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: Abstra
             yield np.array([*weights, short], dtype=float)
 
 
-_EXACT = 1e-7  # relative; what a solver of integer programs rounds
-
-
-@dataclass(frozen=True)
-class CheapestSet:
-    """A sufficient set, by the order of the candidates; `proven` if its cost is `lower_bound`, the least possible."""
-
-    chosen: tuple[Candidate, ...]
-    cost: float
-    lower_bound: float
-    proven: bool
-
-
-@one_thread()
-def cheapest_set(
-    demands: Sequence[Demand],
-    candidates: Sequence[Candidate],
-    keep: Iterable[Candidate] = (),
-    exclude: Iterable[Candidate] = (),
-    seconds: float = 60.0,
-) -> CheapestSet:
-    """The cheapest set of candidates that meets every demand.
-
-    Args:
-        demands: from `torchid.sensor_planning.demands.demands`.
-        candidates: to choose from.
-        keep: in the set, needed or not.
-        exclude: not in the set.
-        seconds: after these, the best set found is returned with the bound reached, unproven.
-
-    Raises:
-        SensorError: as `usable_candidates`.
-    """
-    kept, usable = usable_candidates(demands, candidates, keep, exclude)
-    deadline = time.monotonic() + seconds
-    solved = [_cheapest_part(part, kept, deadline) for part in components(demands, usable)]
-    chosen = kept.union(*(result.chosen for result in solved))
-    beside = total_cost(kept.difference(*(result.chosen for result in solved)))
-    return CheapestSet(
-        tuple(c for c in candidates if c in chosen),
-        total_cost(chosen),
-        beside + sum(result.lower_bound for result in solved),
-        all(result.proven for result in solved),
-    )
-
-
-def _cheapest_part(part: Component, kept: AbstractSet[Candidate], deadline: float) -> CheapestSet:
+def _cheapest_part(part: DemandGroup, kept: AbstractSet[Candidate], deadline: float) -> CheapestSet:
     cost = np.array([c.cost for c in part.candidates])
     must = np.array([float(c in kept) for c in part.candidates])
-    alone = [least_cost(demand, part.candidates) for demand in part.demands]
+    alone = [bound_cost(demand, part.candidates) for demand in part.demands]
     cuts = [row for demand in part.demands for row in inequalities(demand, part.candidates, frozenset())]
     cuts += [
         np.append(cost * [c in d.vectors for c in part.candidates], least.bound)
@@ -317,11 +253,77 @@ def _cheapest_part(part: Component, kept: AbstractSet[Candidate], deadline: floa
     return CheapestSet(chosen, total_cost(best), total_cost(best) if proven else bound, proven)
 
 
-def _pruned(part: Component, wanted: AbstractSet[Candidate], kept: AbstractSet[Candidate]) -> frozenset[Candidate]:
+def _pruned(part: DemandGroup, wanted: AbstractSet[Candidate], kept: AbstractSet[Candidate]) -> frozenset[Candidate]:
     """A sufficient set: all candidates, less whatever can be spared, the unwanted and the dear first."""
     chosen = frozenset(part.candidates)
     for candidate in sorted(chosen - kept, key=lambda c: (c in wanted, -c.cost, c.name)):
         fewer = chosen - {candidate}
         if not any(d.missing(fewer) for d in part.demands if candidate in d.vectors):
             chosen = fewer
+    return chosen
+
+
+def _sufficient(
+    demands: Sequence[Demand], free: Sequence[Candidate], kept: AbstractSet[Candidate], member: Array
+) -> Array:
+    """Which sets meet every demand, (N,) bool, for membership (N, len(free)) of candidates beside the kept ones."""
+    result = np.ones(len(member), dtype=bool)
+    for demand in demands:
+        ours = [k for k, c in enumerate(free) if c in demand.vectors]
+        owner = np.repeat(ours, [demand.vectors[free[k]].shape[1] for k in ours]).astype(int)
+        always, vectors = demand.stacked(kept), demand.stacked(free)
+        for some in np.array_split(np.flatnonzero(result), 1 + len(member) * vectors.size // _MEMORY):
+            masked = vectors * member[some][:, None, owner]
+            fixed = np.broadcast_to(always, (len(some), *always.shape))
+            basis = orthonormal_basis(np.concatenate([fixed, masked], axis=2))
+            result[some] = demand.unreached(basis) == 0
+    return result
+
+
+def _least_of_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float, Sequence[int]]:
+    """Bound and places of the choice among vectors (k, N), by ascending cost (N,), that spans a target (k, d)."""
+    d, length = target.shape[1], np.linalg.norm(vectors, axis=0)
+    if d == 0:
+        return 0.0, ()
+    places = np.flatnonzero(length > TOLERANCE)
+    vectors, cost = vectors[:, places] / length[places], cost[places]
+    rest = orthogonal_part(vectors, target)
+    length = np.linalg.norm(rest, axis=0)
+    inside = length <= TOLERANCE
+    rest = (span_basis(rest).T @ rest) / np.where(inside, 1.0, length)  # (dimensions modulo the target, N)
+    best, chosen, budget = math.inf, np.zeros(0, dtype=int), _COMBINATIONS
+    for g in range(len(rest) + 1):
+        floor = float(cost[: d + g].sum()) if d + g <= len(cost) else math.inf
+        budget -= math.comb(int((~inside).sum()), g) if g < len(rest) else 1
+        if floor >= best or budget < 0:
+            return min(best, floor), places[chosen].tolist()
+        for flat in _flats(rest, inside, g, d + g):
+            basis = _cheapest_basis(vectors, flat)
+            if len(basis) == d + g and cost[basis].sum() < best:
+                best, chosen = float(cost[basis].sum()), np.array(basis)
+    return best, places[chosen].tolist()
+
+
+def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.ndarray]:
+    """Members (N,) bool of flats of dimension g that have at least so many."""
+    if g == len(rest):
+        yield np.ones(rest.shape[1], dtype=bool)
+        return
+    generators = combinations(np.flatnonzero(~inside).tolist(), g)
+    while some := list(islice(generators, _BATCH)):
+        picked = np.array(some, dtype=int).reshape(len(some), g)
+        basis = orthonormal_basis(rest[:, picked].transpose(1, 0, 2))  # (some, dimensions, g)
+        member = (np.linalg.norm(orthogonal_part(rest, basis), axis=1) <= TOLERANCE) | inside
+        yield from np.unique(member[member.sum(1) >= least], axis=0)
+
+
+def _cheapest_basis(vectors: Array, flat: np.ndarray) -> list[int]:
+    """Places of independent vectors among the members (N,) bool of a flat, the first ones first."""
+    basis, chosen = np.zeros((len(vectors), 0)), []
+    for place in np.flatnonzero(flat).tolist():
+        left = orthogonal_part(vectors[:, [place]], basis)
+        length = np.linalg.norm(left)
+        if length > TOLERANCE:
+            basis = np.hstack([basis, left / length])
+            chosen.append(place)
     return chosen

@@ -23,8 +23,8 @@ from mcap.records import Channel as McapChannel
 from mcap.records import Chunk, Message, Schema
 from rosbags import rosbag1
 
-from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget, plain
-from torchid.text import shown
+from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget, require_plain_name
+from torchid.text import excerpt
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Channel:
     def __post_init__(self) -> None:
         """Refuse what no message can show."""
         for text in (self.topic, self.type, self.encoding):
-            plain(text)
+            require_plain_name(text)
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class McapFile:
             raise ValueError("no MCAP file")
         for record in _records(self._stream, True, messages, budget):
             if isinstance(record, Chunk):
-                data = expanded(record.data, record.compression, budget)
+                data = decompress_chunk(record.data, record.compression, budget)
                 if record.uncompressed_crc and zlib.crc32(data) != record.uncompressed_crc:
                     raise ValueError("a chunk that does not match its checksum")
                 yield from _records(BytesIO(data), False, messages, budget)
@@ -175,7 +175,9 @@ class _Reader(rosbag1.Reader):
         stream.seek(start)
         compression = rosbag1.reader.Header.read(stream).get_string("compression")
         stream.seek(end)
-        return chunk._replace(decompressor=functools.partial(expanded, compression=compression, budget=self.budget))
+        return chunk._replace(
+            decompressor=functools.partial(decompress_chunk, compression=compression, budget=self.budget)
+        )
 
     def read_index_data(self, pos: int, indexes: Any) -> None:
         """As before, but every part of the index once."""
@@ -267,7 +269,7 @@ class SqliteFile:
             yield Record(names[topic], received, data, i / total)
 
 
-def expanded(data: bytes, compression: str, budget: Budget) -> bytes:
+def decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
     """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
 
     Raises:
@@ -284,7 +286,7 @@ def expanded(data: bytes, compression: str, budget: Budget) -> bytes:
         with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
             out = stream.read(limit + 1)
     else:
-        raise ValueError(f"chunks compressed by '{shown(compression)}'")
+        raise ValueError(f"chunks compressed by '{excerpt(compression)}'")
     if len(out) > limit:
         raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
     budget.expand(len(out))

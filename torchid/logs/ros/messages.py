@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import FieldError, UnknownNameError, current_file, warn
-from torchid.guards import MAX_ARRAYS, check_names, plain
+from torchid.guards import MAX_ARRAYS, check_names, require_plain_name
 from torchid.logs.log import FloatArray
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Decoder(Protocol):
         """What rows (N, k) mean."""
 
 
-def deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
+def make_deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
     """What makes messages of the bytes on a channel, by the definitions of ROS itself and never those in the bag.
 
     Raises:
@@ -69,9 +69,11 @@ class _Constant:
         self._topic, self._field, self.value = topic, field, ""
 
     def check(self, value: str) -> None:
-        self.value = self.value or plain(value)
+        self.value = self.value or require_plain_name(value)
         if value != self.value:
-            raise FieldError(self._topic, f"{self._field} '{self.value}', then '{plain(value)}'", f"one {self._field}")
+            raise FieldError(
+                self._topic, f"{self._field} '{self.value}', then '{require_plain_name(value)}'", f"one {self._field}"
+            )
 
 
 class JointStates:
@@ -98,7 +100,7 @@ class JointStates:
         if names not in self._orders:
             check_names([len(names)])
             for name in names:
-                plain(name)
+                require_plain_name(name)
             self._orders[names] = self._order(names)
         order = self._orders[names]
         if order is None:
@@ -205,7 +207,7 @@ class Wrench:
         return {"wrench": rows if self._sign == 1 else -rows}
 
 
-class Flag:
+class ContactFlag:
     """`std_msgs/Bool`."""
 
     types: tuple[str, ...] = ("std_msgs/msg/Bool",)
@@ -227,7 +229,7 @@ Stamps = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
+class TopicSeries:
     """What one topic says: stamps (N,) [ns], strictly increasing, and the fields of a log (N, ...).
 
     `stamped`: whether the stamps are the messages' own, and not the times of receipt.
@@ -239,7 +241,7 @@ class Series:
     stamped: bool = True
 
 
-class Rows:
+class TopicMessages:
     """Messages of a topic as they arrive."""
 
     def __init__(self, topic: str, decoder: Decoder) -> None:
@@ -259,7 +261,7 @@ class Rows:
         if 8 * len(self._values) > MAX_ARRAYS:
             raise FieldError(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
 
-    def series(self) -> Series:
+    def series(self) -> TopicSeries:
         """All messages in the order of their stamps, each once.
 
         Raises:
@@ -292,4 +294,4 @@ class Rows:
             message = f"{current_file()}: {self.topic}: {len(again)} messages come twice; each counts once"
             warn(message)
             stamps, rows = np.delete(stamps, again), np.delete(rows, again, axis=0)
-        return Series(self.topic, stamps, self._decoder.fields(rows), stamped)
+        return TopicSeries(self.topic, stamps, self._decoder.fields(rows), stamped)

@@ -12,21 +12,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, UnknownNameError, current_file, install, warn
-from torchid.logs.containers import bag_files, translated
-from torchid.logs.log import FloatArray, is_quaternion, unit_quaternion
-from torchid.logs.quaternion import sign_continuous
+from torchid.errors import FieldError, LogError, UnknownNameError, current_file, how_to_install, warn
+from torchid.logs.containers import list_bag_files, reader_errors_explained
+from torchid.logs.log import FloatArray, is_quaternion, normalize_quaternions
+from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.ros.messages import (
+    ContactFlag,
     Decoder,
-    Flag,
     Imu,
     JointStates,
     Odometry,
-    Rows,
-    Series,
     Stamps,
+    TopicMessages,
+    TopicSeries,
     Wrench,
-    deserializer,
+    make_deserializer,
 )
 from torchid.logs.ros.topics import ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
 from torchid.logs.timeline import LONGEST_STEP, spline_derivatives
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Clock:
+class CommonClock:
     """The stamps (N,) [ns] of a log: those of one topic within the time that all topics cover."""
 
     stamps: Stamps
@@ -50,7 +50,7 @@ class Clock:
         """Other stamps (K,) [ns] in seconds of this clock."""
         return (stamps - self.stamps[0]) / 1e9
 
-    def aligned(self, series: Series) -> dict[str, FloatArray]:
+    def aligned(self, series: TopicSeries) -> dict[str, FloatArray]:
         """The fields of a topic at the log's stamps: as they are where it has these, by a quintic spline elsewhere.
 
         Quaternions are interpolated as in `preprocess`, component by component without sign flips, then normalised.
@@ -68,11 +68,11 @@ class Clock:
         run = self._unbroken(series)
         return {name: self._interpolated(series, run, name) for name in series.fields}
 
-    def held(self, series: Series, values: FloatArray) -> FloatArray:
+    def held(self, series: TopicSeries, values: FloatArray) -> FloatArray:
         """Values (K, ...) of a topic as they were last said, (N, ...)."""
         return np.asarray(values[np.searchsorted(series.stamps, self.stamps, side="right") - 1])
 
-    def _unbroken(self, series: Series) -> slice:
+    def _unbroken(self, series: TopicSeries) -> slice:
         """The samples around the log's time without a gap across which an interpolation would invent what happened."""
         steps = np.diff(series.stamps)
         long = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) if len(steps) else steps
@@ -87,10 +87,10 @@ class Clock:
         start = int(long[before - 1]) + 1 if before else 0
         return slice(start, int(long[after]) + 1 if after < len(long) else len(series.stamps))
 
-    def _interpolated(self, series: Series, run: slice, name: str) -> FloatArray:
+    def _interpolated(self, series: TopicSeries, run: slice, name: str) -> FloatArray:
         values, stamps = series.fields[name][run], self.seconds(series.stamps[run])
         if is_quaternion(name):
-            quat = sign_continuous(unit_quaternion(f"{series.topic}: {name}", values))
+            quat = make_sign_continuous(normalize_quaternions(f"{series.topic}: {name}", values))
             quat = spline_derivatives(stamps, quat, self.time, (0,))[0]
             return np.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True))
         gaps = np.isnan(values).any(axis=0)
@@ -102,7 +102,9 @@ class Clock:
         return out
 
 
-def clock_of(rate: Series, others: Mapping[str, Series], events: Mapping[str, Series]) -> Clock:
+def make_common_clock(
+    rate: TopicSeries, others: Mapping[str, TopicSeries], events: Mapping[str, TopicSeries]
+) -> CommonClock:
     """The stamps of the topic `rate` within the time that all topics cover.
 
     Args:
@@ -124,7 +126,7 @@ def clock_of(rate: Series, others: Mapping[str, Series], events: Mapping[str, Se
             f"{late.topic} starts at {late.stamps[0] / 1e9:.3f} s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
         )
         raise FieldError("time", f"no stamp of {rate.topic} that all topics cover: {found}", "one common clock")
-    return Clock(stamps)
+    return CommonClock(stamps)
 
 
 #: What bags of any kind are read with.
@@ -143,7 +145,7 @@ class _Bag:
     topics: Topics
     channels: Mapping[str, Channel]
     decoders: dict[str, Decoder] = field(default_factory=dict)
-    rows: dict[str, Rows] = field(default_factory=dict)
+    rows: dict[str, TopicMessages] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Look every topic up."""
@@ -156,7 +158,7 @@ class _Bag:
             decoder, given = _decoder(topic), self.channels[name].type
             if given not in decoder.types:
                 raise FieldError(place, f"{name} carries {given}", " or ".join(decoder.types))
-            self.decoders[role], self.rows[role] = decoder, Rows(name, decoder)
+            self.decoders[role], self.rows[role] = decoder, TopicMessages(name, decoder)
 
 
 def read_bag(
@@ -177,7 +179,7 @@ def read_bag(
         TorchidWarning: messages without stamps, messages that come twice, channels that are NaN in part, a frame that
             is not the one expected or that nothing says to expect.
     """
-    files = bag_files(path)
+    files = list_bag_files(path)
     if topics is not None:
         check_topics(path, topics)
     channels: dict[str, Channel] = {}
@@ -199,7 +201,7 @@ def read_bag(
         warn(f"{current_file()}: {', '.join(unstamped)}: {what}")
     sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
     events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
-    clock = clock_of(sampled[topics.rate_topic], sampled, events)
+    clock = make_common_clock(sampled[topics.rate_topic], sampled, events)
     return {
         "time": clock.time,
         **_motion(bag, clock, series),
@@ -222,11 +224,11 @@ def open_bag_file(path: Path) -> Iterator[BagFile]:
     except ImportError as error:
         absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
         found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
-        raise LogError(path, "file", found, install("ros")) from error
+        raise LogError(path, "file", found, how_to_install("ros")) from error
 
     readers: dict[str, Callable[[Path], BagFile]] = {".bag": Ros1File, ".mcap": McapFile, ".db3": SqliteFile}
     accepted = f"a complete {suffix} file of ROS messages"
-    with translated("file", accepted), closing(readers[suffix](path)) as file:
+    with reader_errors_explained("file", accepted), closing(readers[suffix](path)) as file:
         yield file
 
 
@@ -243,15 +245,15 @@ def _decoder(topic: object) -> Decoder:
         return Imu(topic.topic)
     if isinstance(topic, OdometryTopic):
         return Odometry(topic.topic, topic.twist)
-    return Wrench(topic.topic, topic.sign) if isinstance(topic, WrenchTopic) else Flag()
+    return Wrench(topic.topic, topic.sign) if isinstance(topic, WrenchTopic) else ContactFlag()
 
 
 def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> None:
     """Decode every message of the topics in use."""
-    users: dict[str, list[Rows]] = {}
+    users: dict[str, list[TopicMessages]] = {}
     for rows in bag.rows.values():
         users.setdefault(rows.topic, []).append(rows)
-    make = {topic: deserializer(topic, bag.channels[topic]) for topic in users}
+    make = {topic: make_deserializer(topic, bag.channels[topic]) for topic in users}
     for i, file in enumerate(files):
         with open_bag_file(file) as opened:
             for n, record in enumerate(opened.records(users.keys())):
@@ -262,7 +264,7 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
                     progress((i + record.share) / len(files))
 
 
-def _motion(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+def _motion(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Joints, base and IMU."""
     out: dict[str, NDArray[Any]] = {}
     for role in ("joint_states", "odometry", "imu"):
@@ -282,7 +284,7 @@ def _motion(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, 
     return out
 
 
-def _contacts(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+def _contacts(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Contacts in the order of `Topics.contacts`; NaN for the wrench of one without a topic."""
     names = bag.topics.contacts
     if not names:
@@ -298,7 +300,7 @@ def _contacts(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str
     return out
 
 
-def _active(bag: _Bag, clock: Clock, series: Mapping[str, Series], name: str) -> NDArray[np.bool_]:
+def _active(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
     """Whether a contact touches, (N,), as was last said or as its force was last."""
     if name in bag.topics.contact_active:
         said = series.get(f"contact_active.{name}")
@@ -315,12 +317,12 @@ def _active(bag: _Bag, clock: Clock, series: Mapping[str, Series], name: str) ->
 
 
 def _wrench(
-    bag: _Bag, clock: Clock, series: Mapping[str, Series], role: str, nothing: FloatArray | None = None
+    bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
 ) -> FloatArray:
     return clock.aligned(series[role])["wrench"] if nothing is None or role in series else nothing
 
 
-def _ft_sensors(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+def _ft_sensors(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     names = tuple(bag.topics.ft_wrenches)
     if not names:
         return {}

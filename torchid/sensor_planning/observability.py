@@ -1,0 +1,259 @@
+"""Observability of the base with a sensor set: rank(S_b V_x) per contact state, what is lost, why, and remedies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+
+from torchid.identifiability.structure import random_postures, resting_samples
+from torchid.parameters import Array
+from torchid.problem import RowBuilder
+from torchid.problem.chunks import one_thread
+from torchid.problem.contact_state import State, state_name
+from torchid.robot import Robot
+from torchid.rounding import BASE_RANK_TOLERANCE
+from torchid.sensing import Contact, SensorSet
+from torchid.sensing.projection import base_rank, base_singular_values
+from torchid.sensor_planning.candidates import Candidate, candidates, contained_candidates
+from torchid.sensor_planning.demands import Demand, demands, orthonormal_basis
+
+_ZERO = 1e-5  # of a unit vector
+_CHUNK = 1024
+_NEGLIGIBLE = 5e-3  # [m], less than what is printed
+
+
+@dataclass(frozen=True, eq=False)
+class BaseObservability:
+    """Observability of the base with a sensor set in one contact state.
+
+    Attributes:
+        state: which contacts touch; `name`: their frames joined by "+".
+        generic: over random postures; its rank is that of almost every posture.
+        zero: at position zero of every joint, where many robots' limbs are straight.
+        recorded: over postures of a log, or None.
+        lost: None if the generic rank is 6.
+        dependent: if the rank falls at position zero only, for each unmet demand the sensors that are dependent there.
+    """
+
+    state: State
+    name: str
+    generic: PostureSummary
+    zero: PostureSummary
+    recorded: PostureSummary | None
+    lost: LostBase | None
+    dependent: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PostureSummary:
+    """Smallest singular value of S_b V_x over some postures, and the best rank among them."""
+
+    rank: int
+    median: float
+    low: float
+    least: float
+
+    @classmethod
+    def of(cls, singular_values: torch.Tensor) -> PostureSummary:
+        """From singular values (B, 6); `low` is the fifth percentile."""
+        smallest = singular_values[:, -1].numpy()
+        low, median = np.quantile(smallest, (0.05, 0.5))
+        return cls(int(base_rank(singular_values).max()), float(median), float(low), float(smallest.min()))
+
+
+@dataclass(frozen=True, eq=False)
+class LostBase:
+    """The part of the base's equations of motion that a set loses.
+
+    Attributes:
+        posture: (n,) [rad or m] where that was determined.
+        directions: (6, m) orthonormal w, force then moment at the base origin in the base frame, with w^T S_b V_x = 0:
+            the equation of motion of the base along w is in none of the rows.
+        descriptions: the same space in words, see `describe_wrench`.
+        unmet_groups: frames of each group of contacts whose demand is not met, and the dimensions missing.
+        remedies: candidates each of which, added alone, leaves fewer dimensions missing.
+    """
+
+    posture: Array
+    directions: Array
+    descriptions: tuple[str, ...]
+    unmet_groups: tuple[tuple[tuple[str, ...], int], ...]
+    remedies: tuple[Candidate, ...]
+
+
+@one_thread()
+@torch.no_grad()
+def assess_sensors(
+    robot: Robot,
+    contacts: Sequence[Contact],
+    states: Iterable[State],
+    sensors: SensorSet,
+    choice: Sequence[Candidate],
+    samples: int = 64,
+    seed: int = 0,
+    postures: Mapping[State, Array] | None = None,
+) -> list[BaseObservability]:
+    """Rank of the base with a sensor set in every contact state, by the projection itself; nothing for a bolted base.
+
+    Args:
+        robot: the robot.
+        contacts: all contacts.
+        states: which of them touch together.
+        sensors: the set.
+        choice: candidates for remedies.
+        samples: number of random postures.
+        seed: of these.
+        postures: recorded joint positions (N, n) by state [rad or m].
+    """
+    if robot.fixed_base:
+        return []
+    builder, postures = RowBuilder(robot, contacts, sensors), postures or {}
+    drawn = random_postures(robot, samples, np.random.default_rng(seed))
+    channels = candidates(robot, contacts, per="axis", ft_sensors=robot.ft_names)
+    everything = tuple(dict.fromkeys((*channels, *choice)))
+    mounted = contained_candidates(contacts, sensors, channels)
+    checks = []
+    for state in states:
+        generic = demands(robot, contacts, [state], everything, seed)
+        straight = demands(robot, contacts, [state], everything, joint_position=np.zeros(robot.n))
+        cause = _Cause(generic, straight, mounted, choice)
+        checks.append(_assess_state(builder, state, drawn, postures.get(state), cause))
+    return checks
+
+
+def base_values(builder: RowBuilder, state: State, postures: Array) -> torch.Tensor:
+    """Singular values of S_b V_x, (N, 6), at joint positions (N, n) in a contact state."""
+    found = torch.zeros(len(postures), 6, dtype=torch.float64)
+    for start in range(0, len(postures), _CHUNK):
+        samples = resting_samples(postures[start : start + _CHUNK], state)
+        for index, V in builder.null_space_bases(samples, state):
+            found[start : start + _CHUNK][index] = base_singular_values(V)
+    return found
+
+
+def dependent_sensors(generic: Demand, singular: Demand, chosen: Iterable[Candidate]) -> tuple[str, ...]:
+    """The fewest sensors that are independent at one posture but not at another, where the demand is unmet therefore.
+
+    Args:
+        generic: a demand at a posture where the chosen sensors meet it; if they do not, nothing is named.
+        singular: the same demand where they do not.
+        chosen: sensors of one reading each.
+    """
+    needed = [c for c in chosen if c in generic.vectors]
+    if generic.missing(needed) or not singular.missing(needed):
+        return ()
+    for candidate in tuple(needed):  # those that no sensor can be spared of are independent
+        fewer = [c for c in needed if c != candidate]
+        needed = needed if generic.missing(fewer) else fewer
+    for count in range(1, len(needed) + 1):
+        for some in combinations(needed, count):
+            if orthonormal_basis(singular.stacked(some)).any(axis=0).sum() < count:
+                return tuple(c.name for c in some)
+    return ()
+
+
+def simple_wrench_basis(space: Array) -> list[Array]:
+    """Wrenches (6,) that span a space (6, m), with as many zeros as elimination gives; pure moments come last.
+
+    Elimination pivots on the largest force component left, and on a moment component only if no force is left.
+    """
+    rows = np.array(space.T)
+    done = 0
+    for block in (slice(0, 3), slice(3, 6)):
+        while done < len(rows):
+            left = np.abs(rows[done:, block])
+            row, column = divmod(int(np.argmax(left)), 3)
+            if left[row, column] < _ZERO:
+                break
+            rows[[done, done + row]] = rows[[done + row, done]]
+            rows[done] /= rows[done, block.start + column]
+            others = np.arange(len(rows)) != done
+            rows[others] -= np.outer(rows[others, block.start + column], rows[done])
+            done += 1
+    return list(rows[:done])
+
+
+def describe_wrench(wrench: Array) -> str:
+    """A wrench (6,) at the base origin along the base frame's axes, up to scale and sign.
+
+    "moment about (0.71, 0, 0.71)"; "force along (0, 0, 1)", if its line does not pass through the base origin "through
+    (0, 0.1, 0)" [m]; and "with 0.2 m of pitch" [m = N m per N] if a moment about the same line comes with it.
+    """
+    wrench = wrench / np.linalg.norm(wrench)
+    force, moment = wrench[:3], wrench[3:]
+    size = float(np.linalg.norm(force))
+    if size < _ZERO:
+        return f"moment about {_vector(_signed(moment))}"
+    through, pitch = np.cross(force, moment) / size**2, float(force @ moment) / size**2
+    text = f"force along {_vector(_signed(force))}"
+    if np.linalg.norm(through) > _NEGLIGIBLE:
+        text += f" through {_vector(through)}"
+    return text if abs(pitch) < _NEGLIGIBLE else f"{text} with {pitch:.2g} m of pitch"
+
+
+@dataclass(frozen=True)
+class _Cause:
+    """Demands of a state at a random posture and at position zero, the mounted sensors, and candidates for remedies."""
+
+    generic: Sequence[Demand]
+    straight: Sequence[Demand]
+    mounted: tuple[Candidate, ...]
+    choice: Sequence[Candidate]
+
+    def missing(self, *more: Candidate) -> list[int]:
+        """Dimensions missing, demand by demand."""
+        return [demand.missing((*self.mounted, *more)) for demand in self.generic]
+
+    def dependent(self) -> tuple[tuple[str, ...], ...]:
+        """Sensors that are dependent at position zero only."""
+        pairs = zip(self.generic, self.straight, strict=True)
+        return tuple(found for pair in pairs if (found := dependent_sensors(*pair, self.mounted)))
+
+
+def _assess_state(
+    builder: RowBuilder, state: State, drawn: Array, recorded: Array | None, cause: _Cause
+) -> BaseObservability:
+    zero = np.zeros((1, drawn.shape[1]))
+    generic, straight = base_values(builder, state, drawn), base_values(builder, state, zero)
+    ranks, lost = base_rank(generic), None
+    if ranks.max() < 6:
+        regular = zero if base_rank(straight)[0] == ranks.max() else drawn[[int(ranks.argmax())]]
+        lost = _lost(builder, state, regular, cause)
+    return BaseObservability(
+        state=state,
+        name=state_name(builder.contacts, state),
+        generic=PostureSummary.of(generic),
+        zero=PostureSummary.of(straight),
+        recorded=None if recorded is None else PostureSummary.of(base_values(builder, state, recorded)),
+        lost=lost,
+        dependent=cause.dependent(),
+    )
+
+
+def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> LostBase:
+    [(_, V)] = builder.null_space_bases(resting_samples(posture, state), state)
+    U, values, _ = np.linalg.svd(V[0, :6].numpy())
+    directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]
+    short = cause.missing()
+    groups = zip(cause.generic, short, strict=True)
+    return LostBase(
+        posture=posture[0],
+        directions=directions,
+        descriptions=tuple(describe_wrench(wrench) for wrench in simple_wrench_basis(directions)),
+        unmet_groups=tuple((demand.frames, dimensions) for demand, dimensions in groups if dimensions),
+        remedies=tuple(c for c in cause.choice if sum(cause.missing(c)) < sum(short)),
+    )
+
+
+def _signed(direction: Array) -> Array:
+    """Of unit length, the largest component positive."""
+    direction = direction / np.linalg.norm(direction)
+    return direction * np.sign(direction[np.argmax(np.abs(direction).round(6))])
+
+
+def _vector(x: Array) -> str:
+    return f"({', '.join(f'{value:.2f}'.rstrip('0').rstrip('.') for value in np.round(x, 2) + 0.0)})"
