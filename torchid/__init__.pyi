@@ -10,7 +10,7 @@ from .estimators import (
     LogCholeskyParameters,
     Sgd,
     Trainer,
-    project,
+    nearest_consistent,
     violations,
 )
 from .fitting.calibration import (
@@ -146,7 +146,7 @@ __all__ = [
     "motion_from_state",
     "named_sensors",
     "preprocess",
-    "project",
+    "nearest_consistent",
     "read_log",
     "structural_problem",
     "violations",

@@ -148,7 +148,7 @@ def _identify(options: argparse.Namespace) -> None:
 def _print_fit(run: Identification) -> None:
     """Key figures, a line each."""
     from torchid.commands.training import body_eigenvalues
-    from torchid.estimators import BoundEstimate, ConsistentEstimate, SgdEstimate
+    from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, SgdEstimate
 
     estimate, robot = run.estimate, run.experiment.robot
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
@@ -160,8 +160,8 @@ def _print_fit(run: Identification) -> None:
         print(f"ridge         {run.ridge.ridge:g}, chosen by what predicts left-out blocks of the training logs")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
-    if isinstance(estimate, BoundEstimate) and estimate.relative_price is not None:
-        print(f"objective     {100.0 * estimate.relative_price:.3g} % above the least without conditions")
+    if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
+        print(f"objective     {100.0 * estimate.relative_increase:.3g} % above the least without conditions")
     if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
         print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
     if isinstance(estimate, SgdEstimate):

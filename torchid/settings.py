@@ -34,7 +34,7 @@ NamedClass = Annotated[dict[str, Any], AfterValidator(_with_name)]
 """A class of another package by its name, and its options: `{name: Adam, lr: 0.05}`."""
 
 
-def check_settings(settings: object) -> None:
+def validate_settings(settings: object) -> None:
     """Check the fields of a dataclass whose types have a range, a choice or another check; for its `__post_init__`.
 
     Raises:

@@ -23,8 +23,8 @@ from physical import (
 )
 from synthetic import Array
 
-from torchid.estimators import Conditions, Enclosure, Mirror, Violation, project, violations
-from torchid.estimators.conditions import mirrored_parameters
+from torchid.estimators import Conditions, Enclosure, Mirror, Violation, nearest_consistent, violations
+from torchid.estimators.conditions import mirror_matrix
 from torchid.problem.linear import parameter_scale
 
 seeds = st.integers(0, 2**32 - 1)
@@ -196,7 +196,7 @@ def test_a_total_mass_that_is_none_is_refused(mass: float) -> None:
 )
 def test_conditions_that_fit_no_robot_are_refused_as_values(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="accepted"):
-        project(GOOD, SCALE, Conditions(**change))
+        nearest_consistent(GOOD, SCALE, Conditions(**change))
 
 
 @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ def test_a_mirror_that_changes_lengths_is_refused(reflection: Array) -> None:
     ],
 )
 def test_what_cannot_be_checked_is_refused_and_not_passed(phi: Array, scale: Array, message: str) -> None:
-    for check in (violations, project):
+    for check in (violations, nearest_consistent):
         with pytest.raises(ValueError, match=message):
             check(phi, scale, Conditions())
 
@@ -260,5 +260,5 @@ def test_the_mirror_image_is_that_of_its_points(seed: int) -> None:
     for S in (np.eye(3) - 2.0 * np.outer(normal, normal), random_reflection(rng), np.diag([1.0, -1.0, 1.0])):
         phi = of_points(mass, place) + np.repeat([0.0, 0.3], [10, 2])
         expected = of_points(mass, place @ S.T) + np.repeat([0.0, 0.3], [10, 2])
-        np.testing.assert_allclose(mirrored_parameters(S) @ phi, expected, rtol=0.0, atol=1e-13 * np.abs(phi).max())
-        np.testing.assert_allclose(mirrored_parameters(S.T) @ mirrored_parameters(S), np.eye(12), rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(mirror_matrix(S) @ phi, expected, rtol=0.0, atol=1e-13 * np.abs(phi).max())
+        np.testing.assert_allclose(mirror_matrix(S.T) @ mirror_matrix(S), np.eye(12), rtol=0.0, atol=1e-14)

@@ -172,7 +172,7 @@ def test_without_active_conditions_it_is_least_squares(method: Method, seed: int
     estimate = Consistent(ridge, "euclidean", Conditions(0.5 * least), method).solve(problem)
     np.testing.assert_allclose(estimate.phi / problem.scale, plain.phi / problem.scale, rtol=0.0, atol=1e-7)
     assert estimate.unconstrained == pytest.approx(estimate.objective, rel=1e-7)
-    assert estimate.price == pytest.approx(0.0, abs=1e-7 * estimate.objective)
+    assert estimate.increase == pytest.approx(0.0, abs=1e-7 * estimate.objective)
     for name in ("standard_error", "identifiable", "rank", "condition_number", "nominal_cost", "rows"):
         np.testing.assert_array_equal(getattr(estimate, name), getattr(plain, name))
     assert estimate.cost == problem.cost(estimate.phi)
@@ -187,14 +187,14 @@ def test_what_the_conditions_cost_is_stated(method: Method, prior: Prior) -> Non
     estimate = Consistent(1e-2, prior, method=method).solve(problem)
     if prior == "entropic":  # whose domain is a condition
         assert estimate.unconstrained is None
-        assert estimate.price is None
+        assert estimate.increase is None
         return
     found = minimize(
         lambda x: objective(prior, 1e-2, problem, nominal + scale * x), np.zeros(12), options={"gtol": 1e-9}
     )
     assert estimate.unconstrained == pytest.approx(found.fun, rel=1e-7)
-    assert estimate.price == pytest.approx(estimate.objective - found.fun, rel=1e-5)
-    assert estimate.price > 0.01 * estimate.objective  # something is active
+    assert estimate.increase == pytest.approx(estimate.objective - found.fun, rel=1e-5)
+    assert estimate.increase > 0.01 * estimate.objective  # something is active
 
 
 @pytest.mark.parametrize("ridge", [0.0, 1e-10])

@@ -26,9 +26,9 @@ from scipy.optimize import nnls
 from torchid.errors import InputError, NumericalWarning
 from torchid.estimators import Conditions, Consistent, Enclosure, Mirror, certified, violations
 from torchid.estimators.barrier import solve_barrier
-from torchid.estimators.conic import Solution
+from torchid.estimators.conic_formulation import build_conic_problem
+from torchid.estimators.conic_problem import Solution
 from torchid.estimators.consistent import Method, Prior
-from torchid.estimators.formulate import conic_problem
 from torchid.problem.linear import parameter_scale
 
 both = pytest.mark.parametrize("method", METHODS)
@@ -142,7 +142,7 @@ def test_no_multipliers_claim_a_gap_that_is_too_small(seed: int, prior: Prior) -
     rng = np.random.default_rng(seed)
     case = random_case(rng)
     ridge = 0.0 if prior == "euclidean" else 10.0 ** rng.uniform(-6.0, -1.0)
-    conic = conic_problem(case.problem, case.conditions, ridge, prior)
+    conic = build_conic_problem(case.problem, case.conditions, ridge, prior)
     best = solve_barrier(conic)
     inside = solve_barrier(conic, tolerance=1.0).x
     for here, there in ((0.0, 1e-3), (0.0, 1.0), (1e-3, 1e-3), (0.1, 0.0), (1.0, 0.1), (1.0, 1.0)):
@@ -161,20 +161,20 @@ def test_multipliers_that_push_where_the_data_say_nothing_certify_nothing() -> N
     nominal = random_bodies(np.random.default_rng(14), 1)
     box = Enclosure(0, "box", nominal[0, 1:4] / nominal[0, 0], np.eye(3), np.full(3, 0.1))
     problem = replace(nothing_seen(nominal), A=np.eye(12)[:1])  # a mass of 0
-    conic = conic_problem(problem, Conditions(enclosures=(box,)), 0.0, "euclidean")
-    face = conic.names.index("centre of mass of body 0") - len(conic.base)
+    conic = build_conic_problem(problem, Conditions(enclosures=(box,)), 0.0, "euclidean")
+    face = conic.names.index("centre of mass of body 0") - len(conic.F0)
     x = np.zeros(12)
     x[1] = (conic.h[face] - conic.G[face] @ x) / conic.G[face, 1]
     y = np.zeros(len(conic.h))
     y[face] = conic.gradient(x)[0] / conic.G[face, 0]
-    assert conic.gap(x, np.zeros_like(conic.base), y) >= conic.objective(x) - solve_barrier(conic).objective > 0.0
+    assert conic.gap(x, np.zeros_like(conic.F0), y) >= conic.objective(x) - solve_barrier(conic).objective > 0.0
 
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-6])
 @all_priors
 def test_a_gap_is_as_small_as_was_asked_for_and_true(prior: Prior, tolerance: float) -> None:
     problem, _ = active_case(4)
-    conic = conic_problem(problem, Conditions(), 1e-3, prior)
+    conic = build_conic_problem(problem, Conditions(), 1e-3, prior)
     rough, best = solve_barrier(conic, tolerance), solve_barrier(conic)
     assert rough.objective - best.objective <= rough.gap <= tolerance * rough.objective
     assert rough.steps < best.steps
@@ -208,7 +208,7 @@ def test_a_conic_solver_that_ends_outside_the_conditions_says_so(monkeypatch: py
 
 def test_outside_the_domain_of_an_entropic_prior_nothing_is_an_objective() -> None:
     problem, _ = active_case(4)
-    conic = conic_problem(problem, Conditions(), 1e-3, "entropic")
+    conic = build_conic_problem(problem, Conditions(), 1e-3, "entropic")
     assert np.isfinite(conic.objective(np.zeros(24)))
     assert conic.objective(-2.0 * problem.nominal / problem.scale) == np.inf
 

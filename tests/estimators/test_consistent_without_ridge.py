@@ -172,7 +172,7 @@ def test_without_active_conditions_it_is_least_squares_of_least_norm(method: Met
     plain = LeastSquares().solve(problem)
     off = (found.estimate.phi - plain.phi) / problem.scale
     np.testing.assert_allclose(off, 0.0, atol=1e-6)
-    assert found.estimate.price == pytest.approx(0.0, abs=1e-12)
+    assert found.estimate.increase == pytest.approx(0.0, abs=1e-12)
     assert not found.unbounded
 
 

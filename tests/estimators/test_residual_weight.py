@@ -17,7 +17,7 @@ from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import InputError
 from torchid.estimators import LeastSquares, Sgd, SgdEstimate, Trainer
-from torchid.estimators.residual import WEIGHTS, choose_weight
+from torchid.estimators.residual import CANDIDATE_WEIGHTS, choose_weight
 from torchid.fitting.experiment import set_up
 from torchid.problem import MiniBatches, RowBuilder, Samples, compress, linear_problem
 from torchid.regressor import Regressor
@@ -172,7 +172,7 @@ def test_a_module_and_the_random_numbers_are_untouched_while_its_weight_is_chose
     trainer = Trainer(Sgd(epochs=2), w.problem, w.batches, half_way().batches, springs)
     before, state = trainer.state_dict(), torch.get_rng_state()
     choice = trainer.choose_residual_weight()
-    assert choice.candidates == WEIGHTS
+    assert choice.candidates == CANDIDATE_WEIGHTS
     assert torch.equal(torch.get_rng_state(), state)
     assert all(torch.equal(x, before["learned"][name]) for name, x in trainer.loss.state_dict().items())
 

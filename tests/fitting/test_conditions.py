@@ -23,7 +23,7 @@ from torchid.config import dump_config, load_config
 from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError
 from torchid.estimators import Conditions, violations
-from torchid.estimators.conditions import mirrored_parameters
+from torchid.estimators.conditions import mirror_matrix
 from torchid.fitting.estimator import batch_estimator, conditions_from
 from torchid.parameters import PARAMETERS
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
@@ -151,7 +151,7 @@ def test_left_and_right_become_mirror_images(tmp_path: Path, biped: Robot) -> No
     assert len(found) == 7
     for mirror in found:
         assert biped.body_names[mirror.body].replace("l_", "r_") == biped.body_names[mirror.image]
-        image = mirrored_parameters(mirror.reflection) @ biped.nominal[mirror.body]
+        image = mirror_matrix(mirror.reflection) @ biped.nominal[mirror.body]
         np.testing.assert_allclose(image, biped.nominal[mirror.image], atol=1e-12)
 
 
@@ -280,7 +280,7 @@ def test_a_run_meets_its_conditions(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for name in robot.body_names:
         if "left" in name:
             left, right = (robot.body_names.index(n) for n in (name, name.replace("left", "right")))
-            expected = mirrored_parameters(np.diag([1.0, -1.0, 1.0])) @ phi[left]
+            expected = mirror_matrix(np.diag([1.0, -1.0, 1.0])) @ phi[left]
             np.testing.assert_allclose(phi[right], expected, rtol=0.0, atol=1e-7)
     frozen = robot.body_names.index("rear_right_shank_link")
     np.testing.assert_array_equal(phi[frozen], robot.nominal[frozen])

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from torchid.cli import main
 from torchid.commands.training import CHECKPOINT, load_checkpoint
-from torchid.estimators.state import check_alike
+from torchid.estimators.training_state import require_same_structure
 from torchid.report.parameter_files import read_parameters
 from torchid.robot import load_robot
 
@@ -132,7 +132,9 @@ def test_a_training_goes_on_from_its_own_state_alone(place: Path, tmp_path: Path
 
 def test_states_are_alike_if_they_are_made_of_the_same() -> None:
     one = {"x": torch.zeros(3), "n": 2, "t": [1.0, 2.0], "empty": {}, "none": None}
-    check_alike({"x": torch.ones(3), "n": 5.0, "t": [3, 4.0], "empty": {0: {"s": 1}}, "none": None, "more": 1}, one)
+    require_same_structure(
+        {"x": torch.ones(3), "n": 5.0, "t": [3, 4.0], "empty": {0: {"s": 1}}, "none": None, "more": 1}, one
+    )
     for key, value in (
         ("x", torch.zeros(4)),
         ("x", torch.zeros(3, dtype=torch.int64)),
@@ -142,4 +144,4 @@ def test_states_are_alike_if_they_are_made_of_the_same() -> None:
         ("empty", {0: 1}),
     ):
         with pytest.raises(ValueError, match=rf"state\.{key}.* is of another"):
-            check_alike(one | {key: value}, one)
+            require_same_structure(one | {key: value}, one)

@@ -8,7 +8,7 @@ from repository import DEMO
 
 import torchid
 from torchid import parameters
-from torchid.estimators.least_squares import IDENTIFIED, UNSEEN
+from torchid.estimators.least_squares import IDENTIFIED, UNOBSERVABLE
 from torchid.identifiability.structure import structural_samples
 from torchid.problem import RowBuilder, compress, linear_problem
 from torchid.sensing import Contact, named_sensors
@@ -31,12 +31,12 @@ def foot_verdicts(sensors: str, states: tuple[tuple[bool, ...], ...]) -> np.ndar
 @pytest.mark.parametrize("sensors", ["full", "contacts", "joints"])
 def test_the_inertia_of_a_foot_cannot_be_seen_while_it_stands_and_can_once_it_steps(sensors: str) -> None:
     inertia = parameters.INERTIA
-    assert (foot_verdicts(sensors, STANDING)[:, inertia] == UNSEEN).all()
-    assert (foot_verdicts(sensors, STEPPING)[:, inertia] != UNSEEN).all()
+    assert (foot_verdicts(sensors, STANDING)[:, inertia] == UNOBSERVABLE).all()
+    assert (foot_verdicts(sensors, STEPPING)[:, inertia] != UNOBSERVABLE).all()
     if sensors != "contacts":
         assert (foot_verdicts(sensors, STEPPING)[:, inertia] == IDENTIFIED).any(axis=1).all()
 
 
 def test_joint_torques_alone_see_nothing_of_a_standing_foot() -> None:
     verdicts = foot_verdicts("joints", STANDING)
-    assert (verdicts[:, parameters.INERTIAL] == UNSEEN).all()
+    assert (verdicts[:, parameters.INERTIAL] == UNOBSERVABLE).all()

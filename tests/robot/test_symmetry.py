@@ -14,7 +14,7 @@ from synthetic import ANYMAL, G1, ROBOTS, ROMEO, SOLO8, SOLO12, TALOS, Array, lo
 from urdfs import joint, link, table, words, write
 
 from torchid.errors import ConfigError
-from torchid.estimators.conditions import mirrored_parameters
+from torchid.estimators.conditions import mirror_matrix
 from torchid.problem.linear import parameter_scale
 from torchid.robot import Robot, mirror_pairs
 
@@ -55,7 +55,7 @@ def test_the_limbs_of_real_robots_are_mirror_images_and_so_is_their_matter(case:
     for pair in pairs:
         np.testing.assert_allclose(pair.reflection @ pair.reflection.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(pair.reflection) == pytest.approx(-1.0)
-        image = mirrored_parameters(pair.reflection) @ robot.nominal[pair.body]
+        image = mirror_matrix(pair.reflection) @ robot.nominal[pair.body]
         off.append(float(np.abs((image - robot.nominal[pair.image]) / scale[pair.image])[:10].max()))
     assert np.median(off) < 0.03
     assert tolerance is None or max(off) < tolerance
@@ -114,7 +114,7 @@ def test_points_of_the_right_arm_are_those_of_the_left_seen_in_a_mirror(normal: 
         in_right = (in_base - T_right[:3, 3]) @ T_right[:3, :3]
         left, right = of_points(mass, in_left), of_points(mass, in_right)
         left[10:] = right[10:] = [0.3, 0.7]
-        np.testing.assert_allclose(mirrored_parameters(pair.reflection) @ left, right, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(mirror_matrix(pair.reflection) @ left, right, rtol=0.0, atol=1e-9)
 
 
 # --------------------------------------------------------------------------------------------------------- refusals

@@ -25,7 +25,7 @@ from synthetic import Array
 
 from torchid import parameters
 from torchid.errors import InputError
-from torchid.estimators import Conditions, Mirror, project, violations
+from torchid.estimators import Conditions, Mirror, nearest_consistent, violations
 from torchid.estimators.consistent import Method, Prior
 
 seeds = st.integers(0, 2**32 - 1)
@@ -51,7 +51,9 @@ def test_a_projection_is_the_nearest_parameters_that_meet_the_conditions(prior: 
     def distance(other: Array) -> float:
         return prior_value(prior, other, phi, scale, reference)
 
-    near, sure = (project(phi, scale, conditions, prior=prior, nominal=reference, method=method) for method in METHODS)
+    near, sure = (
+        nearest_consistent(phi, scale, conditions, prior=prior, nominal=reference, method=method) for method in METHODS
+    )
     assert violations(near, scale, conditions) == []
     assert violations(sure, scale, conditions, 1e-7) == []  # Clarabel's iterates end up to 1e-8 outside
     nearest = distance(near)
@@ -71,16 +73,16 @@ def test_a_projection_is_the_nearest_parameters_that_meet_the_conditions(prior: 
 @pytest.mark.parametrize("method", METHODS)
 def test_parameters_that_meet_the_conditions_are_their_own_projection(method: Method, prior: Prior) -> None:
     before = GOOD.copy()
-    found = project(GOOD, SCALE, Conditions(1e-4), prior=prior, method=method)
+    found = nearest_consistent(GOOD, SCALE, Conditions(1e-4), prior=prior, method=method)
     accuracy = 1e-5 if (method, prior) == ("certified", "entropic") else 1e-6  # sqrt(gap), an exponential cone's 1e-10
     np.testing.assert_allclose(found / SCALE, GOOD / SCALE, rtol=0.0, atol=accuracy)
     np.testing.assert_array_equal(GOOD, before)
 
 
 def test_a_projection_projects_no_further() -> None:
-    found = project(body(2.0, np.zeros(3), [0.1, 0.2, 0.4]), SCALE, Conditions(1e-3))
+    found = nearest_consistent(body(2.0, np.zeros(3), [0.1, 0.2, 0.4]), SCALE, Conditions(1e-3))
     assert violations(found, SCALE, Conditions(1e-3)) == []
-    again = project(found, SCALE, Conditions(1e-3))
+    again = nearest_consistent(found, SCALE, Conditions(1e-3))
     np.testing.assert_allclose(again / SCALE, found / SCALE, rtol=0.0, atol=1e-6)
 
 
@@ -89,9 +91,9 @@ def test_the_metric_of_a_projection_matters() -> None:
     broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
     measure = parameters.perturb_parameters(GOOD, 0.3, np.random.default_rng(0))
     near = {
-        "euclidean": project(broken, SCALE, Conditions()),
-        "pullback": project(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD),
-        "other": project(broken, SCALE, Conditions(), prior="pullback", nominal=measure),
+        "euclidean": nearest_consistent(broken, SCALE, Conditions()),
+        "pullback": nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD),
+        "other": nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=measure),
     }
     for name, reference in (("pullback", GOOD), ("other", measure)):
         apart = {other: prior_value("pullback", phi, broken, SCALE, reference) for other, phi in near.items()}
@@ -102,7 +104,7 @@ def test_the_metric_of_a_projection_matters() -> None:
 def test_bodies_without_mass_get_none_by_projection(method: Method) -> None:
     phi = np.concatenate([body(1.0, np.zeros(3), [0.1, 0.2, 0.4]), np.zeros((2, 12))])
     phi[2, 10] = 0.3  # a joint's friction, whatever hangs on it
-    found = project(phi, np.repeat(SCALE, 3, axis=0), Conditions(1e-4), method=method)
+    found = nearest_consistent(phi, np.repeat(SCALE, 3, axis=0), Conditions(1e-4), method=method)
     np.testing.assert_array_equal(found[1:, :10], 0.0)
     np.testing.assert_array_equal(found[1, 10:], 0.0)
     assert found[2, 10] == pytest.approx(0.3, abs=1e-6)
@@ -116,7 +118,7 @@ def test_friction_of_zero_moves_only_to_a_mirror_image_or_a_bound() -> None:
     lower = np.full(phi.shape, -np.inf)
     lower[2, 11] = 0.2
     mirror = Mirror(0, 1, np.eye(3))
-    found = project(phi, np.repeat(SCALE, 3, axis=0), Conditions(mirrors=(mirror,), lower=lower))
+    found = nearest_consistent(phi, np.repeat(SCALE, 3, axis=0), Conditions(mirrors=(mirror,), lower=lower))
     np.testing.assert_allclose(found[:, 10], [0.15, 0.15, 0.0], rtol=0.0, atol=1e-7)
     np.testing.assert_allclose(found[:, 11], [0.0, 0.0, 0.2], rtol=0.0, atol=1e-7)
     assert found[2, 10] == 0.0
@@ -127,19 +129,22 @@ def test_distances_that_are_not_defined_are_refused(method: Method) -> None:
     broken = body(2.0, np.zeros(3), [0.1, 0.2, 0.4])
     for arguments in ({"prior": "entropic"}, {"prior": "pullback"}, {"prior": "pullback", "nominal": broken}):
         with pytest.raises(InputError, match=f"{arguments['prior']}, but no density of matter has .* body 0"):
-            project(broken, SCALE, Conditions(), method=method, **arguments)
-    assert violations(project(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD), SCALE, Conditions()) == []
+            nearest_consistent(broken, SCALE, Conditions(), method=method, **arguments)
+    assert (
+        violations(nearest_consistent(broken, SCALE, Conditions(), prior="pullback", nominal=GOOD), SCALE, Conditions())
+        == []
+    )
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"prior": "riemannian"}, "prior: found 'riemannian'; accepted: euclidean, pullback, entropic"),
-        ({"method": "sdp"}, "method: found 'sdp'; accepted: barrier, certified"),
+        ({"prior": "riemannian"}, "prior: found 'riemannian'; accepted: 'euclidean', 'pullback' or 'entropic'"),
+        ({"method": "sdp"}, "method: found 'sdp'; accepted: 'barrier' or 'certified'"),
         ({"nominal": GOOD}, "nominal: found parameters for the euclidean prior"),
         ({"prior": "pullback", "nominal": GOOD[:, :10]}, "nominal: found shape"),
     ],
 )
 def test_arguments_of_a_projection_that_make_no_sense_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        project(GOOD, SCALE, Conditions(), **arguments)
+        nearest_consistent(GOOD, SCALE, Conditions(), **arguments)

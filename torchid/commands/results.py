@@ -14,7 +14,7 @@ from torchid.commands.folder import new_folder, write_json
 from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import ExperimentConfig, dump_config
 from torchid.errors import during
-from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
+from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate, Violation
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
@@ -240,7 +240,7 @@ def _bits(found: Contributions) -> dict[str, list[tuple[str, float]]]:
 
 def _solution_document(estimate: Estimate) -> dict[str, object] | None:
     """What is known of the optimum, or of the descent."""
-    if not isinstance(estimate, BoundEstimate):
+    if not isinstance(estimate, ConstrainedEstimate):
         return None
     names = ("objective", "unconstrained", "distance", "gap", "certified_gap", "steps", "epochs", "best_epoch")
     return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}
@@ -274,7 +274,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
             for group, value in run.metrics[name].identified.relative.items()
             if value is not None
         }
-        price = estimate.relative_price if isinstance(estimate, BoundEstimate) else 0.0
+        price = estimate.relative_increase if isinstance(estimate, ConstrainedEstimate) else 0.0
         final |= {"rank": float(estimate.rank)} | ({} if price is None else {"objective_above_least": price})
         events.close_with(dump_config(config), _hyperparameters(config), final, figures, last)
 

@@ -13,8 +13,8 @@ from torchid.config.sensors import STRICT
 from torchid.errors import ConfigError
 from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.conditions import EnclosureKind
+from torchid.estimators.conic_formulation import Prior
 from torchid.estimators.consistent import Method
-from torchid.estimators.formulate import Prior
 from torchid.estimators.sgd import Consistency
 from torchid.settings import BelowOne, Count, NotNegative, Number, Positive, Seed, Tolerance
 
@@ -74,7 +74,7 @@ def _by_loss(value: object) -> object:
 
 
 ROBUST_ACCEPTED = f"{', '.join(get_args(Loss))}, or a mapping with loss, tuning and passes"
-"""What a message says of a robust fit."""
+"""Accepted for a robust fit, in messages."""
 
 Robust = Annotated[RobustConfig, BeforeValidator(_by_loss)]
 
@@ -135,7 +135,7 @@ class _ConditionsConfig:
 class EstimatorConfig(_ConditionsConfig, _FitConfig):
     """An estimator by its name, with the keys of all: what a key means and accepts is said where its default is from.
 
-    A file may set only the keys of the estimator it names, see `check_keys`.
+    A file may set only the keys of the estimator it names, see `validate_keys`.
     """
 
     prior: Prior = Consistent.prior
@@ -179,7 +179,7 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
         return estimator(**{key: found[key] for key in _fields(estimator) if key in found})
 
 
-def check_keys(estimator: EstimatorConfig, path: Path) -> None:
+def validate_keys(estimator: EstimatorConfig, path: Path) -> None:
     """Refuse a setting that the estimator has not: it would be ignored in silence.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Any kind of settings file: YAML and overrides into a checked dataclass, and every slip into one line."""
+"""Settings files of any kind: YAML and overrides into a validated dataclass, and every error in one line."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from torchid.text import excerpt, is_plain
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TAG = "tag:yaml.org,2002:"
-#: Tags that settings may have; others make dates, sets or bytes, which stand nowhere in them.
+#: Tags that settings may have; others make dates, sets or bytes, which no key accepts.
 _KINDS = ("str", "int", "float", "bool", "null", "map", "seq", "merge")
 _NUMBERS = ("int", "float", "bool", "null")
 
@@ -56,7 +56,7 @@ class _Count:
 
 
 def check_yaml(text: str) -> None:
-    """Refuse what would unfold beyond all bounds, what cannot be shown, and `${...}`, whose value lies elsewhere.
+    """Refuse YAML that unfolds beyond bounds, control characters, and interpolations `${...}`.
 
     Raises:
         ValueError, yaml.YAMLError: what was found.
@@ -82,7 +82,7 @@ def check_yaml(text: str) -> None:
 
 
 def _check_tag(event: yaml.Event) -> None:
-    """Refuse a tag that says what its value is not: what builds values of it fails in ways of its own."""
+    """Refuse a tag that contradicts its value, whose construction would fail with errors of its own."""
     tag = getattr(event, "tag", None)
     if tag in (None, "!"):
         return
@@ -122,7 +122,7 @@ def _as_is(settings: Settings, _: Settings) -> Settings:
 
 @dataclasses.dataclass(frozen=True)
 class FileKind(Generic[T]):
-    """One kind of settings file: what it holds, and how messages speak of it.
+    """One kind of settings file: its dataclass, its paths, and its words in messages.
 
     Attributes:
         settings: the pydantic dataclass of the whole file. Those inside it may lie in lists, in mappings and in
@@ -134,8 +134,8 @@ class FileKind(Generic[T]):
         outputs: places that hold the path of a result.
         prepare: takes settings and those that will override them, and returns the settings to merge; it is called for
             the file and nothing, then, for each override, for all before and it, and for it and nothing.
-        accepted: what a message says is accepted, by place (`*` for a name that the file gives), where the type alone
-            says too little.
+        accepted: the accepted values in messages, by place (`*` for a name from the file), where the type alone says
+            too little.
     """
 
     settings: type[T]
@@ -216,7 +216,7 @@ def _no_settings(kind: FileKind[T], path: Path, found: str, accepted: str) -> Co
 
 
 def _why(error: Exception) -> str:
-    """What a reader of YAML found, in its own words where these are made for readers."""
+    """The cause of an error in reading YAML, in the words of its reader where these are made for users."""
     if isinstance(error, UnicodeDecodeError):
         return "no text"
     spoken = isinstance(error, (OmegaConfBaseException, yaml.YAMLError, ValueError))
@@ -262,7 +262,7 @@ def _absolute(source: object, settings: Settings, places: Sequence[str], folder:
 
 
 def _absolute_at(value: Any, place: Sequence[str], folder: Path) -> Any:
-    """The value with the path at a place made absolute; what is no path where one belongs is left to the checks."""
+    """The value with the path at a place made absolute; values of another type are left to the validation."""
     if not place:
         return _absolute_path(value, folder) if isinstance(value, str) else value
     key, *rest = place
@@ -284,7 +284,7 @@ def _absolute_path(value: str, folder: Path) -> str:
 
 
 def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> ConfigError | UnknownNameError:
-    """The first complaint, an unknown key before others: it is the likeliest cause of the rest."""
+    """The first validation error as one line; an unknown key first, the likeliest cause of the others."""
     complaints = sorted(error.errors(), key=lambda e: e["type"] != "unexpected_keyword_argument")
     first = complaints[0]
     place = [str(part) for part in first["loc"] if part != "[key]"]
@@ -334,7 +334,7 @@ def _hint_at(settings: Any, place: Sequence[str]) -> Any:
 
 
 def _places_of(name: str, settings: Any, place: str = "") -> Iterator[str]:
-    """Where else in a dataclass there is a key of a name, for one that is written in the wrong place."""
+    """Other places in a dataclass with a key of that name, for one that is written in the wrong place."""
     for key, hint in get_type_hints(settings).items():
         if key == name:
             yield place + key

@@ -1,4 +1,4 @@
-"""The settings file of `torchid simulate`: a robot, its feet, motions, and what is wrong with its sensors."""
+"""The settings file of `torchid simulate`: a robot, its feet, motions, and its sensors' imperfections."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class BiasConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class DelayConfig:
-    """How late the foot sensors are [s]."""
+    """The delay of the foot sensors [s]."""
 
     enabled: bool = False
     feet_s: NotNegative = 0.01
@@ -118,7 +118,7 @@ class FrictionConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class SensorImperfectionsConfig:
-    """What the log has that the robot had not; a contact is active while its measured load exceeds a threshold [N]."""
+    """Errors of the sensors; a contact is active while its measured load exceeds a threshold [N]."""
 
     noise: WhiteNoiseConfig = dataclasses.field(default_factory=WhiteNoiseConfig)
     bias: BiasConfig = dataclasses.field(default_factory=BiasConfig)
@@ -128,7 +128,7 @@ class SensorImperfectionsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class BoundsConfig:
-    """What a run must keep [m]: base height near the stance's, feet that do not slip, a zero-moment point inside.
+    """Limits of a motion [m]: of base height from the stance's, of slipping feet, of the zero-moment point.
 
     `zmp_m` is the least distance from the zero-moment point to the border of the support polygon.
     """

@@ -1,4 +1,4 @@
-"""Optimizers and learning-rate schedules of `torch.optim` by name, tried out before any work depends on them."""
+"""Optimizers and learning-rate schedules of `torch.optim`, by name, and a trial of their options."""
 
 from __future__ import annotations
 
@@ -20,47 +20,48 @@ Group = dict[str, Any]
 _WHOLE_RUN = ("T_max", "total_steps")  # lengths that are the number of epochs unless given
 _UNSUITED = {"SparseAdam": "takes sparse gradients alone", "Muon": "takes matrices alone"}
 _FAILURES = (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-"""What torch's classes have been seen to raise at options that cannot be."""
+"""What torch's classes raise at options that they do not accept."""
 
 
 @dataclass(frozen=True)
-class Method:
-    """How an optimizer of torch is used here.
+class OptimizerUse:
+    """How an optimizer of torch is used for the preconditioned parameters.
 
     Attributes:
-        defaults: options for those that are not given. Torch's own suit networks, whose curvature nobody knows; that of
+        defaults: options for those that are not given. Torch's own suit networks of unknown curvature; that of the
             preconditioned parameters is near one.
         alone: further options where none at all is given.
-        whole: whether a step takes all samples at once, an epoch being one step: a line search or a memory of signs
-            compares gradients from step to step, which mini-batches make differ by chance. Gradients are not clipped.
+        full_batch: whether a step takes all samples at once, an epoch being one step: a line search or a memory of
+            signs compares gradients from step to step, which differ by chance between mini-batches. Gradients are not
+            clipped.
     """
 
     defaults: Mapping[str, Any] = field(default_factory=dict)
     alone: Mapping[str, Any] = field(default_factory=dict)
-    whole: bool = False
+    full_batch: bool = False
 
 
-METHODS: dict[str, Method] = {
-    "ASGD": Method({"lr": 1.0}),
-    "Adadelta": Method({"lr": 30.0}),
-    "Adafactor": Method({"lr": 0.1, "eps": (None, 1.0)}),  # steps count in units of the second, not of parameters
-    "Adagrad": Method({"lr": 0.5}),
-    "Adam": Method({"lr": 0.05}),
-    "AdamW": Method({"lr": 0.05}),
-    "Adamax": Method({"lr": 0.3}),
-    "LBFGS": Method({"line_search_fn": "strong_wolfe"}, whole=True),
-    "NAdam": Method({"lr": 0.1}),
-    "RAdam": Method({"lr": 0.3}),
-    "RMSprop": Method({"lr": 0.05}),
-    "Rprop": Method({"lr": 0.2}, whole=True),
-    "SGD": Method({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
+OPTIMIZERS: dict[str, OptimizerUse] = {
+    "ASGD": OptimizerUse({"lr": 1.0}),
+    "Adadelta": OptimizerUse({"lr": 30.0}),
+    "Adafactor": OptimizerUse({"lr": 0.1, "eps": (None, 1.0)}),  # steps count in units of the second, not of parameters
+    "Adagrad": OptimizerUse({"lr": 0.5}),
+    "Adam": OptimizerUse({"lr": 0.05}),
+    "AdamW": OptimizerUse({"lr": 0.05}),
+    "Adamax": OptimizerUse({"lr": 0.3}),
+    "LBFGS": OptimizerUse({"line_search_fn": "strong_wolfe"}, full_batch=True),
+    "NAdam": OptimizerUse({"lr": 0.1}),
+    "RAdam": OptimizerUse({"lr": 0.3}),
+    "RMSprop": OptimizerUse({"lr": 0.05}),
+    "Rprop": OptimizerUse({"lr": 0.2}, full_batch=True),
+    "SGD": OptimizerUse({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
 }
-"""The optimizers that come near the closed form; docs/estimators.md says how near."""
+"""The supported optimizers, those that come near the closed form; docs/estimators.md says how near."""
 
 
 def optimizer_names() -> list[str]:
-    """Names of the classes in `torch.optim` that are supported: those in `METHODS` that this torch has."""
-    return sorted(name for name, _ in _classes(torch.optim, Optimizer) if name in METHODS)
+    """Names of the classes in `torch.optim` that are supported: those in `OPTIMIZERS` that this torch has."""
+    return sorted(name for name, _ in _classes(torch.optim, Optimizer) if name in OPTIMIZERS)
 
 
 def schedule_names() -> list[str]:
@@ -72,7 +73,7 @@ def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimi
     """An optimizer of parameter groups.
 
     Args:
-        chosen: its name, and options; those that are not given are as in `METHODS`.
+        chosen: its name, and options; those that are not given are as in `OPTIMIZERS`.
         groups: of parameters, as torch takes them.
 
     Raises:
@@ -81,7 +82,7 @@ def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimi
     """
     name, options = _split(chosen)
     found = dict(_classes(torch.optim, Optimizer)).get(name)
-    if found is not None and name not in METHODS:
+    if found is not None and name not in OPTIMIZERS:
         accepted = ", ".join(optimizer_names())
         raise InputError("estimator", f"optimizer {name}", _UNSUITED.get(name, "not supported"), accepted)
     if found is None:
@@ -93,7 +94,7 @@ def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimi
             )
         groups = [{"params": [x for group in groups for x in group["params"]]}]
     try:
-        return found(list(groups), **{**_defaults(METHODS[name], options), **options})
+        return found(list(groups), **{**_defaults(OPTIMIZERS[name], options), **options})
     except _FAILURES as error:
         raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(found)) from error
 
@@ -132,7 +133,7 @@ def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
 
 
 def try_out(optimizer: Mapping[str, Any], schedule: Mapping[str, Any] | None, epochs: int) -> None:
-    """Take two steps on a parabola and the schedule through all epochs, so that what does not work is known at once.
+    """Take two steps on a parabola, and the schedule through all epochs: options that do not work fail here.
 
     Arguments as of `make_optimizer` and `make_schedule`.
 
@@ -172,7 +173,7 @@ def _split(chosen: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     return options.pop("name"), options
 
 
-def _defaults(method: Method, options: Mapping[str, Any]) -> dict[str, Any]:
+def _defaults(method: OptimizerUse, options: Mapping[str, Any]) -> dict[str, Any]:
     return dict(method.defaults) if options else {**method.defaults, **method.alone}
 
 

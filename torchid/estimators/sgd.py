@@ -1,4 +1,4 @@
-"""Mini-batch descent: its settings, its objective, and the penalties that keep bodies physical."""
+"""Mini-batch descent: its settings, its loss, and the penalties on bodies that are not physically consistent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.least_squares import Regularized
 from torchid.estimators.optimizers import try_out
 from torchid.problem import Batch, LinearProblem, MiniBatches
-from torchid.settings import BelowOne, Count, NamedClass, NotNegative, Positive, check_settings
+from torchid.settings import BelowOne, Count, NamedClass, NotNegative, Positive, validate_settings
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class PenaltyWeights:
     """Weights of the penalties beside the mean squared whitened residual.
 
     Attributes:
-        eigenvalue: squares of what the eigenvalues of scaled pseudo-inertias lack to the margin.
-        log_det: minus the logarithms of these eigenvalues above the margin, a barrier.
+        eigenvalue: squares of the shortfall of scaled pseudo-inertias' eigenvalues from the margin.
+        log_det: minus the logarithms of these eigenvalues less the margin, a barrier.
         mass: squares of negative masses, in units of their scale.
         friction: squares of negative friction, in units of its scale.
     """
@@ -37,7 +37,7 @@ class PenaltyWeights:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_settings(self)
+        validate_settings(self)
 
     @property
     def curvature(self) -> float:
@@ -55,8 +55,8 @@ def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWei
 
     Args:
         scaled: (L, 12), parameters in units of their scale.
-        bodies: (L',) int, bodies whose inertia is asked to be possible; friction is asked to be of all.
-        margin: least eigenvalue asked for.
+        bodies: (L',) int, bodies whose inertia is penalized; friction is, of all.
+        margin: least eigenvalue without a penalty.
         weights: of the terms.
     """
     out: dict[str, Tensor] = {}
@@ -74,7 +74,7 @@ def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWei
 
 
 def _extended_log(x: Tensor, least: float = 1e-4) -> Tensor:
-    """The logarithm, and below `least` its tangent: a descent that starts outside still finds its way in."""
+    """The logarithm, and below `least` its tangent: the gradient of a body outside the cone points inside."""
     inside = x.clamp_min(least)
     return inside.log() + (x - inside) / least
 
@@ -90,7 +90,7 @@ class TrainingSettings:
     Attributes:
         epochs: passes over the logs, at most.
         optimizer: the name of one of `optimizer_names()`, classes of `torch.optim`, and what it takes; what is not
-            given is as in `METHODS`.
+            given is as in `OPTIMIZERS`.
         schedule: the name of a class of `torch.optim.lr_scheduler`, stepped once per epoch, and what it takes; None for
             none.
         patience: epochs without a better loss on the held-out logs after which to stop; None: never.
@@ -141,8 +141,8 @@ class Sgd(TrainingSettings, Regularized):
 
 
 @dataclass(frozen=True)
-class Terms:
-    """Terms of the loss of a batch, and sums of squares of its projected whitened forces, both by name."""
+class LossTerms:
+    """LossTerms of the loss of a batch, and sums of squares of its projected whitened forces, both by name."""
 
     losses: dict[str, Tensor]
     squares: dict[str, Tensor]
@@ -151,10 +151,10 @@ class Terms:
         """Sum of the terms."""
         return torch.stack(list(self.losses.values())).sum()
 
-    def plus(self, other: Terms, share: float) -> Terms:
+    def plus(self, other: LossTerms, share: float) -> LossTerms:
         """These and those of another batch, which holds this share of the samples, without their gradients."""
         losses = {name: self.losses.get(name, 0.0) + share * x.detach() for name, x in other.losses.items()}
-        return Terms(losses, {name: self.squares.get(name, 0.0) + x for name, x in other.squares.items()})
+        return LossTerms(losses, {name: self.squares.get(name, 0.0) + x for name, x in other.squares.items()})
 
 
 class Loss(nn.Module):
@@ -174,7 +174,7 @@ class Loss(nn.Module):
         learnable: LearnableParameters,
         residual: nn.Module | None,
     ) -> None:
-        """Fix what is trained on which logs."""
+        """Set parameters, module and logs."""
         super().__init__()
         self.settings = settings
         self.learnable, self.residual = learnable, residual
@@ -185,8 +185,8 @@ class Loss(nn.Module):
             "_bodies", torch.from_numpy(problem.free_bodies()).to(batches.columns.device), persistent=False
         )
 
-    def forward(self, batch: Batch) -> Terms:
-        """Terms of one batch."""
+    def forward(self, batch: Batch) -> LossTerms:
+        """LossTerms of one batch."""
         settings, phi = self.settings, self.learnable()
         rigid, other = self.forces(batch, phi)
         share = self._per_row / len(batch)
@@ -203,7 +203,7 @@ class Loss(nn.Module):
             forces["residual"] = other
             if self.residual_weight:
                 losses["residual"] = self.residual_weight * share * other.square().sum()
-        return Terms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
+        return LossTerms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
 
     def forces(self, batch: Batch, phi: Tensor) -> tuple[Tensor, Tensor | None]:
         """Whitened projected forces, (B, n_rows), of parameters (12 L,) and of the residual module."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchid.errors import UnknownNameError
-from torchid.estimators import BoundEstimate
+from torchid.estimators import ConstrainedEstimate
 from torchid.fitting.fit import Fit, LogFitter, Solve
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
@@ -276,7 +276,7 @@ def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
         return fit
     added = (factor**2 - 1.0) * estimate.cost
     changed: dict[str, Any] = {name: getattr(estimate, name) + added for name in ("cost", "nominal_cost")}
-    if isinstance(estimate, BoundEstimate):
+    if isinstance(estimate, ConstrainedEstimate):
         objectives = {name: getattr(estimate, name) for name in ("objective", "unconstrained")}
         changed |= {name: x + added / problem.rows for name, x in objectives.items() if x is not None}
     estimate = replace(estimate, standard_error=factor * estimate.standard_error, **changed)

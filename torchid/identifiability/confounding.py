@@ -172,7 +172,7 @@ class TotalMass:
         return self.separable and 2.0 * self.standard_error <= self.nominal
 
 
-def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1e-10) -> TotalMass:
+def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = RANK_TOLERANCE) -> TotalMass:
     """The total mass of estimated parameters, with a standard error without regularization.
 
     Args:
@@ -192,7 +192,7 @@ def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1
 
 @one_thread()
 def combination_standard_error(
-    problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = 1e-10
+    problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = RANK_TOLERANCE
 ) -> float:
     """Standard error of a combination `weights @ phi`, (12 L,), without regularization.
 

@@ -23,7 +23,7 @@ from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import state_name
 from torchid.problem.elimination import eliminate_columns
-from torchid.rounding import numerical_rank
+from torchid.rounding import RANK_TOLERANCE, numerical_rank
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def contributions(
     builder: RowBuilder,
     problem: LinearProblem,
     dof_names: Sequence[str],
-    rank_tolerance: float = 1e-10,
+    rank_tolerance: float = RANK_TOLERANCE,
     done: ProgressCallback | None = None,
 ) -> Contributions:
     """Leave every log, contact state and sensor out in turn.

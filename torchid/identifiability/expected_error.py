@@ -17,6 +17,7 @@ from torchid.problem.chunks import one_thread, subsample_states
 from torchid.problem.contact_state import State
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components
 from torchid.problem.predict import predicted_forces
+from torchid.rounding import RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 
 _SAMPLES = 400  # a contact state
@@ -75,7 +76,11 @@ def expected_errors(
 
 @one_thread()
 def error_directions(
-    problem: LinearProblem, ridge: float, noise_variance: float, prior_error: float, rank_tolerance: float = 1e-10
+    problem: LinearProblem,
+    ridge: float,
+    noise_variance: float,
+    prior_error: float,
+    rank_tolerance: float = RANK_TOLERANCE,
 ) -> Array:
     """Independent errors of least squares with a ridge, (M, P): their outer products sum up to the error's covariance.
 

@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.estimators import Estimate
-from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
+from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contribution, Contributions, PartContribution
@@ -27,7 +27,7 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS
 from torchid.text import escape, raw_stream
 
-MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
+MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNOBSERVABLE: ".", FIXED: ""}
 
 
 class PlainConsole(Console):

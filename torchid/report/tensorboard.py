@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from torch.utils.tensorboard import SummaryWriter
 
-from torchid.estimators import BoundEstimate, Epoch, Estimate
+from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
 from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, SETS
@@ -100,11 +100,11 @@ class RunEvents:
         self._writer.add_scalar("loss/data", estimate.nominal_cost / rows, 0)
         self._writer.add_scalar("loss/data", estimate.cost / rows, 1)
         self._writer.add_scalar("descent/samples_per_second", samples_per_second, 1)
-        if isinstance(estimate, BoundEstimate):
+        if isinstance(estimate, ConstrainedEstimate):
             self._writer.add_scalar("loss/prior", estimate.objective - estimate.cost / rows, 1)
             self._writer.add_scalar("closed_form/distance", estimate.distance, 1)
-            if estimate.relative_price is not None:
-                self._writer.add_scalar("closed_form/objective_above_least", estimate.relative_price, 1)
+            if estimate.relative_increase is not None:
+                self._writer.add_scalar("closed_form/objective_above_least", estimate.relative_increase, 1)
 
     def fit(self, step: int, estimate: Estimate) -> None:
         """Statistics of the problem."""

@@ -1,4 +1,4 @@
-"""The convex problem behind every consistent estimate: a quadratic, 4 x 4 semidefinite blocks, linear conditions."""
+"""The conic problem behind every consistent estimate: a quadratic, linear matrix inequalities, linear conditions."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ import numpy as np
 
 from torchid.errors import InputError
 from torchid.parameters import Array
-from torchid.rounding import is_significant
 
-SAME = 1e-9
-"""Numbers closer than this share of their scale are one."""
+EQUAL_WITHIN = 1e-9
+"""Numbers closer than this share of their scale count as equal."""
 
-REACH = 1e3
-"""Scales of the parameters: no better point is looked for further away, where the data say nothing."""
+SEARCH_RADIUS = 1e3
+"""Radius within which a gap holds, in scales of the parameters, along directions that the data do not determine."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A minimizer.
+    """An approximate minimizer.
 
     Attributes:
         x: (n,).
-        objective: there.
-        gap: its distance to the dual objective, which bounds how far it is above the least one.
+        objective: at x.
+        gap: duality gap, which bounds how far the objective is above the least one.
         steps: Newton steps, or iterations of the conic solver.
     """
 
@@ -36,8 +35,8 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class Row:
-    """A linear condition: row @ x >= bound, or == bound."""
+class LinearCondition:
+    """row @ x >= bound, or == bound, and its name for messages."""
 
     name: str
     row: Array
@@ -46,28 +45,31 @@ class Row:
 
 @dataclass(frozen=True)
 class ConicProblem:
-    """min ||R x - r||^2 + c^T x + constant - sum_k w_k log det J_k(x), with J_k(x) >= 0, G x >= h, E x = e.
+    """min ||R x - r||^2 + c^T x + constant - sum_k w_k log det F_k(x), with F_k(x) >= 0, G x >= h, E x = e.
+
+    The linear matrix inequalities are F_k(x) = F0_k + sum_v x_v F_kv, as in Boyd, Vandenberghe, "Convex Optimization",
+    section 4.6, each on ten of the variables.
 
     Attributes:
         root: R, (m, n); target: r, (m,); linear: c, (n,); constant.
-        base: (K, 4, 4), `J_k(0)`.
-        slopes: (K, 10, 4, 4), change of J_k with each of its variables; zero where it depends on fewer than ten.
+        F0: (K, 4, 4).
+        F: (K, 10, 4, 4), zero where an inequality depends on fewer than ten variables.
         variables: (K, 10) int, which entries of x those are.
         weights: (K,) >= 0, of the log-determinants in the objective (an entropic prior's).
         G, h: (M, n), (M,).
         E, e: (Q, n), (Q,), rows of E orthonormal.
-        names: (K,) and then (M,): what each condition says, for messages.
-        floor: > 0, an objective that is as good as none: below, gaps are relative to this.
-        deviations: (n, n): `deviations @ x` is what parameters deviate by from nominal, in units of their scale.
-        start: (n,), a point that is known to be inside all conditions; None where they are not known to leave room.
+        names: (K,) and then (M,): of the conditions, for messages.
+        floor: > 0, the objective that counts as 0: below, gaps are relative to this.
+        deviations: (n, n): `deviations @ x` is the deviation of the parameters from nominal, in units of their scale.
+        start: (n,), a strictly feasible point; None where none is known.
     """
 
     root: Array
     target: Array
     linear: Array
     constant: float
-    base: Array
-    slopes: Array
+    F0: Array
+    F: Array
     variables: np.ndarray
     weights: Array
     G: Array
@@ -82,7 +84,7 @@ class ConicProblem:
     @property
     def degree(self) -> int:
         """Degree of the barrier: near its minimizer at weight kappa the duality gap is this times kappa."""
-        return 4 * len(self.base) + len(self.h)
+        return 4 * len(self.F0) + len(self.h)
 
     @cached_property
     def hessian(self) -> Array:
@@ -90,8 +92,8 @@ class ConicProblem:
         return 2.0 * self.root.T @ self.root
 
     @cached_property
-    def moves(self) -> Array:
-        """Orthonormal moves that keep E x, (n, n - Q)."""
+    def null_space(self) -> Array:
+        """Orthonormal basis of the null space of E, (n, n - Q)."""
         if not len(self.e):
             return np.eye(len(self.linear))
         return np.ascontiguousarray(np.linalg.svd(self.E)[2][len(self.e) :].T)
@@ -104,19 +106,19 @@ class ConicProblem:
         return self.objective(np.asarray(np.linalg.lstsq(self.root, self.target)[0], dtype=np.float64))
 
     def blocks(self, x: Array) -> Array:
-        """J_k(x), (K, 4, 4)."""
-        return self.base + np.einsum("kv,kvij->kij", x[self.variables], self.slopes)
+        """F_k(x), (K, 4, 4)."""
+        return self.F0 + np.einsum("kv,kvij->kij", x[self.variables], self.F)
 
     def slack(self, x: Array) -> Array:
-        """How far every condition is from being broken: eigenvalues of the blocks (4 K,), then G x - h (M,)."""
+        """Distance of x from the border of every condition: eigenvalues of F_k(x) (4 K,), then G x - h (M,)."""
         return np.concatenate([np.linalg.eigvalsh(self.blocks(x)).ravel(), self.G @ x - self.h])
 
     def gradient(self, x: Array) -> Array:
-        """Of the quadratic and the linear term, (n,)."""
+        """Gradient of the quadratic and the linear term, (n,)."""
         return 2.0 * self.root.T @ (self.root @ x - self.target) + self.linear
 
     def objective(self, x: Array) -> float:
-        """Value at x; inf where a weighted block is not positive definite."""
+        """Objective at x; inf where a block with a weight is not positive definite."""
         misfit = self.root @ x - self.target
         value = misfit @ misfit + self.linear @ x + self.constant
         weighted = self.weights > 0.0
@@ -128,7 +130,7 @@ class ConicProblem:
         return float(value)
 
     def gap(self, x: Array, Z: Array, y: Array) -> float:
-        """Objective at x less the dual objective: no point of the domain within reach is better by more.
+        """Objective at x less the dual objective: no feasible point within `SEARCH_RADIUS` is better by more.
 
         Whatever the multipliers, weak duality holds, so that this bounds the error of any solver.
 
@@ -138,21 +140,22 @@ class ConicProblem:
             y: (M,) >= 0, multipliers of the rows.
         """
         blocks, weighted = self.blocks(x), self.weights > 0.0
-        turned = np.zeros_like(self.slopes)  # w J^-1 dJ J^-1, change of a weighted block's multiplier
+        turned = np.zeros_like(self.F)  # w F^-1 dF F^-1, change of the multiplier of a weighted block
         inverse = np.linalg.inv(blocks[weighted])[:, None]
-        turned[weighted] = self.weights[weighted, None, None, None] * inverse @ self.slopes[weighted] @ inverse
+        turned[weighted] = self.weights[weighted, None, None, None] * inverse @ self.F[weighted] @ inverse
         hessian = self.hessian.copy()
         pairs = (self.variables[:, :, None], self.variables[:, None, :])
-        np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", turned, self.slopes))
+        np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", turned, self.F))
         residual = self.gradient(x) - self.G.T @ y - self._gathered(Z)
-        # A Newton step says what the quadratic and the log-determinants can take up of it, at least cost.
-        values, vectors = np.linalg.eigh(self.moves.T @ hessian @ self.moves)
-        modes = vectors.T @ (self.moves.T @ residual)
-        seen = np.abs(modes) <= 2.0 * REACH * values
-        step = -self.moves @ (vectors[:, seen] @ (modes[seen] / np.maximum(values[seen], np.finfo(float).tiny)))
+        # A Newton step gives the part of it that the quadratic and the log-determinants balance at least cost.
+        values, vectors = np.linalg.eigh(self.null_space.T @ hessian @ self.null_space)
+        modes = vectors.T @ (self.null_space.T @ residual)
+        balanced = np.abs(modes) <= 2.0 * SEARCH_RADIUS * values
+        lengths = modes[balanced] / np.maximum(values[balanced], np.finfo(float).tiny)
+        step = -self.null_space @ (vectors[:, balanced] @ lengths)
         taken = np.einsum("kv,kvij->kij", step[self.variables], turned)
-        left = self.moves.T @ (residual + self.hessian @ step + self._gathered(taken))
-        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + REACH * np.abs(left).sum()
+        left = self.null_space.T @ (residual + self.hessian @ step + self._gathered(taken))
+        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + SEARCH_RADIUS * np.abs(left).sum()
         products = blocks @ (Z - taken)
         gap += np.trace(products[~weighted], axis1=1, axis2=2).sum()
         weights = self.weights[weighted, None]
@@ -162,22 +165,26 @@ class ConicProblem:
         return float(gap + (weights * (relative - 1.0 - np.log(relative))).sum())
 
     def _gathered(self, Z: Array) -> Array:
-        """Sum of <Z_k, dJ_k/dx>, (n,)."""
+        """Sum of <Z_k, dF_k/dx>, (n,)."""
         out = np.zeros(len(self.linear))
-        np.add.at(out, self.variables, np.einsum("kvij,kij->kv", self.slopes, Z))
+        np.add.at(out, self.variables, np.einsum("kvij,kij->kv", self.F, Z))
         return out
 
 
-def independent(rows: list[Row], count: int) -> tuple[Array, Array]:
-    """The same equalities in as few rows as they have rank.
+def reduce_equalities(rows: list[LinearCondition], count: int) -> tuple[Array, Array]:
+    """The same equalities E x = e in as few orthonormal rows as they have rank.
+
+    Args:
+        rows: the equalities.
+        count: of entries in x.
 
     Raises:
-        InputError: they contradict each other, or what is held fixed.
+        InputError: they contradict each other, or parameters that are not free.
     """
     E, e = np.array([row.row for row in rows]).reshape(len(rows), count), np.array([row.bound for row in rows])
     U, values, right = np.linalg.svd(E, full_matrices=False)
-    kept = is_significant(values)
-    off = np.abs(e - U[:, kept] @ (U[:, kept].T @ e)) > SAME * (1.0 + np.abs(e).max(initial=0.0))
+    kept = values > 1e-10 * values.max(initial=0.0)
+    off = np.abs(e - U[:, kept] @ (U[:, kept].T @ e)) > EQUAL_WITHIN * (1.0 + np.abs(e).max(initial=0.0))
     if off.any():
         names = ", ".join(dict.fromkeys(row.name for row, wrong in zip(rows, off, strict=True) if wrong))
         found = "contradicts what is held fixed or the other equalities"
@@ -185,17 +192,17 @@ def independent(rows: list[Row], count: int) -> tuple[Array, Array]:
     return right[kept], (U[:, kept].T @ e) / values[kept]
 
 
-def with_room(rows: list[Row], E: Array, e: Array) -> list[Row]:
-    """The rows that the equalities leave open: a barrier has no inside where they settle one.
+def remove_implied(rows: list[LinearCondition], E: Array, e: Array) -> list[LinearCondition]:
+    """The inequalities without those that equalities E x = e imply: with them there is no strictly feasible point.
 
     Raises:
-        InputError: the equalities contradict one.
+        InputError: an inequality contradicts the equalities.
     """
     out = []
     for row in rows:
         along = E @ row.row
-        if np.linalg.norm(row.row - E.T @ along) > SAME * np.linalg.norm(row.row):
+        if np.linalg.norm(row.row - E.T @ along) > EQUAL_WITHIN * np.linalg.norm(row.row):
             out.append(row)
-        elif along @ e < row.bound - SAME * (1.0 + abs(row.bound)):
+        elif along @ e < row.bound - EQUAL_WITHIN * (1.0 + abs(row.bound)):
             raise InputError("estimator", row.name, "excluded by equalities", "conditions that some robot can meet")
     return out
