@@ -12,7 +12,7 @@ import torch
 from physical import active_case, data, nothing_seen, random_bodies
 from synthetic import Array
 
-from torchid.estimators import ConstrainedEstimate, Consistent, Estimate, LeastSquares, Sgd, SgdEstimate, Trainer
+from torchid.estimators import Consistent, ConstrainedEstimate, Estimate, LeastSquares, Sgd, SgdEstimate, Trainer
 from torchid.estimators.consistent import ConsistentEstimate, Method, Prior
 from torchid.estimators.least_squares import FIXED, VERDICTS
 from torchid.problem import Batch, LinearProblem
