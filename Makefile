@@ -2,7 +2,15 @@
 PYTHON ?= python3
 PIP := .venv/bin/pip --disable-pip-version-check
 
-.PHONY: demo test clean
+# Tests of single parts: no commands, descents, bags, property tests of whole rows, nor comparisons over many robots.
+FAST := tests/config tests/logs tests/robot tests/regressor tests/sensing tests/problem/test_rows.py \
+	tests/estimators/test_conditions.py tests/estimators/test_least_squares.py tests/estimators/test_penalties.py
+SLOW := tests/logs/test_bags.py tests/logs/test_bag_messages.py tests/logs/test_bag_stamps.py tests/logs/test_mutations.py \
+	tests/regressor/test_oracle.py tests/robot/test_shapes.py \
+	tests/problem/test_rows.py::test_fast_rows_are_the_plain_ones_whatever_is_measured_touches_and_however_frames_are_turned
+TESTS ?= tests
+
+.PHONY: demo test test-fast coverage clean
 
 demo: .venv/ready
 	.venv/bin/torchid identify torchid/demo/quadruped.yaml output=runs/quadruped overwrite=true
@@ -14,8 +22,14 @@ test: .venv/ready-for-tests
 	.venv/bin/lint-imports
 	.venv/bin/pytest -n auto --dist loadfile
 
+test-fast: .venv/ready-for-tests
+	.venv/bin/pytest -n auto --dist loadfile $(FAST) $(SLOW:%=--deselect=%)
+
+coverage: .venv/ready-for-tests
+	.venv/bin/pytest -n auto --dist loadfile --cov=torchid $(TESTS)
+
 clean:
-	rm -rf .venv
+	rm -rf .venv .coverage
 
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -12,7 +12,7 @@ import torch
 from physical import active_case, data, nothing_seen, random_bodies
 from synthetic import Array
 
-from torchid.estimators import ConstrainedEstimate, Consistent, Estimate, LeastSquares, Sgd, SgdEstimate, Trainer
+from torchid.estimators import Consistent, ConstrainedEstimate, Estimate, LeastSquares, Sgd, SgdEstimate, Trainer
 from torchid.estimators.consistent import ConsistentEstimate, Method, Prior
 from torchid.estimators.least_squares import FIXED, VERDICTS
 from torchid.problem import Batch, LinearProblem
@@ -58,7 +58,7 @@ class EstimatorContract(ABC):
         problem = usual_problem()
         estimate = self.solve(problem)
         assert type(estimate) is self.kind
-        arrays = ("phi", "standard_error", "seen", "identifiable", "data_share", "verdict")
+        arrays = ("phi", "standard_error", "observable", "identifiable", "data_share", "verdict")
         assert {getattr(estimate, name).shape for name in arrays} == {(24,)}
         assert estimate.phi.dtype == estimate.standard_error.dtype == np.float64
         assert np.isfinite(estimate.phi).all()
@@ -68,7 +68,7 @@ class EstimatorContract(ABC):
         assert estimate.nominal_cost == problem.cost(problem.nominal)
         assert estimate.cost < estimate.nominal_cost
 
-    def test_bound_estimates_state_their_objective_above_the_unconstrained_one(self) -> None:
+    def test_an_estimate_under_conditions_states_its_objective_above_the_unconstrained_one(self) -> None:
         estimate = self.solve(usual_problem())
         if isinstance(estimate, ConstrainedEstimate):
             assert np.isfinite([estimate.objective, estimate.distance]).all()
