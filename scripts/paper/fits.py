@@ -1,4 +1,4 @@
-"""Compress the logs of one condition once per sensor set, fit any nominal parameters, predict unseen forces."""
+"""Compress the logs of one condition once per sensor set, fit any nominal parameters, predict other motions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class StateRank:
 
 @dataclass(frozen=True)
 class CompressedLogs:
-    """What a sensor set keeps of some groups of logs: a factor per group and contact state."""
+    """Groups of logs compressed for one sensor set: a factor per group and contact state."""
 
     experiment: Experiment
     builder: RowBuilder
@@ -43,7 +43,7 @@ class CompressedLogs:
         return [self._solve(factor, nominal, friction) for nominal in nominals]
 
     def ranks(self, groups: Sequence[str], friction: bool) -> list[StateRank]:
-        """What each contact state of some groups determines on its own, and all together, most frequent first."""
+        """Rank of each contact state of some groups on its own, most frequent first, and of all together."""
         nominal = self.experiment.robot.nominal
         (together,) = self.fit(groups, [nominal], friction)
         out = []
@@ -90,7 +90,7 @@ class Series:
     projected: Mapping[str, Array]
 
     def row(self, name: str) -> int:
-        """Place of a row."""
+        """Index of a row."""
         return self.rows.index(name)
 
 

@@ -19,7 +19,7 @@ NOMINAL, TRUE = "nominal", "true"
 class Record:
     """Errors of one parameter vector on the unseen log.
 
-    `measured` compares with what the imperfect sensors of that log say, `exact` with what truly happened.
+    `measured` compares with the readings of that log's imperfect sensors, `exact` with the true forces.
     """
 
     condition: str

@@ -74,7 +74,7 @@ class Judge:
         """Of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
 
         Args:
-            logs: as `in_folds` has cut them.
+            logs: as `split_into_folds` has cut them.
             parts: compressed, with the weights of a robust fit.
             both: nominal and identified parameters.
             left_out: those of a fit without each fold, by its number; none without cross-validation.
@@ -195,7 +195,7 @@ def chosen_ridge(
 
     Args:
         parts: of the blocks, compressed.
-        blocks: training logs, as `in_folds` cuts them.
+        blocks: training logs, as `split_into_folds` cuts them.
         scene: robot, contacts and settings.
         sensors: of the fit.
         builder: of the rows.

@@ -30,17 +30,17 @@ CHUNK = 2048
 def map_chunks(
     logs: Sequence[Samples],
     builder: RowBuilder,
-    fold: Callable[[Iterator[tuple[Samples, State]]], Result],
+    reduce: Callable[[Iterator[tuple[Samples, State]]], Result],
     chunk: int = CHUNK,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[Result]:
-    """What `fold` makes of the chunks of some logs, one result per worker.
+    """Results of `reduce` over the chunks of some logs, one per worker.
 
     Args:
-        logs: bound logs; each is moved to the builder's device chunk by chunk.
+        logs: each is moved to the builder's device chunk by chunk.
         builder: whose layouts and device are used.
-        fold: given an iterator over some of the chunks and their contact states.
+        reduce: given an iterator over some of the chunks and their contact states.
         chunk: samples per chunk.
         threads: workers, each with one intra-op thread (small arrays do not profit from more); by default one per
             intra-op thread torch would use, one if the builder is on a GPU.
@@ -52,7 +52,7 @@ def map_chunks(
     lock = threading.Lock()
 
     def run(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Result:
-        return fold(pieces(part))
+        return reduce(pieces(part))
 
     def pieces(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Iterator[tuple[Samples, State]]:
         for samples, state, index in part:
@@ -81,7 +81,7 @@ def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[Stat
 
 
 def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
-    """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
+    """About `count` samples of every contact state, evenly spread over the logs, and how many each represents."""
     found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
     for samples in logs:
         every = torch.arange(len(samples))

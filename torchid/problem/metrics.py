@@ -20,7 +20,7 @@ from torchid.sensing import Contact, named_sensors
 from torchid.text import listed
 
 WHITENED = "projected_residual"
-"""The group of the rows that a fit sees: whitened, and projected so that nothing unmeasured is in them."""
+"""The group of the rows of a fit: whitened, and projected so that nothing unmeasured is in them."""
 
 ROW_GROUPS = {
     "joint_torque": "joint torque [N m]",
@@ -130,7 +130,7 @@ class Evaluation:
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
     def summary(self, measured: ForceSums, errors: ForceSums) -> Metrics:
-        """What sums say."""
+        """Metrics from sums of squares."""
         base = self.robot.base_rows
         rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
         joints = slice(base, base + self.robot.n)
@@ -185,8 +185,8 @@ def describe_worse(found: list[WorseThanNominal]) -> str | None:
     if not found:
         return None
     by_logs = {one.logs: [str(other) for other in found if other.logs == one.logs] for one in found}
-    told = "; ".join(f"on {logs}: {listed(texts)}" for logs, texts in by_logs.items())
-    return f"the identified parameters predict worse than the URDF's, {told}"
+    texts_by_logs = "; ".join(f"on {logs}: {listed(texts)}" for logs, texts in by_logs.items())
+    return f"the identified parameters predict worse than the URDF's, {texts_by_logs}"
 
 
 def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:
@@ -221,7 +221,7 @@ def null_space_components(
 class ForceSums:
     """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space.
 
-    `whitened`: of the rows that a fit sees, V_x^T f of its sensors in units of their noise.
+    `whitened`: of the rows of a fit, V_x^T f of its sensors in units of their noise.
     """
 
     def __init__(self, n_rows: int) -> None:
@@ -268,7 +268,7 @@ class Squares:
         self.plain, self.sum, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
 
     def add(self, x: torch.Tensor, weight: float = 1.0) -> None:
-        """Add samples (N, rows), NaN where unknown, each of which stands for so many."""
+        """Add samples (N, rows), NaN where unknown, each of which counts as `weight` samples."""
         values = x.cpu().numpy()
         known = np.isfinite(values)
         values = np.where(known, values, 0.0)
@@ -300,7 +300,7 @@ class Squares:
         return float(np.sqrt(max((self.sum[rows][known] - plain**2 / count).sum(), 0.0) / count.sum()))
 
     def merge(self, other: Squares) -> None:
-        """Add what another has seen."""
+        """Add the sums of another."""
         self.plain += other.plain
         self.sum += other.sum
         self.count += other.count

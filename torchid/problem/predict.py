@@ -26,7 +26,7 @@ _ROWS = 2**16  # of a log on the disk that are in memory at a time
 
 
 def calibrate_readings(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
-    """Samples whose readings are the forces they stand for: s y - o for an offset o and a scale s of the reading y.
+    """Samples whose readings are the forces themselves: s y - o for an offset o and a scale s of the reading y.
 
     Readings without unknowns are shared with `samples`; those that change lie on the disk if `samples` do.
 
@@ -150,7 +150,7 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
 
 
 def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
-    """V_x V_x^T f of generalized forces (M, N, n_rows): what is left of each row inside the builder's null space."""
+    """V_x V_x^T f of generalized forces (M, N, n_rows): the part of each row inside the builder's null space."""
     out, base = forces.copy(), builder.tree.base_rows
     with torch.no_grad(), one_thread():
         for state, index in chunks_by_state(samples):
@@ -158,7 +158,7 @@ def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Arr
             coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
             for part, V in builder.null_space_bases(samples[index].to(builder.device), state):
                 chosen = where[part if isinstance(part, slice) else part.cpu().numpy()]
-                place = np.ix_(np.arange(len(forces)), chosen, coupled)
-                inside = V @ (V.mT @ torch.from_numpy(forces[place]).to(V)[..., None])
-                out[place] = inside[..., 0].cpu().numpy()
+                at = np.ix_(np.arange(len(forces)), chosen, coupled)
+                inside = V @ (V.mT @ torch.from_numpy(forces[at]).to(V)[..., None])
+                out[at] = inside[..., 0].cpu().numpy()
     return out

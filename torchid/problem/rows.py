@@ -145,7 +145,7 @@ class RowBuilder(nn.Module):
 
         Yields:
             (columns, rows): rows are (M, len(columns) + 1), the right-hand side last, valid until the next
-                is asked for.
+                is requested.
         """
         workspace = workspace or Workspace()
         layout, dynamics = self.layout(state), self.dynamics(samples, workspace)
@@ -294,24 +294,24 @@ class RowBuilder(nn.Module):
                 torch.addcmul(above, dynamics.directions[:, body, None], own[moved[body]], out=carried[:, body])
             else:
                 carried[:, body] = above
-        for kept, bodies in column_layout.runs(layout.bodies):
+        for kept, bodies in column_layout.runs(layout.nodes):
             if kept:
                 start, end = column_layout.starts[bodies.start], column_layout.starts[bodies.stop]
                 shape = (len(bodies), len(kept))
-                pulling = sum(column < parameters.INERTIA.start for column in kept)
+                n_with_force = sum(column < parameters.INERTIA.start for column in kept)
                 columns = X[start - inertial.start : end - inertial.start].unflatten(0, shape)
                 wrenches = dynamics.wrenches[:, start:end].unflatten(1, shape)
-                self._carry(wrenches, carried[:, bodies.start : bodies.stop], pulling, columns)
+                self._carry(wrenches, carried[:, bodies.start : bodies.stop], n_with_force, columns)
         return X
 
     @staticmethod
-    def _carry(wrenches: Tensor, carried: Tensor, pulling: int, out: Tensor) -> None:
-        """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `pulling` columns have a force."""
+    def _carry(wrenches: Tensor, carried: Tensor, n_with_force: int, out: Tensor) -> None:
+        """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `n_with_force` c have forces."""
         torch.mul(wrenches[3].unsqueeze(2), carried[3].unsqueeze(1), out=out)
         for k in (4, 5):
             out.addcmul_(wrenches[k].unsqueeze(2), carried[k].unsqueeze(1))
         for k in (0, 1, 2):
-            out[:, :pulling].addcmul_(wrenches[k, :, :pulling].unsqueeze(2), carried[k].unsqueeze(1))
+            out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), carried[k].unsqueeze(1))
 
     def _contact_rows(self, layout: ContactStateLayout, dynamics: ChunkDynamics) -> tuple[Tensor, Tensor]:
         """Rows of J_C, unmeasured and measured, in base and coupled joints, (B, k, base rows + coupled joints)."""
@@ -331,13 +331,14 @@ class RowBuilder(nn.Module):
                     starts[kind] += len(wrenches)
         return tuple(both.permute(2, 0, 1).split(sizes, dim=1))
 
-    def _index(self, places: Iterable[int]) -> Tensor:
-        return torch.tensor(list(places), dtype=torch.int64, device=self.device)
+    def _index(self, indices: Iterable[int]) -> Tensor:
+        return torch.tensor(list(indices), dtype=torch.int64, device=self.device)
 
     def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""
-        places = [place for body in layout.contact_bodies for place in body.components]
+        components = [component for body in layout.contact_bodies for component in body.components]
         local = {
-            contact: self.recorded_wrench(samples, contact, dynamics) for contact in {contact for contact, _ in places}
+            contact: self.recorded_wrench(samples, contact, dynamics)
+            for contact in {contact for contact, _ in components}
         }
-        return torch.stack([local[contact][:, k] for contact, k in places], dim=1)
+        return torch.stack([local[contact][:, k] for contact, k in components], dim=1)

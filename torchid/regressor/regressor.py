@@ -1,4 +1,4 @@
-"""The regressor K(q, v, a): its rows, batch-last, and a module for anybody's training loop."""
+"""The regressor K(q, v, a): a differentiable module, and the batch-last functions that compute its rows."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Regressor(nn.Module):
         return self.from_motion(motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity))
 
     def from_motion(self, motion: Motion) -> Tensor:
-        """As `forward`, from a `Motion` (which knows no base position, heading or linear velocity)."""
+        """As `forward`, from a `Motion` (which has no base position, heading or linear velocity)."""
         tree, layout = self.tree, self._layout
         joints = joint_motion(tree, motion)
         states = body_states(tree, motion, joints)
@@ -154,7 +154,7 @@ def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | N
     Args:
         states: of the frames that `layout`'s parameters are expressed in.
         layout: which columns to compute.
-        out: a buffer of the result's shape to write to, as it was left by an earlier call with the same layout.
+        out: a buffer of the result's shape to write to, unchanged since an earlier call with the same layout, or zero.
     """
     if out is None:
         out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
