@@ -101,7 +101,7 @@ class Judge:
         """Of the measured forces and of the errors, for each calibration."""
         phi = np.stack([one.parameters(self.evaluation) for one in calibrations])
         if not calibrations[0].changes_readings:
-            measured, *errors = self.evaluation.sums(logs, phi, progress)
+            measured, *errors = self.evaluation.force_sums(logs, phi, progress)
             pairs = [(_copied(measured), error) for error in errors]
         else:
             pairs = []
@@ -110,7 +110,9 @@ class Judge:
                     if number != 1:  # the identified ones say the same
                         warnings.simplefilter("ignore", TorchidWarning)
                     readings = one.logs(logs)
-                measured, error = self.evaluation.sums(readings, phi[number : number + 1], progress if number else None)
+                measured, error = self.evaluation.force_sums(
+                    readings, phi[number : number + 1], progress if number else None
+                )
                 pairs.append((measured, error))
         for (measured, error), squares in zip(pairs, residuals(self.builder, logs, parts, calibrations), strict=True):
             for sums, found in ((measured, squares.measured), (error, squares.error)):
@@ -120,7 +122,7 @@ class Judge:
     def _metrics(self, sums: Sequence[Sequence[tuple[ForceSums, ForceSums]]]) -> list[Metrics]:
         """Of each calibration, over all folds."""
         return [
-            self.evaluation.summary(*(ForceSums.total(each) for each in zip(*same, strict=True)))
+            self.evaluation.summarize(*(ForceSums.total(each) for each in zip(*same, strict=True)))
             for same in zip(*sums, strict=True)
         ]
 

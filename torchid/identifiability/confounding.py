@@ -178,12 +178,12 @@ def _found(
 ) -> list[ExtraEstimate]:
     """The unknowns of one elimination, at identified and nominal parameters; `shared`: those they depend on."""
     P = len(known.free)
-    sensitivity, own, hidden = found.inverse @ found.C[:, :P], [found.inverse], [found.hidden]
+    sensitivity, own, hidden = found.inverse @ found.C[:, :P], [found.inverse], [found.unobservable]
     if shared is not None:
         through = found.inverse @ found.C[:, P:]
         sensitivity = sensitivity - through @ shared.inverse @ shared.C[:, :P]
         own.append(through @ shared.inverse)
-        hidden.append(through @ shared.hidden)
+        hidden.append(through @ shared.unobservable)
     G = known.reached(sensitivity)
     unseen = G @ known.hidden
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
@@ -194,14 +194,14 @@ def _found(
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
     for k, extra in enumerate(found.extras):
-        if not np.isfinite(found.alone[k]):
+        if not np.isfinite(found.std_if_known[k]):
             continue
-        inflation = float(deviation[k] / found.alone[k])
+        inflation = float(deviation[k] / found.std_if_known[k])
         mixed: tuple[str, ...] = ()
         if inflation > APART:
             blamed = lost[k] or 2.0 * through_parameters[k] > variance[k]
             mixed = _largest(known.blamed(G[k], noise), names) if blamed else ()
-            others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.hidden[k]), _labels(found))
+            others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.unobservable[k]), _labels(found))
             mixed = (*mixed, *others)
         error = noise * float(deviation[k]) if np.isfinite(deviation[k]) else np.inf
         value, nominal = (float(x[k]) for x in values)

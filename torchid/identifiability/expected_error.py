@@ -16,7 +16,7 @@ from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import one_thread, subsample_states
 from torchid.problem.contact_state import State
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components
-from torchid.problem.predict import predicted_forces
+from torchid.problem.predict import predict_forces
 from torchid.rounding import RANK_TOLERANCE, is_significant
 from torchid.sensing import SensorNoise
 
@@ -96,7 +96,7 @@ def expected_errors(
     for samples, state, weight in subsample_states(logs, _SAMPLES):
         samples = samples.to(builder.device)
         terms = builder.dynamics(samples)
-        predicted = torch.stack([predicted_forces(builder, terms, phi).T for phi in columns])
+        predicted = torch.stack([predict_forces(builder, terms, phi).T for phi in columns])
         rows = _row_noise(builder, samples, noise)
         through_contacts = _wrench_noise(builder, samples, state, noise)
         for sums, errors, without_contacts in (

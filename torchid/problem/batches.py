@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
-from torchid.problem.predict import predicted_forces
+from torchid.problem.predict import predict_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
@@ -131,7 +131,7 @@ class MiniBatches:
         for log in self._logs:
             for start in range(0, len(log), _CHUNK):
                 samples = log[start : start + _CHUNK].to(self.builder.device)
-                yield samples.coordinates(), predicted_forces(self.builder, self.builder.dynamics(samples), columns).T
+                yield samples.coordinates(), predict_forces(self.builder, self.builder.dynamics(samples), columns).T
 
     def _generator(self, number: int) -> torch.Generator:
         return torch.Generator().manual_seed((self.seed * 1_000_003 + number) % 2**63)

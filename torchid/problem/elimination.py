@@ -27,8 +27,8 @@ class Elimination:
         inverse: (M, r), of least norm; the noise of the r rows is white, of unit variance, and in no other row.
         C: (r, 12 L + S), columns of the bodies' parameters and, for those of one log, of the S unknowns of all logs.
         z: (r,).
-        alone: (M,), standard deviation of each unknown if all else were known, infinite where no row has it.
-        hidden: (M, M) projector to combinations that no row has.
+        std_if_known: (M,), standard deviation of each unknown if all else were known; infinite if no row depends on it.
+        unobservable: (M, M), projector to combinations that no row depends on.
     """
 
     log: str
@@ -36,13 +36,15 @@ class Elimination:
     inverse: Array
     C: Array
     z: Array
-    alone: Array
-    hidden: Array
+    std_if_known: Array
+    unobservable: Array
 
     @property
     def determined(self) -> np.ndarray:
         """Unknowns that the rows give if the bodies' parameters are known, (M,) bool."""
-        return np.asarray(np.isfinite(self.alone) & (np.linalg.norm(self.hidden, axis=1) < UNOBSERVABLE_SHARE))
+        return np.asarray(
+            np.isfinite(self.std_if_known) & (np.linalg.norm(self.unobservable, axis=1) < UNOBSERVABLE_SHARE)
+        )
 
 
 @dataclass(frozen=True)
@@ -120,9 +122,9 @@ def _eliminate(
     U, values, V, remaining = _split(np.where(present, columns / scale, 0.0), rest)
     top, count = U.T @ rest, builder.columns.count
     C = np.hstack([top[:, :count] @ builder.columns.parameter_map(), top[:, count:-1]])
-    alone = np.where(present, 1.0 / scale, np.inf)
-    hidden = np.eye(len(extras)) - V @ V.T
-    found = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], alone, hidden)
+    std_if_known = np.where(present, 1.0 / scale, np.inf)
+    unobservable = np.eye(len(extras)) - V @ V.T
+    found = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], std_if_known, unobservable)
     return found, remaining
 
 

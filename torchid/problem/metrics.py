@@ -12,7 +12,7 @@ from torchid.parameters import Array
 from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import State
 from torchid.problem.extras import ExtraTerms
-from torchid.problem.predict import measured_and_predicted
+from torchid.problem.predict import measured_and_predicted_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
@@ -106,10 +106,12 @@ class Evaluation:
 
         Without the whitened projected residual, which depends on sensors.
         """
-        measured, *errors = self.sums(logs, phi, progress)
-        return [self.summary(measured, error) for error in errors]
+        measured, *errors = self.force_sums(logs, phi, progress)
+        return [self.summarize(measured, error) for error in errors]
 
-    def sums(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[ForceSums]:
+    def force_sums(
+        self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None
+    ) -> list[ForceSums]:
         """Of the measured forces, then of the errors of each row of `phi`."""
         builder = self.builder
         columns = builder.to_columns(phi)
@@ -117,7 +119,7 @@ class Evaluation:
         def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
-                found = measured_and_predicted(builder, samples, state, columns)
+                found = measured_and_predicted_forces(builder, samples, state, columns)
                 for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
                     total.rows.add(predicted - found.measured)
                 vectors = torch.cat([found.torque[None], found.predicted - found.torque])
@@ -129,7 +131,7 @@ class Evaluation:
         parts = map_chunks(logs, builder, fold, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
-    def summary(self, measured: ForceSums, errors: ForceSums) -> Metrics:
+    def summarize(self, measured: ForceSums, errors: ForceSums) -> Metrics:
         """Metrics from sums of squares."""
         base = self.robot.base_rows
         rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
@@ -226,7 +228,7 @@ class ForceSums:
 
     def __init__(self, n_rows: int) -> None:
         """Start empty."""
-        self.rows, self.projected, self.whitened = Squares(n_rows), Squares(1), Squares(1)
+        self.rows, self.projected, self.whitened = SumsOfSquares(n_rows), SumsOfSquares(1), SumsOfSquares(1)
 
     @classmethod
     def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
@@ -260,7 +262,7 @@ class ForceSums:
         return float(force), float(moment)
 
 
-class Squares:
+class SumsOfSquares:
     """Sums and sums of squares by row, over the samples where the row is known."""
 
     def __init__(self, rows: int) -> None:
@@ -299,7 +301,7 @@ class Squares:
             return np.nan
         return float(np.sqrt(max((self.sum[rows][known] - plain**2 / count).sum(), 0.0) / count.sum()))
 
-    def merge(self, other: Squares) -> None:
+    def merge(self, other: SumsOfSquares) -> None:
         """Add the sums of another."""
         self.plain += other.plain
         self.sum += other.sum

@@ -69,7 +69,7 @@ def _readings(samples: Samples, known: Sequence[tuple[Extra, float]], tree: Kine
 
 
 @dataclass(frozen=True)
-class Forces:
+class GeneralizedForces:
     """Generalized forces of some samples, rows as in K: base force, base moment, joints.
 
     `measured`, (B, n_rows): S^T tau + J_C^T lambda [N, N m], NaN where a force that enters was not measured. `torque`,
@@ -81,7 +81,7 @@ class Forces:
     predicted: Tensor
 
 
-def predicted_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
+def predict_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
     """K phi, (n_rows, B), for parameters in the builder's columns, (columns,), without extras.
 
     Bodies' wrenches, summed over subtrees, work along screw axes: the rows of K are never formed.
@@ -118,7 +118,9 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: State, dynamics
     return total
 
 
-def measured_and_predicted(builder: RowBuilder, samples: Samples, state: State, phi: Tensor) -> Forces:
+def measured_and_predicted_forces(
+    builder: RowBuilder, samples: Samples, state: State, phi: Tensor
+) -> GeneralizedForces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
 
     Sensors count as calibrated: of the extras, those of actuators alone enter.
@@ -127,12 +129,12 @@ def measured_and_predicted(builder: RowBuilder, samples: Samples, state: State, 
     base_rows = builder.tree.base_rows
     torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
     measured = torque + contact_forces(builder, samples, state, dynamics).T
-    predicted = torch.stack([predicted_forces(builder, dynamics, p).T for p in phi])
+    predicted = torch.stack([predict_forces(builder, dynamics, p).T for p in phi])
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
         if extra.dof is not None and extra.what in ACTUATORS:
             column = dof_extra_column(extra, samples, builder.tree)
             predicted[..., base_rows + extra.dof] += phi[:, number, None] * column
-    return Forces(measured, torque, predicted)
+    return GeneralizedForces(measured, torque, predicted)
 
 
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
@@ -142,7 +144,7 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
     measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
     with torch.no_grad(), one_thread():
         for state, index in chunks_by_state(samples):
-            found = measured_and_predicted(builder, samples[index].to(builder.device), state, columns)
+            found = measured_and_predicted_forces(builder, samples[index].to(builder.device), state, columns)
             where = index if isinstance(index, slice) else index.numpy()
             measured[where] = found.measured.cpu().numpy()
             predicted[:, where] = found.predicted.cpu().numpy()
