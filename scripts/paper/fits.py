@@ -62,7 +62,7 @@ class CompressedLogs:
         return batch_estimator(settings, stated_conditions(settings, robot)).solve(problem)
 
 
-def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
+def compress_groups(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
     """Compress groups of logs with an experiment's sensors."""
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(experiment.config.device)
     factors = {name: compress_by_state(logs, builder) for name, logs in groups.items()}
@@ -94,7 +94,7 @@ class Series:
         return self.rows.index(name)
 
 
-def series_of(evaluation: Evaluation, samples: Samples, phi: Mapping[str, Array]) -> Series:
+def predict_series(evaluation: Evaluation, samples: Samples, phi: Mapping[str, Array]) -> Series:
     """Forces of a log and the predictions of named parameter vectors (12 L,)."""
     true, predicted = force_series(evaluation.builder, samples, np.stack(list(phi.values())))
     inside = null_space_part(evaluation.builder, samples, np.concatenate([true[None], predicted]))

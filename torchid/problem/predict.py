@@ -93,7 +93,7 @@ def predict_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) ->
         by_body[body, start:end] = phi[start:end]
     wrench = by_body @ dynamics.wrenches  # (6, L, B)
     below = tree.ancestors.T @ wrench
-    torque = (dynamics.directions * below).sum(0)
+    torque = (dynamics.screw_axes * below).sum(0)
     coulomb, viscous = phi[layout.count : builder.columns.count].unflatten(0, (-1, 2)).unbind(1)
     velocity = dynamics.joints.velocity[1:]
     torque[1:] += coulomb[:, None] * tree.coulomb_sign(velocity) + viscous[:, None] * velocity
@@ -114,7 +114,7 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: State, dynamics
             wrench = (wrenches_at_base(dynamics.states, body, units) * components).sum(1, keepdim=True)
             joints = builder.columns.joints_above(body)  # and no others, where an unmeasured force would be NaN
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
-            total[rows] += generalized_forces(tree, dynamics.directions, body, wrench, joints)[0]
+            total[rows] += generalized_forces(tree, dynamics.screw_axes, body, wrench, joints)[0]
     return total
 
 

@@ -30,13 +30,13 @@ def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor) -> Tensor:
 
 
 def generalized_forces(
-    tree: KinematicTree, directions: Tensor, body: int, wrenches: Tensor, joints: Sequence[int]
+    tree: KinematicTree, screw_axes: Tensor, body: int, wrenches: Tensor, joints: Sequence[int]
 ) -> Tensor:
     """Work of wrenches on a body, per unit of base twist and joint velocity.
 
     Args:
         tree: the robot's constants.
-        directions: from `joint_screw_axes`, (6, L, B).
+        screw_axes: from `joint_screw_axes`, (6, L, B).
         body: the node that they act on.
         wrenches: at the base origin, (6, k, B) [N, N m].
         joints: independent joints to give columns for, after the base's six (none for a fixed base).
@@ -45,7 +45,7 @@ def generalized_forces(
         (k, base rows + len(joints), B).
     """
     path = tree.path(body)
-    screws = tree.joint_map[path][:, list(joints)].T @ directions[:, path]
+    screws = tree.joint_map[path][:, list(joints)].T @ screw_axes[:, path]
     torque = (wrenches[:, :, None] * screws[:, None]).sum(0)
     return torch.cat([wrenches.transpose(0, 1), torque], dim=1) if tree.base_rows else torque
 
