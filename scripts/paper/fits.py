@@ -14,7 +14,7 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, linear_problem
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import compress_by_state, merge_factors
-from torchid.problem.contact_state import State, state_name
+from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import BASE_ROWS
 from torchid.problem.predict import force_series, null_space_part
 
@@ -34,8 +34,8 @@ class CompressedLogs:
 
     experiment: Experiment
     builder: RowBuilder
-    factors: Mapping[str, Mapping[State, TriangularFactor]]
-    counts: Mapping[str, Mapping[State, int]]
+    factors: Mapping[str, Mapping[ContactState, TriangularFactor]]
+    counts: Mapping[str, Mapping[ContactState, int]]
 
     def fit(self, groups: Sequence[str], nominals: Sequence[Array], friction: bool) -> list[Estimate]:
         """Parameters from some groups of logs, near each of some nominal ones (L, 12)."""
@@ -66,7 +66,7 @@ def compress_groups(experiment: Experiment, groups: Mapping[str, Sequence[Sample
     """Compress groups of logs with an experiment's sensors."""
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(experiment.config.device)
     factors = {name: compress_by_state(logs, builder) for name, logs in groups.items()}
-    counts: dict[str, dict[State, int]] = {name: {} for name in groups}
+    counts: dict[str, dict[ContactState, int]] = {name: {} for name in groups}
     for name, logs in groups.items():
         for samples in logs:
             for state, index in chunks_by_state(samples):

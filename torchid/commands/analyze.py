@@ -25,7 +25,7 @@ from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import free_parameters
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
 from torchid.problem.linear import parameter_scale
 from torchid.report.analysis import (
@@ -95,7 +95,9 @@ def placed(source: object, field: str = "analysis", instead_of: str = "") -> Ite
         raise SensorError(source, _place(field, instead_of, error), error.found, error.accepted) from error
 
 
-def scenarios(scene: Scene, train: Sequence[Samples], source: object = "experiment") -> dict[str, tuple[State, ...]]:
+def scenarios(
+    scene: Scene, train: Sequence[Samples], source: object = "experiment"
+) -> dict[str, tuple[ContactState, ...]]:
     """Contact states by scenario; of logs, most frequent first.
 
     Raises:
@@ -104,7 +106,7 @@ def scenarios(scene: Scene, train: Sequence[Samples], source: object = "experime
     frames = [contact.frame for contact in scene.contacts]
     wanted = scene.config.analysis.scenarios
     if wanted is None:
-        seen: Counter[State] = Counter()
+        seen: Counter[ContactState] = Counter()
         for samples in train:
             for state, index in chunks_by_state(samples):
                 seen[state] += len(samples[index])
@@ -157,7 +159,7 @@ class Scenario:
     """
 
     name: str
-    states: tuple[State, ...]
+    states: tuple[ContactState, ...]
     plan: SensorPlan
     proposed: tuple[StateCheck, ...] | None
     base: BaseParameters
@@ -269,7 +271,9 @@ def _weighed(scene: Scene, train: Sequence[Samples], source: object) -> Scene:
     return replace(scene, config=stating(scene.config, found))
 
 
-def _answered(ask: Asked, name: str, states: tuple[State, ...], train: Sequence[Samples], bars: Progress) -> Scenario:
+def _answered(
+    ask: Asked, name: str, states: tuple[ContactState, ...], train: Sequence[Samples], bars: Progress
+) -> Scenario:
     """Everything that is asked of one scenario."""
     scene, settings = ask.scene, ask.scene.config.analysis
     robot, contacts = scene.robot, scene.contacts

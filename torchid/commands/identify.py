@@ -31,7 +31,7 @@ from torchid.identifiability.rank import StateReport, check_base, state_reports
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts
 from torchid.problem.compression import Part, merge_folds, merge_states, split_into_folds
-from torchid.problem.contact_state import State, state_name
+from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import SETS
 from torchid.report.tables import progress_bars
 
@@ -240,7 +240,7 @@ def _by_state(
     experiment: Experiment, builder: RowBuilder, parts: Sequence[Part], source: object
 ) -> dict[str, Estimate]:
     """What each contact state determines on its own, by least squares, most frequent first."""
-    settings, samples = experiment.config.estimator, Counter[State]()
+    settings, samples = experiment.config.estimator, Counter[ContactState]()
     for part in parts:
         samples[part.state] += part.samples
     estimator, out = LeastSquares(settings.pull, settings.rank_tolerance), {}

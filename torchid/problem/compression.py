@@ -14,7 +14,7 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.chunks import CHUNK, ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder, Workspace
 from torchid.problem.samples import Samples
@@ -33,7 +33,7 @@ _NORMAL = 0.6745  # median of |x| of standard normal x
 RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
 """Weighted rows from the samples that they come from, their columns, and themselves."""
 
-_Key = tuple[str, State, int, bool]
+_Key = tuple[str, ContactState, int, bool]
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Part:
     """
 
     source: str
-    state: State
+    state: ContactState
     factor: TriangularFactor
     samples: int
     fold: int = 0
@@ -73,7 +73,7 @@ def compress_by_state(
     chunk: int = CHUNK,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
-) -> dict[State, TriangularFactor]:
+) -> dict[ContactState, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
     found = map_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
     return {part.state: part.factor for part in _merge_parts(found)}
@@ -99,13 +99,16 @@ def compress_parts(
 
 
 def _fold(
-    builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weight_rows: RowWeighting | None = None
+    builder: RowBuilder,
+    chunks: Iterator[tuple[Samples, ContactState]],
+    by_log: bool,
+    weight_rows: RowWeighting | None = None,
 ) -> list[Part]:
     """Compress some chunks into parts, of all logs together unless `by_log`."""
     parts: dict[_Key, Part] = {}
     workspace = Workspace()
 
-    def part(samples: Samples, state: State, unloaded: bool) -> Part:
+    def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
         key = (samples.source, state, samples.fold, unloaded) if by_log else ("", state, 0, False)
         return parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
 
@@ -225,7 +228,7 @@ def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Sampl
 
 def _count(logs: Sequence[Samples], builder: RowBuilder) -> int:
     independent = sum(len(log) / log.oversampling for log in logs)
-    states: set[tuple[str, State]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
+    states: set[tuple[str, ContactState]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
     size = 8 * (builder.width + 1) ** 2 * max(len(states), 1) * worker_count(builder.device)
     return max(1, min(FOLDS, int(independent / _LEAST), _MEMORY // size))
 

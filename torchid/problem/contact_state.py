@@ -21,11 +21,11 @@ from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 from torchid.sensing import Contact, SensorSet
 
-State = tuple[bool, ...]
+ContactState = tuple[bool, ...]
 """Which contacts touch the ground."""
 
 
-def state_name(contacts: Sequence[Contact], state: State) -> str:
+def state_name(contacts: Sequence[Contact], state: ContactState) -> str:
     """Frames in contact, joined by "+"."""
     return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or "none"
 
@@ -139,9 +139,9 @@ class ContactStateLayouts:
         self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
-        self._made: dict[State, ContactStateLayout] = {}
+        self._made: dict[ContactState, ContactStateLayout] = {}
 
-    def layout(self, state: State) -> ContactStateLayout:
+    def layout(self, state: ContactState) -> ContactStateLayout:
         """The layout of a contact state, worked out when it is first needed."""
         if state not in self._made:
             self._made[state] = self._lay_out(state)
@@ -151,7 +151,7 @@ class ContactStateLayouts:
         """Drop all layouts: the robot's constants have moved to another device or precision."""
         self._made.clear()
 
-    def _lay_out(self, state: State) -> ContactStateLayout:
+    def _lay_out(self, state: ContactState) -> ContactStateLayout:
         touching: dict[int, list[int]] = {}
         for contact, active in enumerate(state):
             if active:

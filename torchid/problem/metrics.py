@@ -10,7 +10,7 @@ import torch
 
 from torchid.parameters import Array
 from torchid.problem.chunks import ProgressCallback, map_chunks
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.predict import measured_and_predicted_forces
 from torchid.problem.rows import RowBuilder
@@ -116,7 +116,7 @@ class Evaluation:
         builder = self.builder
         columns = builder.to_columns(phi)
 
-        def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
+        def fold(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
                 found = measured_and_predicted_forces(builder, samples, state, columns)
@@ -206,7 +206,7 @@ def group_name(group: str) -> str:
 
 
 def null_space_components(
-    builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor
+    builder: RowBuilder, samples: Samples, state: ContactState, vectors: torch.Tensor
 ) -> Iterator[torch.Tensor]:
     """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.compression import Part
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
 from torchid.problem.linear import LinearProblem, TriangularFactor
 from torchid.problem.rows import RowBuilder
@@ -73,7 +73,7 @@ class _Chunk:
     """
 
     log: str
-    state: State
+    state: ContactState
     oversampling: float
     rows: Tensor
     sources: Tensor
@@ -114,7 +114,7 @@ class SampledRows:
         counts = np.array([[len(chunk.rows), len(chunk.rows) / chunk.oversampling] for chunk in self.chunks]).sum(0)
         return float(counts[0] / counts[1])
 
-    def _chunk(self, samples: Samples, state: State) -> _Chunk:
+    def _chunk(self, samples: Samples, state: ContactState) -> _Chunk:
         rows, W = self.builder.rows_by_sample(samples.to(self.builder.device), state)
         sources = (self._ways(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
         return _Chunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
@@ -158,7 +158,7 @@ class SampledRows:
         With parameters of an earlier fit in the builder's columns, by log, rows that are far off count less, as in
         Huber's loss: what impacts do to the parameters would look like noise of all rows.
         """
-        parts: dict[tuple[str, State], Part] = {}
+        parts: dict[tuple[str, ContactState], Part] = {}
         every = tuple(range(self.builder.width))
         for chunk in self.whitened(variance):
             key = chunk.log, chunk.state
@@ -182,7 +182,7 @@ def _source_names(builder: RowBuilder) -> list[str]:
     return [*BASE_GROUPS[: builder.tree.base_rows], *dofs, *contacts]
 
 
-def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State]]:
+def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, ContactState]]:
     """About so many samples, at random so that no gait is in step with them, log by log and state by state.
 
     Of filtered logs, four for every independent one: more would add little.

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchid.logs.spill import Spill
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
-from torchid.problem.contact_state import State, contact_extra_column, dof_extra_column
+from torchid.problem.contact_state import ContactState, contact_extra_column, dof_extra_column
 from torchid.problem.extras import ACTUATORS, Extra
 from torchid.problem.rows import ChunkDynamics, RowBuilder
 from torchid.problem.samples import Samples
@@ -101,7 +101,7 @@ def predict_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) ->
     return torch.cat([wrench.sum(1), joints]) if tree.base_rows else joints
 
 
-def contact_forces(builder: RowBuilder, samples: Samples, state: State, dynamics: ChunkDynamics) -> Tensor:
+def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, dynamics: ChunkDynamics) -> Tensor:
     """J_C^T lambda, (n_rows, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
     tree = builder.tree
     total = samples.time.new_zeros(tree.n_rows, len(samples))
@@ -119,7 +119,7 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: State, dynamics
 
 
 def measured_and_predicted_forces(
-    builder: RowBuilder, samples: Samples, state: State, phi: Tensor
+    builder: RowBuilder, samples: Samples, state: ContactState, phi: Tensor
 ) -> GeneralizedForces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
 

@@ -14,9 +14,9 @@ from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.contact_state import (
     Columns,
+    ContactState,
     ContactStateLayout,
     ContactStateLayouts,
-    State,
     dof_extra_column,
     extra_columns,
 )
@@ -137,7 +137,7 @@ class RowBuilder(nn.Module):
         """Where the rows are computed."""
         return self.tree.ancestors.device
 
-    def layout(self, state: State) -> ContactStateLayout:
+    def layout(self, state: ContactState) -> ContactStateLayout:
         """What is constant in a contact state: columns, joints and wrenches that take part."""
         return self._layouts.layout(state)
 
@@ -154,7 +154,7 @@ class RowBuilder(nn.Module):
         return ChunkDynamics(joints, states, screw_axes, wrenches, samples.base.rotation)
 
     def rows(
-        self, samples: Samples, state: State, workspace: Workspace | None = None
+        self, samples: Samples, state: ContactState, workspace: Workspace | None = None
     ) -> Iterator[tuple[tuple[int, ...], Tensor]]:
         """Blocks of rows for samples that share a contact state; no gradient flows through reused buffers.
 
@@ -170,7 +170,7 @@ class RowBuilder(nn.Module):
             columns, rows = self._uncoupled_row(joint, samples, dynamics)
             yield columns, rows.T
 
-    def rows_by_sample(self, samples: Samples, state: State) -> tuple[Tensor, Tensor]:
+    def rows_by_sample(self, samples: Samples, state: ContactState) -> tuple[Tensor, Tensor]:
         """The same rows sample by sample, for samples that share a contact state.
 
         Returns:
@@ -195,7 +195,7 @@ class RowBuilder(nn.Module):
             W[:, base + joint, slot] = 1.0 / self._layouts.dof_std[joint]
         return rows, W
 
-    def null_space_bases(self, samples: Samples, state: State) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    def null_space_bases(self, samples: Samples, state: ContactState) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
         layout, dynamics = self.layout(state), self.dynamics(samples)
         yield from null_space(self._contact_rows(layout, dynamics)[0])

@@ -13,7 +13,7 @@ from torchid.identifiability.structure import at_rest, random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.chunks import one_thread
-from torchid.problem.contact_state import State, state_name
+from torchid.problem.contact_state import ContactState, state_name
 from torchid.robot import Robot
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorSet
@@ -127,7 +127,7 @@ class StateCheck:
         coincident: if the rank falls at position zero only, for each unmet demand the sensors that act alike there.
     """
 
-    state: State
+    state: ContactState
     name: str
     generic: PostureSummary
     zero: PostureSummary
@@ -141,12 +141,12 @@ class StateCheck:
 def check_set(
     robot: Robot,
     contacts: Sequence[Contact],
-    states: Iterable[State],
+    states: Iterable[ContactState],
     sensors: SensorSet,
     choice: Sequence[Candidate],
     samples: int = 64,
     seed: int = 0,
-    postures: Mapping[State, Array] | None = None,
+    postures: Mapping[ContactState, Array] | None = None,
 ) -> list[StateCheck]:
     """Check a sensor set in every contact state with the projection itself; nothing to check for a bolted base.
 
@@ -176,7 +176,7 @@ def check_set(
     return checks
 
 
-def base_values(builder: RowBuilder, state: State, postures: Array) -> torch.Tensor:
+def base_values(builder: RowBuilder, state: ContactState, postures: Array) -> torch.Tensor:
     """Singular values of S_b V_x, (N, 6), at joint positions (N, n) in a contact state."""
     found = torch.zeros(len(postures), 6, dtype=torch.float64)
     for start in range(0, len(postures), _CHUNK):
@@ -229,7 +229,7 @@ class _Cause:
         return tuple(found for pair in pairs if (found := coincident(*pair, self.mounted)))
 
 
-def _check(builder: RowBuilder, state: State, drawn: Array, recorded: Array | None, cause: _Cause) -> StateCheck:
+def _check(builder: RowBuilder, state: ContactState, drawn: Array, recorded: Array | None, cause: _Cause) -> StateCheck:
     zero = np.zeros((1, drawn.shape[1]))
     generic, straight = base_values(builder, state, drawn), base_values(builder, state, zero)
     ranks, lost = base_rank(generic), None
@@ -247,7 +247,7 @@ def _check(builder: RowBuilder, state: State, drawn: Array, recorded: Array | No
     )
 
 
-def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> LostBase:
+def _lost(builder: RowBuilder, state: ContactState, posture: Array, cause: _Cause) -> LostBase:
     [(_, V)] = builder.null_space_bases(at_rest(posture, state), state)
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
     directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]

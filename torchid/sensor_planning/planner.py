@@ -14,7 +14,7 @@ from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import subsample_states
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
@@ -62,7 +62,7 @@ class Need:
     proven: bool
 
 
-def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State]) -> tuple[Branch, ...]:
+def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[ContactState]) -> tuple[Branch, ...]:
     """All branches with joints of their own, depth first; a finger that only mimics has none."""
     used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
     tree = KinematicTree(robot)
@@ -81,7 +81,7 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State])
     return tuple(found)
 
 
-def needs(robot: Robot, contacts: Sequence[Contact], states: Iterable[State], seed: int = 0) -> tuple[Need, ...]:
+def needs(robot: Robot, contacts: Sequence[Contact], states: Iterable[ContactState], seed: int = 0) -> tuple[Need, ...]:
     """What every group of contacts needs if all joint torques and contact components could be measured."""
     states = tuple(states)
     limbs = branches(robot, contacts, states)
@@ -120,7 +120,7 @@ class Question:
 
     robot: Robot
     contacts: tuple[Contact, ...]
-    states: tuple[State, ...]
+    states: tuple[ContactState, ...]
     candidates: tuple[Candidate, ...]
     prior: Array
     keep: frozenset[Candidate] = frozenset()
@@ -229,7 +229,7 @@ def plan_sensors(question: Question, progress: StepCallback | None = None) -> Se
 def check(question: Question, sensors: SensorSet) -> list[StateCheck]:
     """Whether a sensor set sees the base in every state of a scenario; over the postures of its logs as well."""
     ask = question
-    pieces: dict[State, list[Array]] = {}
+    pieces: dict[ContactState, list[Array]] = {}
     for samples, state, _ in subsample_states(ask.logs, _POSTURES):
         pieces.setdefault(state, []).append(samples.joint_position.numpy())
     postures = {state: np.concatenate(found) for state, found in pieces.items()}
