@@ -1,4 +1,4 @@
-"""Compress the logs of one condition once per sensor set, fit any nominal parameters, predict unseen forces."""
+"""Compress the logs of one condition once per sensor set, fit any nominal parameters, predict other motions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, linear_problem
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import compress_by_state, merge_factors
-from torchid.problem.contact_state import State, state_name
+from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import BASE_ROWS
 from torchid.problem.predict import force_series, null_space_part
 
@@ -30,12 +30,12 @@ class StateRank:
 
 @dataclass(frozen=True)
 class CompressedLogs:
-    """What a sensor set keeps of some groups of logs: a factor per group and contact state."""
+    """Groups of logs compressed for one sensor set: a factor per group and contact state."""
 
     experiment: Experiment
     builder: RowBuilder
-    factors: Mapping[str, Mapping[State, TriangularFactor]]
-    counts: Mapping[str, Mapping[State, int]]
+    factors: Mapping[str, Mapping[ContactState, TriangularFactor]]
+    counts: Mapping[str, Mapping[ContactState, int]]
 
     def fit(self, groups: Sequence[str], nominals: Sequence[Array], friction: bool) -> list[Estimate]:
         """Parameters from some groups of logs, near each of some nominal ones (L, 12)."""
@@ -43,7 +43,7 @@ class CompressedLogs:
         return [self._solve(factor, nominal, friction) for nominal in nominals]
 
     def ranks(self, groups: Sequence[str], friction: bool) -> list[StateRank]:
-        """What each contact state of some groups determines on its own, and all together, most frequent first."""
+        """Rank of each contact state of some groups on its own, most frequent first, and of all together."""
         nominal = self.experiment.robot.nominal
         (together,) = self.fit(groups, [nominal], friction)
         out = []
@@ -63,11 +63,11 @@ class CompressedLogs:
         return batch_estimator(settings, conditions_from(settings, robot)).solve(problem)
 
 
-def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
+def compress_groups(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) -> CompressedLogs:
     """Compress groups of logs with an experiment's sensors."""
     builder = RowBuilder(experiment.robot, experiment.contacts, experiment.sensors).to(experiment.config.device)
     factors = {name: compress_by_state(logs, builder) for name, logs in groups.items()}
-    counts: dict[str, dict[State, int]] = {name: {} for name in groups}
+    counts: dict[str, dict[ContactState, int]] = {name: {} for name in groups}
     for name, logs in groups.items():
         for samples in logs:
             for state, index in chunks_by_state(samples):
@@ -91,11 +91,11 @@ class Series:
     projected: Mapping[str, Array]
 
     def row(self, name: str) -> int:
-        """Place of a row."""
+        """Index of a row."""
         return self.rows.index(name)
 
 
-def series_of(evaluation: Evaluation, samples: Samples, phi: Mapping[str, Array]) -> Series:
+def predict_series(evaluation: Evaluation, samples: Samples, phi: Mapping[str, Array]) -> Series:
     """Forces of a log and the predictions of named parameter vectors (12 L,)."""
     true, predicted = force_series(evaluation.builder, samples, np.stack(list(phi.values())))
     inside = null_space_part(evaluation.builder, samples, np.concatenate([true[None], predicted]))

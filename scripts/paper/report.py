@@ -13,7 +13,7 @@ from matplotlib.ticker import LogFormatter
 from rich.table import Table
 
 from paper.fits import Series
-from paper.results import TRUE, Results, figures, findings
+from paper.results import TRUE, Results, error_figures, examine_claims
 from paper.settings import SHOWN
 from torchid.commands.folder import write_json
 from torchid.parameters import Array
@@ -135,22 +135,22 @@ def summary_table(results: Results, training: str) -> Table:
     return table
 
 
-def findings_table(results: Results) -> Table:
-    """Which of the paper's findings hold, by condition and training logs."""
+def claims_table(results: Results) -> Table:
+    """Which of the claims of the paper hold, by condition and training logs."""
     table = Table(title="Findings of the paper: (1) full (2) contacts (3) joints", title_justify="left")
     for heading in ("sensors", "fitted on", "", "holds", "median error"):
         table.add_column(heading)
     for condition in results.conditions:
         for training in results.trainings:
-            for finding in findings(results, condition, training):
-                first = finding.number == 1
+            for claim in examine_claims(results, condition, training):
+                first = claim.number == 1
                 table.add_row(
                     condition if first else "",
                     training if first else "",
-                    f"({finding.number})",
-                    "yes" if finding.holds else "no",
-                    finding.why,
-                    end_section=finding.number == 3,
+                    f"({claim.number})",
+                    "yes" if claim.holds else "no",
+                    claim.why,
+                    end_section=claim.number == 3,
                 )
     return table
 
@@ -221,7 +221,7 @@ def study_tables(results: Results) -> dict[str, Table]:
         **{f"errors, {t}": error_table(results, condition, t) for t in results.trainings},
         "errors as measured": error_table(results, condition, training, "measured"),
         **{f"all conditions, {t}": summary_table(results, t) for t in results.trainings},
-        "findings": findings_table(results),
+        "findings": claims_table(results),
         "ranks": rank_table(results),
     }
 
@@ -266,8 +266,8 @@ def _document(results: Results) -> dict[str, object]:
                 "sensors": record.sensors,
                 "noise_draw": record.noise_draw,
                 "nominal_draw": record.nominal_draw,
-                "measured": _finite(figures(record.measured)),
-                "exact": _finite(figures(record.exact)),
+                "measured": _finite(error_figures(record.measured)),
+                "exact": _finite(error_figures(record.exact)),
             }
             for record in results.records
         ],

@@ -1,4 +1,4 @@
-"""What the study found: errors on the unseen log by condition, and the paper's three findings put to the numbers."""
+"""What the study found: errors on the unseen log by condition, and whether the three claims of the paper hold."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOMINAL, TRUE = "nominal", "true"
 class Record:
     """Errors of one parameter vector on the unseen log.
 
-    `measured` compares with what the imperfect sensors of that log say, `exact` with what truly happened.
+    `measured` compares with the readings of that log's imperfect sensors, `exact` with the true forces.
     """
 
     condition: str
@@ -78,18 +78,18 @@ class Results:
             condition: of the sensors.
             training: which logs were fitted.
             sensors: the sensor set, or NOMINAL or TRUE.
-            figure: a key of `figures`.
+            figure: a key of `error_figures`.
             against: "exact" or "measured".
         """
         found = [
-            figures(getattr(record, against))[figure]
+            error_figures(getattr(record, against))[figure]
             for record in self.records
             if (record.condition, record.training, record.sensors) == (condition, training, sensors)
         ]
         return Spread(float(np.median(found)), min(found), max(found))
 
 
-def figures(metrics: Metrics) -> dict[str, float]:
+def error_figures(metrics: Metrics) -> dict[str, float]:
     """All figures of the table: `GROUP` in units, `GROUP/relative` and `base_force/variation` as shares."""
     out = {group: metrics.rms[group] for group in ROW_GROUPS}
     out |= {f"{group}/relative": metrics.relative[group] for group in ROW_GROUPS}
@@ -110,16 +110,16 @@ _BASE, _INSIDE = ("base_force", "base_moment"), "nullspace"
 
 
 @dataclass(frozen=True)
-class Finding:
-    """Whether a finding of the paper holds, and the figures that say so."""
+class Claim:
+    """A claim of the paper, whether the results support it, and the figures in evidence."""
 
     number: int
     holds: bool
     why: str
 
 
-def findings(results: Results, condition: str, training: str) -> tuple[Finding, Finding, Finding]:
-    """Examine the findings of section V, on medians of the errors against what truly happened.
+def examine_claims(results: Results, condition: str, training: str) -> tuple[Claim, Claim, Claim]:
+    """Examine the claims of section V, on medians of the errors against what truly happened.
 
     (1) Full sensing is adequate everywhere: good on every group of rows. (2) Contacts only is good on the base rows and
     poor on joint torques. (3) Joints only is the best of the three sets inside the projected space, and poor outside,
@@ -148,17 +148,17 @@ def findings(results: Results, condition: str, training: str) -> tuple[Finding, 
     best = min(_SETS, key=lambda sensors: error(sensors, _INSIDE))
     outside = max((group for group in ROW_GROUPS if group != _INSIDE), key=lambda group: times("joints", group))
     return (
-        Finding(
+        Claim(
             1,
             all(good("full", group) for group in ROW_GROUPS),
             f"worst, {group_name(worst)}: {share('full', worst):.2g} x nominal, {above_floor:.2g} x true",
         ),
-        Finding(
+        Claim(
             2,
             all(good("contacts", group) for group in _BASE) and poor("contacts", "joint_torque"),
             f"{group_name(base)} {share('contacts', base):.2g} x nominal, joint torque {torque:.2g} x full",
         ),
-        Finding(
+        Claim(
             3,
             best == "joints" and any(poor("joints", group) for group in ROW_GROUPS if group != _INSIDE),
             f"inside best: {best}; outside, {group_name(outside)} {times('joints', outside):.2g} x full",

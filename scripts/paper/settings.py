@@ -1,4 +1,4 @@
-"""The settings of a study: motions, sensor imperfections, and how both are told apart."""
+"""The settings of a study: motions, sensor imperfections, and how studies combine them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def conditions(config: SimulationConfig) -> tuple[Condition, ...]:
 
 
 SHOWN = ("white noise", "all runs")  # condition and training set of the figures
-SQUATS, UNSEEN = "squat_", "unseen_"  # how the names of the squats, and of the motion that no fit sees, begin
+SQUATS, UNSEEN = "squat_", "unseen_"  # how the names of the squats, and of the motion that no fit uses, begin
 TRAINING = {"all runs": ("squats", "others"), "squats alone": ("squats",)}
 
 _QUICK_S = {"squat_1.0hz": 2.9, "squat_2.5hz": 2.9, "sway_0.5hz": 6.4, "unseen_1.5hz": 2.9}

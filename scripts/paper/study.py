@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from paper.fits import Series, compressed, series_of
+from paper.fits import Series, compress_groups, predict_series
 from paper.results import NOMINAL, TRUE, Ranks, Record, Results
 from paper.settings import SHOWN, SQUATS, TRAINING, UNSEEN, Condition, Study, conditions
 from torchid import parameters
@@ -123,7 +123,7 @@ class Reproduction:
         friction, nominals = draw.condition.friction, self._nominals()
         vectors: dict[str, dict[str, list[Array]]] = {training: {} for training in TRAINING}
         for sensors, experiment in self._experiments.items():
-            logs = compressed(experiment, draw.groups)
+            logs = compress_groups(experiment, draw.groups)
             for training, groups in TRAINING.items():
                 vectors[training][sensors] = [fit.phi for fit in logs.fit(groups, nominals, friction)]
                 if draw.condition.name == SHOWN[0] and draw.number == 0:
@@ -135,7 +135,7 @@ class Reproduction:
             self._evaluate(draw, training, rows)
             if (draw.condition.name, training) == SHOWN and draw.number == 0:
                 first = {name: phi[0] for name, phi in rows.items()}
-                self._shown.append(series_of(self._evaluation, draw.exact, first))
+                self._shown.append(predict_series(self._evaluation, draw.exact, first))
 
     def _evaluate(self, draw: _Draw, training: str, rows: Mapping[str, Sequence[Array]]) -> None:
         candidates = np.stack([phi for vectors in rows.values() for phi in vectors])

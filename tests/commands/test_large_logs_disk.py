@@ -266,7 +266,7 @@ def links(folder: Path) -> list[str]:
 READ = """
 import json, sys, threading, time, torch
 from torchid.config import load_config
-from torchid.problem.predict import calibrated
+from torchid.problem.predict import calibrate_readings
 from torchid.fitting.experiment import set_up
 from torchid.commands.reading import LogReader
 def used():

@@ -13,7 +13,7 @@ import torch
 from synthetic import Oracle, load, random_states
 from urdfs import joint, link, write
 
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values, null_space
@@ -22,7 +22,7 @@ from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
 RANDOM = "random"  # an axis
 
 
-def states_of(*rows: str) -> tuple[State, ...]:
+def states_of(*rows: str) -> tuple[ContactState, ...]:
     """Contact states from strings of 0 and 1."""
     return tuple(tuple(digit == "1" for digit in row) for row in rows)
 
@@ -37,7 +37,7 @@ class Machine:
 
     chains: dict[str, tuple[str, tuple[str, ...]]]
     contacts: tuple[Contact, ...]
-    states: tuple[State, ...]
+    states: tuple[ContactState, ...]
     per: str = "axis"
     seed: int = 3
     mimics: dict[str, str] = field(default_factory=dict)
@@ -72,7 +72,7 @@ def subsets(count: int) -> np.ndarray:
 
 
 def sees_the_base(
-    robot: Robot, contacts: Sequence[Contact], states: Sequence[State], sets: Sequence[SensorSet]
+    robot: Robot, contacts: Sequence[Contact], states: Sequence[ContactState], sets: Sequence[SensorSet]
 ) -> np.ndarray:
     """Which sets give rank(S_b V_x) = 6 in every state, at one random posture each, with Pinocchio's Jacobians."""
     oracle, result = Oracle.of(robot), np.ones(len(sets), dtype=bool)

@@ -19,7 +19,7 @@ from torchid.identifiability.base_parameters import (
     unobservable_parameters,
 )
 from torchid.identifiability.structure import standing_samples, standing_states, structural_problem, structural_samples
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.regressor import motion_from_state
 from torchid.sensing import Contact, SensorSet, named_sensors
 
@@ -126,7 +126,7 @@ def test_postures_are_well_spread() -> None:
 # ------------------------------------------------------------------------------------------ what standing feet hide
 
 
-def seen(name: str, sensors: SensorSet | str, states: Sequence[State], friction: bool = False) -> BaseParameters:
+def seen(name: str, sensors: SensorSet | str, states: Sequence[ContactState], friction: bool = False) -> BaseParameters:
     robot, contacts = biped(name)
     if isinstance(sensors, str):
         sensors = named_sensors(sensors, robot.n, len(contacts))

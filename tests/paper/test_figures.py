@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from paper.fits import Series, series_of
+from paper.fits import Series, predict_series
 from paper.report import error_table, study_figures
 from paper.results import NOMINAL, TRUE, Record, Results
 from paper.settings import SHOWN
@@ -55,7 +55,7 @@ def test_errors_of_the_base_force_are_given_relative_to_its_rms_about_its_mean(s
 
 def test_a_series_holds_predictions_of_every_vector_in_the_order_of_the_rows(samples: Samples) -> None:
     phi = {"one": ROBOT.nominal.flatten(), "two": 2.0 * ROBOT.nominal.flatten()}
-    series = series_of(EVALUATION, samples, phi)
+    series = predict_series(EVALUATION, samples, phi)
     assert series.rows == (*BASE_ROWS, *ROBOT.joint_names)
     np.testing.assert_allclose(series.predicted["two"], 2.0 * series.predicted["one"], rtol=1e-12, atol=1e-9)
     measured, (one,) = force_series(EVALUATION.builder, samples, phi["one"][None])

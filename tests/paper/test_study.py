@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from paper.results import NOMINAL, TRUE, Record, Results, findings
+from paper.results import NOMINAL, TRUE, Record, Results, examine_claims
 from script_calls import call
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -177,7 +177,7 @@ def changed(sensors: str, group: str, value: float) -> Results:
 
 
 def holds(found: Results) -> list[bool]:
-    return [finding.holds for finding in findings(found, "noise", "all")]
+    return [finding.holds for finding in examine_claims(found, "noise", "all")]
 
 
 def test_the_papers_own_pattern_confirms_all_three_findings() -> None:

@@ -16,7 +16,7 @@ from torchid.errors import SensorError, UnknownNameError
 from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors
 from torchid.sensing.projection import null_space
@@ -212,7 +212,9 @@ def test_what_cannot_be_a_candidate_or_a_price_is_refused_in_one_line() -> None:
 # ------------------------------------------------------------------------------------------- what is lost, and why
 
 
-def bases(robot: Robot, contacts: tuple[Contact, ...], state: State, sensors: SensorSet, posture: Array) -> Array:
+def bases(
+    robot: Robot, contacts: tuple[Contact, ...], state: ContactState, sensors: SensorSet, posture: Array
+) -> Array:
     """S_b V_x, (6, r), with Pinocchio's Jacobian."""
     q = random_states(np.random.default_rng(0), robot.n, 1)[0]
     q[0, 7:] = posture

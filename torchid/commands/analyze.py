@@ -23,7 +23,7 @@ from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
 from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import free_parameters
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
 from torchid.problem.linear import parameter_scale
 from torchid.report.analysis import (
@@ -55,7 +55,7 @@ class ScenarioAnalysis:
     """
 
     name: str
-    states: tuple[State, ...]
+    states: tuple[ContactState, ...]
     plan: SensorPlan
     proposed: tuple[BaseObservability, ...] | None
     base: BaseParameters
@@ -163,7 +163,7 @@ def _read(request: AnalysisRequest, bars: Progress) -> tuple[list[Samples], list
     return reader.read(files.train, request.proposed, done), reader.read(files.test, None, done)
 
 
-def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[State, ...]]:
+def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[ContactState, ...]]:
     """Contact states by scenario: those of the settings, or else of the logs, most frequent first.
 
     Raises:
@@ -172,7 +172,7 @@ def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[State, 
     frames = [contact.frame for contact in scene.contacts]
     wanted = scene.config.analysis.scenarios
     if wanted is None:
-        recorded: Counter[State] = Counter()
+        recorded: Counter[ContactState] = Counter()
         for samples in train:
             for state, index in chunks_by_state(samples):
                 recorded[state] += len(samples[index])
@@ -188,7 +188,7 @@ def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[State, 
 
 
 def _analyze_scenario(
-    request: AnalysisRequest, name: str, states: tuple[State, ...], train: Sequence[Samples], bars: Progress
+    request: AnalysisRequest, name: str, states: tuple[ContactState, ...], train: Sequence[Samples], bars: Progress
 ) -> ScenarioAnalysis:
     """Plan sensors for one scenario, and check those that are proposed."""
     scene, settings = request.scene, request.scene.config.analysis

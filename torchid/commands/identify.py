@@ -30,7 +30,7 @@ from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts
 from torchid.problem.compression import Part, merge_folds, merge_states, split_into_folds
-from torchid.problem.contact_state import State, state_name
+from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import SETS
 from torchid.report.tables import progress_bars
 
@@ -227,7 +227,7 @@ def _robust(
 
 def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
     """What each contact state determines on its own, by least squares, most frequent first."""
-    samples = Counter[State]()
+    samples = Counter[ContactState]()
     for part in parts:
         samples[part.state] += part.samples
     estimator, out = LeastSquares(fitter.estimator.ridge, rank_tolerance=fitter.estimator.rank_tolerance), {}

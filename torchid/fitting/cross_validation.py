@@ -230,7 +230,7 @@ class Scorer:
         """Of the measured forces and of the errors, for each calibration."""
         phi = np.stack([one.parameters(self.evaluation) for one in calibrations])
         if not calibrations[0].changes_readings:
-            measured, *errors = self.evaluation.sums(logs, phi, progress)
+            measured, *errors = self.evaluation.force_sums(logs, phi, progress)
             pairs = [(ForceSums.total([measured]), error) for error in errors]
         else:
             pairs = []
@@ -239,7 +239,9 @@ class Scorer:
                     if number != 1:  # the identified ones say the same
                         warnings.simplefilter("ignore", TorchidWarning)
                     readings = one.logs(logs)
-                measured, error = self.evaluation.sums(readings, phi[number : number + 1], progress if number else None)
+                measured, error = self.evaluation.force_sums(
+                    readings, phi[number : number + 1], progress if number else None
+                )
                 pairs.append((measured, error))
         squares = sum_residuals(self.builder, logs, parts, calibrations)
         for (measured, error), own in zip(pairs, squares, strict=True):
@@ -250,7 +252,7 @@ class Scorer:
     def _metrics(self, sums: Sequence[Sequence[tuple[ForceSums, ForceSums]]]) -> list[Metrics]:
         """Of each calibration, over all folds."""
         return [
-            self.evaluation.summary(*(ForceSums.total(each) for each in zip(*same, strict=True)))
+            self.evaluation.summarize(*(ForceSums.total(each) for each in zip(*same, strict=True)))
             for same in zip(*sums, strict=True)
         ]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchid.errors import BaseLostError, BaseLostWarning, warn
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import chunks_by_state, one_thread, subsample_states
-from torchid.problem.contact_state import State, state_name
+from torchid.problem.contact_state import ContactState, state_name
 from torchid.sensing.projection import base_rank, base_singular_values
 
 _CHECKED = 512  # samples a state, from all over the logs: shares are then known to about 2 %
@@ -47,15 +47,15 @@ class StateReport:
 @torch.no_grad()
 def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateReport]:
     """One report per contact state, most frequent first."""
-    counts = Counter[State]()
+    counts = Counter[ContactState]()
     for samples in logs:
         every = torch.arange(len(samples))
         for state, index in chunks_by_state(samples):
             counts[state] += len(every[index])
     rows, values, weights = (
-        Counter[State](),
-        defaultdict[State, list[Tensor]](list),
-        defaultdict[State, list[Tensor]](list),
+        Counter[ContactState](),
+        defaultdict[ContactState, list[Tensor]](list),
+        defaultdict[ContactState, list[Tensor]](list),
     )
     for samples, state, weight in subsample_states(logs, _CHECKED):
         for _, V in builder.null_space_bases(samples.to(builder.device), state):

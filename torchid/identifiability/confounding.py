@@ -267,12 +267,12 @@ def _estimates(
 ) -> list[ExtraEstimate]:
     """The extra parameters of one elimination, at identified and nominal parameters; `shared`: those they depend on."""
     P = len(covariance.free)
-    sensitivity, own, hidden = found.inverse @ found.C[:, :P], [found.inverse], [found.hidden]
+    sensitivity, own, hidden = found.inverse @ found.C[:, :P], [found.inverse], [found.unobservable]
     if shared is not None:
         through = found.inverse @ found.C[:, P:]
         sensitivity = sensitivity - through @ shared.inverse @ shared.C[:, :P]
         own.append(through @ shared.inverse)
-        hidden.append(through @ shared.hidden)
+        hidden.append(through @ shared.unobservable)
     G = covariance.scale_sensitivity(sensitivity)
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
     lost = np.linalg.norm(G @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
@@ -282,14 +282,14 @@ def _estimates(
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
     for k, extra in enumerate(found.extras):
-        if not np.isfinite(found.alone[k]):
+        if not np.isfinite(found.std_if_known[k]):
             continue
-        inflation = float(deviation[k] / found.alone[k])
+        inflation = float(deviation[k] / found.std_if_known[k])
         confounded: tuple[str, ...] = ()
         if inflation > INFLATION_LIMIT:
             by_bodies = lost[k] or 2.0 * through_parameters[k] > variance[k]
             confounded = _largest(covariance.variance_shares(G[k], noise), names) if by_bodies else ()
-            others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.hidden[k]), _labels(found))
+            others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.unobservable[k]), _labels(found))
             confounded = (*confounded, *others)
         error = noise * float(deviation[k]) if np.isfinite(deviation[k]) else np.inf
         value, nominal = (float(x[k]) for x in values)

@@ -14,9 +14,9 @@ from torchid.identifiability.information import triangular_factor
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import one_thread, subsample_states
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components
-from torchid.problem.predict import predicted_forces
+from torchid.problem.predict import predict_forces
 from torchid.rounding import RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 
@@ -60,7 +60,7 @@ def expected_errors(
     for samples, state, weight in subsample_states(logs, _SAMPLES):
         samples = samples.to(builder.device)
         terms = builder.dynamics(samples)
-        predicted = torch.stack([predicted_forces(builder, terms, phi).T for phi in columns])
+        predicted = torch.stack([predict_forces(builder, terms, phi).T for phi in columns])
         rows = _row_noise(builder, samples, noise)
         through_contacts = _wrench_noise(builder, samples, state, noise)
         for sums, errors, without_contacts in (
@@ -127,7 +127,7 @@ def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Ten
     return torch.cat([*turned, rest], dim=2)
 
 
-def _wrench_noise(builder: RowBuilder, samples: Samples, state: State, noise: SensorNoise) -> Tensor:
+def _wrench_noise(builder: RowBuilder, samples: Samples, state: ContactState, noise: SensorNoise) -> Tensor:
     """Generalized forces that one standard deviation of each contact sensor makes, (6 C, B, n_rows)."""
     std = samples.time.new_zeros(len(builder.contacts), 6)
     for contact, active in enumerate(state):

@@ -14,7 +14,7 @@ from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
 from torchid.problem.compression import unloaded_offset_equations
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
 from torchid.rounding import KINEMATIC_TOLERANCE
 
@@ -213,7 +213,7 @@ def _air_information(builder: RowBuilder, samples: Samples, count: int) -> Itera
             yield place[0], torch.outer(wide, wide)
 
 
-def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State, float]]:
+def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, ContactState, float]]:
     """Chunks of about `most` samples, evenly spread over contact states and logs, and how many each represents."""
     states = {state for samples in logs for state, _ in chunks_by_state(samples)}
     for samples, state, represented in subsample_states(logs, max(most // max(len(states), 1), 1)):

@@ -13,7 +13,7 @@ from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.regressor import FrameJacobian, motion_from_state
 from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross_product, joint_motion
 from torchid.regressor.tree import KinematicTree
@@ -31,7 +31,7 @@ def structural_problem(
     robot: Robot,
     contacts: Sequence[Contact],
     sensors: SensorSet,
-    states: Sequence[State],
+    states: Sequence[ContactState],
     friction: bool = True,
     samples: Sequence[Samples] | None = None,
 ) -> LinearProblem:
@@ -53,7 +53,7 @@ def structural_problem(
 
 
 def structural_samples(
-    robot: Robot, contacts: Sequence[Contact], states: Sequence[State], count: int | None = None, seed: int = 0
+    robot: Robot, contacts: Sequence[Contact], states: Sequence[ContactState], count: int | None = None, seed: int = 0
 ) -> list[Samples]:
     """Random samples, see `standing_samples`, of every contact state; they serve any sensor set.
 
@@ -70,7 +70,7 @@ def structural_samples(
 
 
 def standing_samples(
-    robot: Robot, contacts: Sequence[Contact], state: State, count: int, rng: np.random.Generator
+    robot: Robot, contacts: Sequence[Contact], state: ContactState, count: int, rng: np.random.Generator
 ) -> Samples:
     """Random samples that honour a contact state; forces are zeros.
 
@@ -103,7 +103,7 @@ def standing_samples(
 @one_thread()
 @torch.no_grad()
 def standing_states(
-    robot: Robot, contacts: Sequence[Contact], state: State, count: int, rng: np.random.Generator
+    robot: Robot, contacts: Sequence[Contact], state: ContactState, count: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Coordinates q, v, a, as `Regressor` takes them, with `J_C v = 0` and `J_C a + dJ_C/dt v = 0`.
 
@@ -129,7 +129,7 @@ def standing_states(
     return q, v, _in_null_space(a, inverse, J) - (inverse @ drift[..., None])[..., 0]
 
 
-def resting_samples(joint_position: Array, state: State) -> Samples:
+def resting_samples(joint_position: Array, state: ContactState) -> Samples:
     """Samples of an upright robot at rest, at joint positions (N, n) [rad or m] in a contact state, without forces."""
     q = torch.from_numpy(np.ascontiguousarray(joint_position, dtype=float))
     still, base = torch.zeros_like(q), q.new_zeros(len(q), 3)

@@ -33,7 +33,7 @@ _ACCEPTED = {
 
 @dataclass(frozen=True)
 class BaseMotion:
-    """All that the dynamics depend on of the base at N samples, in the base frame; None where it is not known.
+    """Motion of the base at N samples, as far as the dynamics depend on it, in the base frame; None where not known.
 
     Attributes:
         quat_xyzw: (N, 4), rotates base to world.
@@ -48,15 +48,15 @@ class BaseMotion:
 
     @classmethod
     def from_coordinates(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
-        """Of generalized coordinates as `Regressor` takes them; nothing of a bolted base."""
+        """The base's motion in generalized coordinates as `Regressor` takes them; empty for a bolted base."""
         if fixed_base:
             return cls()
         found = motion_from_state(q, v, a, q.shape[1] - 7)
         return cls(q[:, 3:7], found.base_specific_force, found.base_angular_velocity, found.base_angular_acceleration)
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> BaseMotion:
-        """With every tensor changed."""
-        return BaseMotion(**{name: change(x) for name, x in vars(self).items() if x is not None})
+    def map(self, function: Callable[[Tensor], Tensor]) -> BaseMotion:
+        """The same motion with a function applied to every tensor."""
+        return BaseMotion(**{name: function(x) for name, x in vars(self).items() if x is not None})
 
     @property
     def rotation(self) -> Tensor | None:
@@ -75,8 +75,8 @@ def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
         rotation_world_base: (N, 3, 3), base to world.
     """
     up = rotation_world_base[:, 2]  # vertical, in the base frame
-    place = up.abs().argmax(dim=1, keepdim=True)
-    nearest = torch.zeros_like(up).scatter(1, place, up.gather(1, place).sign())
+    index = up.abs().argmax(dim=1, keepdim=True)
+    nearest = torch.zeros_like(up).scatter(1, index, up.gather(1, index).sign())
     x, y, z = torch.linalg.cross(nearest, up).unbind(1)
     zero = torch.zeros_like(x)
     turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))

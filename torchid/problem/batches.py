@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
-from torchid.problem.predict import predicted_forces
+from torchid.problem.predict import predict_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
@@ -26,7 +26,7 @@ class Batch:
         K: (B, n_rows, P'), `W^T K`, in the columns of the `MiniBatches` it came from; rows of zeros where a sample has
             fewer.
         f: (B, n_rows), `W^T f`, in standard deviations of the sensor noise.
-        W: (B, n_rows, n_rows), takes any further generalized force (B, n_rows) [N, N m] to the rows: `W^T r`.
+        W: (B, n_rows, n_rows), projects any further generalized force r, (B, n_rows) [N, N m], to these rows: `W^T r`.
         q, v, a: generalized coordinates as in `Samples.coordinates`.
     """
 
@@ -46,7 +46,7 @@ class Batch:
         return int(self.W.any(dim=1).sum())
 
     def __getitem__(self, index: slice | Tensor) -> Batch:
-        """Some of the samples."""
+        """The rows of some samples."""
         return Batch(*(getattr(self, field.name)[index] for field in fields(self)))
 
     @property
@@ -89,7 +89,7 @@ class MiniBatches:
         self._left = memory
 
     def split_blocks(self, count: int) -> list[MiniBatches]:
-        """About so many blocks of successive samples, none across two logs, at least one of each log."""
+        """Mini-batches of about `count` blocks of successive samples, each of one log, at least one of every log."""
         pieces: list[Samples] = []
         for log in self._logs:
             parts = min(max(round(count * len(log) / max(self.samples, 1)), 1), max(len(log), 1))
@@ -98,7 +98,7 @@ class MiniBatches:
         return [self.like(piece) for piece in pieces if len(piece)]
 
     def hold_out(self, count: int, every: int) -> tuple[MiniBatches, list[MiniBatches]]:
-        """All samples but some of about `count` blocks, and these: of every so many, one that the seed draws."""
+        """Mini-batches without some of about `count` blocks, and those blocks: one in `every`, drawn by the seed."""
         blocks, generator = self.split_blocks(count), self._generator(-1)
         held_out = [
             start + int(torch.randint(every, (), generator=generator))
@@ -108,7 +108,7 @@ class MiniBatches:
         return self.like(*kept), [blocks[number] for number in held_out]
 
     def like(self, *logs: Samples) -> MiniBatches:
-        """Mini-batches like these of other samples."""
+        """Mini-batches of other samples, with the same settings."""
         return MiniBatches(logs, self.builder, self.batch_size, self.seed, self._memory)
 
     def epoch(self, number: int) -> Iterator[Batch]:
@@ -131,7 +131,7 @@ class MiniBatches:
         for log in self._logs:
             for start in range(0, len(log), _CHUNK):
                 samples = log[start : start + _CHUNK].to(self.builder.device)
-                yield samples.coordinates(), predicted_forces(self.builder, self.builder.dynamics(samples), columns).T
+                yield samples.coordinates(), predict_forces(self.builder, self.builder.dynamics(samples), columns).T
 
     def _generator(self, number: int) -> torch.Generator:
         return torch.Generator().manual_seed((self.seed * 1_000_003 + number) % 2**63)

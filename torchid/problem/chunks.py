@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from threadpoolctl import ThreadpoolController
 
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
@@ -30,17 +30,17 @@ CHUNK = 2048
 def map_chunks(
     logs: Sequence[Samples],
     builder: RowBuilder,
-    fold: Callable[[Iterator[tuple[Samples, State]]], Result],
+    reduce: Callable[[Iterator[tuple[Samples, ContactState]]], Result],
     chunk: int = CHUNK,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[Result]:
-    """What `fold` makes of the chunks of some logs, one result per worker.
+    """Results of `reduce` over the chunks of some logs, one per worker.
 
     Args:
-        logs: bound logs; each is moved to the builder's device chunk by chunk.
+        logs: each is moved to the builder's device chunk by chunk.
         builder: whose layouts and device are used.
-        fold: given an iterator over some of the chunks and their contact states.
+        reduce: given an iterator over some of the chunks and their contact states.
         chunk: samples per chunk.
         threads: workers, each with one intra-op thread (small arrays do not profit from more); by default one per
             intra-op thread torch would use, one if the builder is on a GPU.
@@ -51,10 +51,12 @@ def map_chunks(
         builder.layout(state)
     lock = threading.Lock()
 
-    def run(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Result:
-        return fold(pieces(part))
+    def run(part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]]) -> Result:
+        return reduce(pieces(part))
 
-    def pieces(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Iterator[tuple[Samples, State]]:
+    def pieces(
+        part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]],
+    ) -> Iterator[tuple[Samples, ContactState]]:
         for samples, state, index in part:
             piece = samples[index].to(builder.device)
             yield piece, state
@@ -65,7 +67,7 @@ def map_chunks(
     return run_in_workers(tasks, run, threads or worker_count(builder.device))
 
 
-def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slice | torch.Tensor]]:
+def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[ContactState, slice | torch.Tensor]]:
     """Chunks of samples that share a contact state: the state and an index into the samples."""
     active = samples.active.cpu().numpy()
     packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
@@ -80,9 +82,9 @@ def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[Stat
             yield tuple(active[example].tolist()), piece
 
 
-def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
-    """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
-    found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
+def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, ContactState, float]]:
+    """About `count` samples of every contact state, evenly spread over the logs, and how many each represents."""
+    found: dict[ContactState, list[tuple[Samples, torch.Tensor]]] = {}
     for samples in logs:
         every = torch.arange(len(samples))
         for state, index in chunks_by_state(samples):

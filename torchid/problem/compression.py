@@ -14,24 +14,26 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.chunks import CHUNK, ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder, Workspace
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
 
 FOLDS = 5
-"""Blocks that all training samples are cut into: each fit sees four fifths, and five fits are cheap."""
+"""Blocks that all training samples are cut into: each fit takes four fifths, and five fits are cheap."""
 
 _LEAST = 20  # independent samples a block: what neighbours share through a filter is a small part of that
 _MEMORY = 2**30  # bytes of factors
 _FEWEST, _BATCHES = 16, 8  # readings that make an equation, and in how many their slow changes show
 _ZEROS = 0.01  # share of readings that are exactly 0 from which on something else than a sensor has written them,
 _ONE_SIDED = 0.05  # unless both signs are at least this frequent: then 0 is one step of a coarse sensor among others
-_OUTLYING = 4.0  # standard deviations; of Gaussian readings 6e-5 are left out
+_OUTLYING = 4.0  # standard deviations; of Gaussian readings 6e-5 are dropped
 _NORMAL = 0.6745  # median of |x| of standard normal x
 RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
-_Key = tuple[str, State, int, bool]
+"""Weighted rows from the samples that they come from, their columns, and themselves."""
+
+_Key = tuple[str, ContactState, int, bool]
 
 
 @dataclass
@@ -43,7 +45,7 @@ class Part:
     """
 
     source: str
-    state: State
+    state: ContactState
     factor: TriangularFactor
     samples: int
     fold: int = 0
@@ -71,7 +73,7 @@ def compress_by_state(
     chunk: int = CHUNK,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
-) -> dict[State, TriangularFactor]:
+) -> dict[ContactState, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
     found = map_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
     return {part.state: part.factor for part in _merge_parts(found)}
@@ -88,8 +90,7 @@ def compress_parts(
     """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
 
     Logs of one source count as one. Unknown offsets of contact sensors have further parts: readings in the air.
-    `weight_rows` may change other rows before they are added: called with the samples they come from, their columns and
-    themselves.
+    `weight_rows` weights all other rows before they are added.
     """
     fold = partial(_fold, builder, by_log=True, weight_rows=weight_rows)
     parts = _merge_parts(map_chunks(logs, builder, fold, chunk, threads, progress))
@@ -98,13 +99,16 @@ def compress_parts(
 
 
 def _fold(
-    builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weight_rows: RowWeighting | None = None
+    builder: RowBuilder,
+    chunks: Iterator[tuple[Samples, ContactState]],
+    by_log: bool,
+    weight_rows: RowWeighting | None = None,
 ) -> list[Part]:
-    """Parts of some chunks, all logs together unless `by_log`."""
+    """Compress some chunks into parts, of all logs together unless `by_log`."""
     parts: dict[_Key, Part] = {}
     workspace = Workspace()
 
-    def part(samples: Samples, state: State, unloaded: bool) -> Part:
+    def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
         key = (samples.source, state, samples.fold, unloaded) if by_log else ("", state, 0, False)
         return parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
 
@@ -125,7 +129,7 @@ def _fold(
 
 @one_thread()
 def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
-    """The parts that workers have made of their chunks."""
+    """The parts of all workers, those of one log, contact state and fold merged."""
     total: dict[_Key, Part] = {}
     for part in chain.from_iterable(of_workers):
         same = total.setdefault((part.source, part.state, part.fold, part.unloaded), part)
@@ -138,7 +142,7 @@ def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
 
 @one_thread()
 def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
-    """The factor of all that some factors have seen."""
+    """One factor of the rows of several."""
     out = TriangularFactor(builder.width)
     for factor in factors:
         out.merge(factor)
@@ -149,7 +153,7 @@ def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> T
 def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
     """The problem in all 12 L parameters from the factor of the regrouped columns.
 
-    What is free is said by `free_parameters`.
+    Which parameters are free is decided by `free_parameters`.
 
     Raises:
         ValueError: the builder has unknowns beside these parameters, which take `assemble`.
@@ -162,7 +166,7 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
 def problem_from_triangle(
     R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool = True
 ) -> LinearProblem:
-    """The problem of a triangular factor in the regrouped columns, right-hand side last.
+    """The problem in all 12 L parameters from a triangle in the regrouped columns, right-hand side last.
 
     Args:
         R: (M, columns + 1).
@@ -186,7 +190,10 @@ def problem_from_triangle(
 
 
 def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
-    """What can be fitted, (12 L,) bool: no inertia of massless bodies, no friction of welds, none if not `friction`."""
+    """Parameters that can be fitted, (12 L,) bool.
+
+    Not among them: inertial parameters of massless bodies, friction of welds, and any friction if not `friction`.
+    """
     free = np.ones(robot.nominal.shape, dtype=bool)
     free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
     still = [body.joint is None or body.joint.kind == "fixed" for body in robot.bodies]
@@ -195,11 +202,11 @@ def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
 
 
 def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
-    """The logs in order, cut into blocks contiguous in time that know their fold.
+    """The logs in order, cut into blocks contiguous in time, with the fold of each.
 
-    Errors of successive samples are alike, so that samples drawn at random would judge a fit by what it has seen. A log
-    is cut as often as its share of all samples asks for; where there are many, whole logs are left out. Fewer folds, or
-    a single one, if the samples or the memory for their factors are too few.
+    Errors of successive samples are correlated, so that samples drawn at random would test a fit on its training data.
+    A log is cut in proportion to its share of all samples; where there are many, whole logs are held out. There are
+    fewer folds, or a single one, if the samples or the memory for their factors are too few.
 
     Args:
         logs: bound logs.
@@ -221,20 +228,20 @@ def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Sampl
 
 def _count(logs: Sequence[Samples], builder: RowBuilder) -> int:
     independent = sum(len(log) / log.oversampling for log in logs)
-    states: set[tuple[str, State]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
+    states: set[tuple[str, ContactState]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
     size = 8 * (builder.width + 1) ** 2 * max(len(states), 1) * worker_count(builder.device)
     return max(1, min(FOLDS, int(independent / _LEAST), _MEMORY // size))
 
 
 @one_thread()
 def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    """One part for each log and fold, its contact states together; equations in the air stay apart."""
+    """Parts with the contact states of each log and fold merged; offset equations of unloaded sensors stay apart."""
     return _folded(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
 
 
 @one_thread()
 def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    """One part for each log and contact state, its folds together; equations in the air stay apart."""
+    """Parts with the folds of each log and contact state merged; offset equations of unloaded sensors stay apart."""
     return _folded(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
 
 
@@ -252,13 +259,15 @@ def _folded(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: 
 
 @dataclass(frozen=True)
 class UnloadedOffsetEquation:
-    """What some samples say of the unknown offset of a contact sensor's channel.
+    """The equation that readings of an unloaded contact sensor give for its unknown offset.
+
+    A sensor whose contact is in the air reads its offset and the weight of what hangs on it.
 
     Attributes:
         offset: its number among the extras.
         scale: number of the channel's unknown scale, None if that is known.
         gated: whether readings in the air are exactly 0, as masked, clamped or missing ones are: no equation.
-        mean: of the readings, outliers left out [N, N m].
+        mean: of the readings, without outliers [N, N m].
         deviation: standard deviation of the mean, that of independent readings with the stated noise, or more if they
             scatter more, one by one or over longer spans of time.
     """
@@ -272,7 +281,7 @@ class UnloadedOffsetEquation:
     def row(self, builder: RowBuilder) -> tuple[tuple[int, ...], Tensor]:
         """The whitened equation `o - (s - 1) mean = mean` as a block of one row: its columns, and (1, columns + 1).
 
-        The scale's column holds the mean, for the noise of single readings would pull the scale to 0.
+        The scale's column holds the mean, for the noise of single readings would bias the scale towards 0.
         """
         first, row = builder.columns.count, [1.0, self.mean]
         columns: tuple[int, ...] = (first + self.offset,)
@@ -283,7 +292,7 @@ class UnloadedOffsetEquation:
 
 
 def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator[UnloadedOffsetEquation]:
-    """What the readings in the air among some samples of a log say of every offset that is unknown."""
+    """Equations of the unknown offsets, from the readings in the air among some samples of a log."""
     if samples.unloaded is None:
         return
     scales = {x.contact: number for number, x in enumerate(builder.extras) if x.what == "scale" and x.contact}
@@ -309,9 +318,9 @@ def _gated(y: Tensor) -> bool:
 
 
 def _mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
-    """Mean of readings (M,) in their order, outliers left out, and its standard deviation before oversampling."""
+    """Mean of readings (M,) in their order, without outliers, and its standard deviation before oversampling."""
     away = (y - y.median()).abs()
     y = y[away <= _OUTLYING * max(float(away.median()) / _NORMAL, noise)]
     batches = y[: len(y) // _BATCHES * _BATCHES].view(_BATCHES, -1).mean(1)
-    seen = max(float(y.var()) / len(y), float(batches.var()) / _BATCHES) / oversampling
-    return float(y.mean()), max(noise**2 / len(y), seen) ** 0.5
+    scatter = max(float(y.var()) / len(y), float(batches.var()) / _BATCHES) / oversampling
+    return float(y.mean()), max(noise**2 / len(y), scatter) ** 0.5

@@ -1,4 +1,4 @@
-"""What is constant in a contact state, worked out once: which columns, joints and wrench directions take part."""
+"""Columns of the rows, and what is constant in a contact state: which of them, which joints and wrenches take part."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 from torchid.sensing import Contact, SensorSet
 
-State = tuple[bool, ...]
+ContactState = tuple[bool, ...]
 """Which contacts touch the ground."""
 
 
-def state_name(contacts: Sequence[Contact], state: State) -> str:
+def state_name(contacts: Sequence[Contact], state: ContactState) -> str:
     """Frames in contact, joined by "+"."""
     return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or "none"
 
@@ -58,7 +58,7 @@ class Columns:
         return [j for j, row in enumerate(self.joint_rows) if any(moved in path for moved, _ in row.moved)]
 
     def parameter_map(self) -> Array:
-        """Matrix M, (count, 12 L), that takes parameters to these columns: `K = K_columns @ M`."""
+        """Matrix M, (count, 12 L), from parameters to these columns: `K = K_columns @ M`."""
         nodes = self.tree.node_of
         matrix = np.zeros((self.count, len(nodes), parameters.PER_BODY))
         inertial = reduction_matrix(self.tree).reshape(self.layout.count, len(nodes), -1)
@@ -75,7 +75,7 @@ class ContactBody:
 
     `unmeasured`, (k_x, 6): orthonormal rows that span the unmeasured wrench directions, `measured`, (k_m, 6): one row
     per measured component, both as wrenches at the body's joint frame, in its axes. `components`: contact and component
-    of each measured row. `joints`: places among the coupled joints of those that move the body.
+    of each measured row. `joints`: indices, among the coupled joints, of those that move the body.
     """
 
     body: int
@@ -87,19 +87,27 @@ class ContactBody:
 
 @dataclass(frozen=True)
 class ContactStateLayout:
-    """A contact state: bodies in contact; measured joints that the projection mixes, and those it leaves alone.
+    """What is constant in a contact state: which bodies, joints and columns take part in its rows.
 
-    `moved`: bodies that coupled joints move directly, ascending, with the joint's place among the coupled ones and the
-    ratio of its motion. `bodies`: on whose parameters coupled rows depend, by the columns `inertial` and `friction`.
-    `extras`: columns of unknowns beside the bodies' parameters.
-    `row_std`: noise of the base rows and coupled joints; `wrench_std`: of the measured components, body by body.
+    Measured joints between the base and a contact are coupled: the projection combines their rows with those of the
+    base. All others are uncoupled: each of them is an equation of its own.
+
+    Attributes:
+        contact_bodies: bodies in contact.
+        coupled_joints, uncoupled_joints: indices of independent joints.
+        moved: nodes that coupled joints move directly, ascending, with the joint's index among the coupled ones and the
+            ratio of its motion.
+        nodes: on whose parameters coupled rows depend, by the columns `inertial` and `friction`.
+        row_std: noise of the base rows and coupled joints [N, N m].
+        wrench_std: noise of the measured components, body by body [N, N m].
+        extras: columns of unknowns beside the bodies' parameters.
     """
 
     contact_bodies: tuple[ContactBody, ...]
     coupled_joints: tuple[int, ...]
     uncoupled_joints: tuple[int, ...]
     moved: tuple[tuple[int, int, float], ...]
-    bodies: range
+    nodes: range
     inertial: range
     friction: tuple[int, ...]
     row_std: Tensor
@@ -123,7 +131,7 @@ class ContactStateLayouts:
         sensors: SensorSet,
         extras: Sequence[Extra] = (),
     ) -> None:
-        """Look the contacts' frames up."""
+        """Look up the nodes that carry the contacts' frames."""
         self.extras = tuple(extras)
         self.columns = columns
         self.contacts = tuple(contacts)
@@ -131,9 +139,9 @@ class ContactStateLayouts:
         self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
-        self._made: dict[State, ContactStateLayout] = {}
+        self._made: dict[ContactState, ContactStateLayout] = {}
 
-    def layout(self, state: State) -> ContactStateLayout:
+    def layout(self, state: ContactState) -> ContactStateLayout:
         """The layout of a contact state, worked out when it is first needed."""
         if state not in self._made:
             self._made[state] = self._lay_out(state)
@@ -143,7 +151,7 @@ class ContactStateLayouts:
         """Drop all layouts: the robot's constants have moved to another device or precision."""
         self._made.clear()
 
-    def _lay_out(self, state: State) -> ContactStateLayout:
+    def _lay_out(self, state: ContactState) -> ContactStateLayout:
         touching: dict[int, list[int]] = {}
         for contact, active in enumerate(state):
             if active:
@@ -157,15 +165,15 @@ class ContactStateLayouts:
             for place, joint in enumerate(coupled)
             for body, ratio in self.columns.joint_rows[joint].moved
         )
-        bodies_below, starts = self._bodies_below([body for body, _, _ in moved]), self.columns.layout.starts
+        nodes_below, starts = self._nodes_below([body for body, _, _ in moved]), self.columns.layout.starts
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
         return ContactStateLayout(
             bodies,
             coupled,
             tuple(joint for joint in measured if joint not in moving),
             tuple(moved),
-            bodies_below,
-            range(starts[bodies_below.start], starts[bodies_below.stop]),
+            nodes_below,
+            range(starts[nodes_below.start], starts[nodes_below.stop]),
             tuple(self.columns.friction(body) + k for body, _, _ in moved for k in (0, 1)),
             self._tensor(np.append(noise.base_std[:base_rows], self.dof_std[list(coupled)])),
             self._tensor(noise.wrench_std[[k for body in bodies for _, k in body.components]]),
@@ -176,8 +184,8 @@ class ContactStateLayouts:
             ),
         )
 
-    def _bodies_below(self, moved: list[int]) -> range:
-        """Hull of the subtrees of some bodies; with a floating base, all bodies."""
+    def _nodes_below(self, moved: list[int]) -> range:
+        """Hull of the subtrees of some nodes; with a floating base, all nodes."""
         tree = self.columns.tree
         if tree.base_rows:
             return range(tree.n_nodes)
@@ -219,7 +227,7 @@ def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Ten
 
 
 def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
-    """What one unit of a contact sensor's unknown takes from its reading along a recorded axis, (B,)."""
+    """What one unit of a contact sensor's unknown subtracts from its reading along a recorded axis, (B,)."""
     if extra.what == "offset":
         return samples.active[:, contact].to(samples.time) if samples.share is None else samples.share[:, contact]
     reading = samples.wrench
@@ -247,7 +255,7 @@ def extra_columns(
         rotations: by contact, (B, 3, 3) from its frame to the recorded axes where these are the world's.
     """
     through = (measured @ W).permute(1, 2, 0)  # how each measured component enters the rows
-    places = [place for body in layout.contact_bodies for place in body.components]
+    components = [component for body in layout.contact_bodies for component in body.components]
     for extra in extras:
         if extra.dof is not None:
             row = W[:, tree.base_rows + layout.coupled_joints.index(extra.dof)]
@@ -257,7 +265,7 @@ def extra_columns(
         column, reading = W.new_zeros(W.shape[2], len(samples)), contact_extra_column(extra, samples, contact, axis)
         vector = range(3) if axis < 3 else range(3, 6)
         for k in vector if contact in rotations else [axis]:
-            if (contact, k) in places:
+            if (contact, k) in components:
                 turned = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
-                column = column + through[places.index((contact, k))] * turned
+                column = column + through[components.index((contact, k))] * turned
         yield column

@@ -1,4 +1,4 @@
-"""Problems with unknowns beside the bodies' parameters: these are eliminated, so that estimators never see them."""
+"""Problems with unknowns beside the bodies' parameters, which are eliminated before estimators get the problem."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
 
 @dataclass(frozen=True)
 class Elimination:
-    """Unknowns psi of one log, or of all, in terms of what is left: `psi = inverse @ (z - C @ left)`.
+    """Unknowns psi of one log, or of all, in terms of the remaining ones x: `psi = inverse @ (z - C @ x)`.
 
     Attributes:
         log: their source, "" for those of all logs.
@@ -27,8 +27,8 @@ class Elimination:
         inverse: (M, r), of least norm; the noise of the r rows is white, of unit variance, and in no other row.
         C: (r, 12 L + S), columns of the bodies' parameters and, for those of one log, of the S unknowns of all logs.
         z: (r,).
-        alone: (M,), standard deviation of each unknown if all else were known, infinite where no row has it.
-        hidden: (M, M) projector to combinations that no row has.
+        std_if_known: (M,), standard deviation of each unknown if all else were known; infinite if no row depends on it.
+        unobservable: (M, M), projector to combinations that no row depends on.
     """
 
     log: str
@@ -36,18 +36,20 @@ class Elimination:
     inverse: Array
     C: Array
     z: Array
-    alone: Array
-    hidden: Array
+    std_if_known: Array
+    unobservable: Array
 
     @property
     def determined(self) -> np.ndarray:
         """Unknowns that the rows give if the bodies' parameters are known, (M,) bool."""
-        return np.asarray(np.isfinite(self.alone) & (np.linalg.norm(self.hidden, axis=1) < UNOBSERVABLE_SHARE))
+        return np.asarray(
+            np.isfinite(self.std_if_known) & (np.linalg.norm(self.unobservable, axis=1) < UNOBSERVABLE_SHARE)
+        )
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """What estimators see, and what has been eliminated from it: log by log, the unknowns of all logs last.
+    """The problem for estimators, and what has been eliminated from it: log by log, the unknowns of all logs last.
 
     `if_known`: the problem there would be if all that has been eliminated were known to be 0.
     """
@@ -57,10 +59,10 @@ class Assembly:
     if_known: LinearProblem
 
     def extras_at(self, phi: Array) -> list[Array]:
-        """What fits the rows best at parameters (12 L,), for each elimination."""
+        """Values of the eliminated unknowns that fit the rows best at parameters (12 L,), for each elimination."""
         of_all = [found.inverse @ (found.z - found.C @ phi) for found in self.eliminations if not found.log]
-        left = np.concatenate([phi, *of_all])
-        return [found.inverse @ (found.z - found.C @ (left if found.log else phi)) for found in self.eliminations]
+        remaining = np.concatenate([phi, *of_all])
+        return [x.inverse @ (x.z - x.C @ (remaining if x.log else phi)) for x in self.eliminations]
 
 
 @one_thread()
@@ -77,7 +79,7 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
         return Assembly(problem, (), problem)
     count = builder.columns.count
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
-    found, left = [], []
+    eliminations, remaining = [], []
     for source, own in factors.items():
         R = merge_factors(own, builder).triangle().numpy()
         rest = np.delete(R, [count + number for number in per_log], axis=1)
@@ -85,23 +87,23 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
             extras = tuple(builder.extras[number] for number in per_log)
             columns = R[:, [count + number for number in per_log]]
             elimination, rest = _eliminate(source, extras, columns, rest, builder, np.linalg.norm(columns, axis=0))
-            found.append(elimination)
-        left.append(rest)
-    rows: Array = np.asarray(np.linalg.qr(np.concatenate(left), mode="r"))
+            eliminations.append(elimination)
+        remaining.append(rest)
+    rows: Array = np.asarray(np.linalg.qr(np.concatenate(remaining), mode="r"))
     if of_all:
         extras = tuple(builder.extras[number] for number in of_all)
         sizes = np.linalg.norm(everything.triangle().numpy()[:, [count + number for number in of_all]], axis=0)
         rest = np.delete(rows, np.s_[count:-1], axis=1)
         elimination, rows = _eliminate("", extras, rows[:, count:-1], rest, builder, sizes)
-        found.append(elimination)
+        eliminations.append(elimination)
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
-    spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in found)
+    spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in eliminations)
     rows_left = max(everything.rows - round(spent), 1)
     problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction)
     known = np.delete(everything.triangle().numpy(), np.s_[count:-1], axis=1)
     known = np.asarray(np.linalg.qr(known, mode="r"))
     if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction)
-    return Assembly(problem, tuple(found), if_known)
+    return Assembly(problem, tuple(eliminations), if_known)
 
 
 def _sources(parts: Sequence[Part]) -> list[str]:
@@ -115,19 +117,19 @@ def _eliminate(
 
     `sizes`: (M,), norms of the columns before anything was eliminated.
     """
-    seen = is_significant(sizes)
-    scale = np.where(seen, sizes, 1.0)
-    U, values, V, left = _split(np.where(seen, columns / scale, 0.0), rest)
+    present = is_significant(sizes)
+    scale = np.where(present, sizes, 1.0)
+    U, values, V, remaining = _split(np.where(present, columns / scale, 0.0), rest)
     top, count = U.T @ rest, builder.columns.count
     C = np.hstack([top[:, :count] @ builder.columns.parameter_map(), top[:, count:-1]])
-    alone = np.where(seen, 1.0 / scale, np.inf)
-    hidden = np.eye(len(extras)) - V @ V.T
-    found = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], alone, hidden)
-    return found, left
+    std_if_known = np.where(present, 1.0 / scale, np.inf)
+    unobservable = np.eye(len(extras)) - V @ V.T
+    found = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], std_if_known, unobservable)
+    return found, remaining
 
 
 def eliminate_columns(X: Array, unknown: Sequence[int]) -> Array:
-    """Rows of the other columns that say the same of them as X, (R, N), does where some columns are unknown."""
+    """Rows of the other columns of X, (R, N), from which the unknowns of some columns are eliminated."""
     if not unknown:
         return X
     columns = X[:, list(unknown)]

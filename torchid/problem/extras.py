@@ -25,7 +25,7 @@ _SIZES = dict(zip(CHANNELS, (5.0, 50.0, 5.0, 50.0, 5.0), strict=True))
 class ExtraTerms:
     """Which unknowns there are, none by default.
 
-    A reading y of a sensor with an offset o and a scale s stands for the force s y - o. `offsets` and `scales` say for
+    A reading y of a sensor with an offset o and a scale s means the force s y - o. `offsets` and `scales` say for
     some of `CHANNELS` whether they are constant over a "log" or over "all" logs.
 
     Of every joint whose torque is measured: `armature` (reflected rotor inertia, times the joint's acceleration),
@@ -51,8 +51,8 @@ class Extra:
         unit: of the unknown.
         size: of a plausible value, in this unit.
         per_log: whether every log has its own.
-        dof: place in the robot's `dof_names`, or
-        contact: place among the contacts and component along the axes that the log has the wrench in.
+        dof: index in the robot's `dof_names`, or
+        contact: index among the contacts and component along the axes that the log has the wrench in.
     """
 
     what: str
@@ -100,16 +100,16 @@ def measured_channels(robot: Robot, contacts: Sequence[Contact], sensors: Sensor
 def _channels(
     robot: Robot, contacts: Sequence[Contact], sensors: SensorSet
 ) -> Iterator[tuple[str, str, str, int | None, tuple[int, int] | None]]:
-    """Kind, name, component and place of every channel that is read."""
+    """Kind, name, component and index of every channel that is read."""
     for dof in np.flatnonzero(sensors.torque).tolist():
         name, _, component = (
             robot.dof_names[dof].rpartition(".") if dof >= robot.n else (robot.joint_names[dof], "", "")
         )
         kind = "joint_torque" if dof < robot.n else "ft_force" if component.startswith("f") else "ft_moment"
         yield kind, name, component, dof, None
-    for place, k in np.argwhere(recorded_components(contacts, sensors, in_world=True)).tolist():
+    for index, k in np.argwhere(recorded_components(contacts, sensors, in_world=True)).tolist():
         kind = "contact_force" if k < 3 else "contact_moment"
-        yield kind, contacts[place].frame, WRENCH_COMPONENTS[k], None, (place, k)
+        yield kind, contacts[index].frame, WRENCH_COMPONENTS[k], None, (index, k)
 
 
 def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:

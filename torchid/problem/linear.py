@@ -1,4 +1,4 @@
-"""The linear problem that estimators see, and the triangular factors that any number of its rows are kept as."""
+"""The linear problem that estimators solve, and the triangular factors that any number of its rows compress to."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class LinearProblem:
         nominal: (P,), the prior parameters.
         scale: (P,), > 0, the size a deviation of each parameter is measured in.
         free: (P,) bool, parameters to fit; the others stay nominal.
-        oversampling: rows per independent row, at least 1: a low-pass filter leaves noise correlated, so that rows say
-            less than their number suggests.
+        oversampling: rows per independent row, at least 1: a low-pass filter leaves noise correlated, so that rows hold
+            less information than their number suggests.
     """
 
     A: Array
@@ -68,11 +68,11 @@ class LinearProblem:
         misfit = self.A @ phi - self.b
         return float(misfit @ misfit + self.residual)
 
-    def fraction(self, of: float) -> LinearProblem:
-        """The problem as if of this share of its rows, which say the same as all: an estimate of that of a part."""
-        root = float(np.sqrt(of))
-        rows = max(round(of * self.rows), 1)
-        return replace(self, A=root * self.A, b=root * self.b, residual=of * self.residual, rows=rows)
+    def fraction(self, share: float) -> LinearProblem:
+        """An estimate of the problem of a share of the rows, whose information is that share of all rows'."""
+        root = float(np.sqrt(share))
+        rows = max(round(share * self.rows), 1)
+        return replace(self, A=root * self.A, b=root * self.b, residual=share * self.residual, rows=rows)
 
     def prediction_distance(self, phi: Array, other: Array) -> float:
         """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""
@@ -81,7 +81,7 @@ class LinearProblem:
 
 
 def parameter_scale(nominal: Array) -> Array:
-    """Size of a plausible deviation of each parameter, (L, 12): what the pull to the URDF is measured in.
+    """Size of a plausible deviation of each parameter, (L, 12): the unit of regularization towards nominal parameters.
 
     Mass m of the body; first moments m r; inertias m r^2, with r the body's radius of gyration about its link origin;
     friction 1 N m and 1 N m s/rad.
@@ -133,7 +133,7 @@ class TriangularFactor:
         self._absorb(support, rows)
 
     def merge(self, other: TriangularFactor) -> None:
-        """Add everything that another factor has seen.
+        """Add the rows of another factor.
 
         Raises:
             ValueError: the factors differ in columns.

@@ -10,9 +10,9 @@ import torch
 
 from torchid.parameters import Array
 from torchid.problem.chunks import ProgressCallback, map_chunks
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ExtraTerms
-from torchid.problem.predict import measured_and_predicted
+from torchid.problem.predict import measured_and_predicted_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
@@ -20,7 +20,7 @@ from torchid.sensing import Contact, named_sensors
 from torchid.text import join_names
 
 WHITENED = "projected_residual"
-"""The group of the rows that a fit sees: whitened, and projected so that nothing unmeasured is in them."""
+"""The group of the rows of a fit: whitened, and projected so that nothing unmeasured is in them."""
 
 ROW_GROUPS = {
     "joint_torque": "joint torque [N m]",
@@ -106,18 +106,20 @@ class Evaluation:
 
         Without the whitened projected residual, which depends on sensors.
         """
-        measured, *errors = self.sums(logs, phi, progress)
-        return [self.summary(measured, error) for error in errors]
+        measured, *errors = self.force_sums(logs, phi, progress)
+        return [self.summarize(measured, error) for error in errors]
 
-    def sums(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[ForceSums]:
+    def force_sums(
+        self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None
+    ) -> list[ForceSums]:
         """Of the measured forces, then of the errors of each row of `phi`."""
         builder = self.builder
         columns = builder.to_columns(phi)
 
-        def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
+        def fold(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
-                found = measured_and_predicted(builder, samples, state, columns)
+                found = measured_and_predicted_forces(builder, samples, state, columns)
                 for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
                     total.rows.add(predicted - found.measured)
                 vectors = torch.cat([found.torque[None], found.predicted - found.torque])
@@ -129,8 +131,8 @@ class Evaluation:
         parts = map_chunks(logs, builder, fold, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
-    def summary(self, measured: ForceSums, errors: ForceSums) -> Metrics:
-        """What sums say."""
+    def summarize(self, measured: ForceSums, errors: ForceSums) -> Metrics:
+        """Metrics from sums of squares."""
         base = self.robot.base_rows
         rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
         joints = slice(base, base + self.robot.n)
@@ -185,8 +187,8 @@ def describe_worse(found: list[WorseThanNominal]) -> str | None:
     if not found:
         return None
     by_logs = {one.logs: [str(other) for other in found if other.logs == one.logs] for one in found}
-    told = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
-    return f"the identified parameters predict worse than the URDF's, {told}"
+    texts_by_logs = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
+    return f"the identified parameters predict worse than the URDF's, {texts_by_logs}"
 
 
 def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:
@@ -204,7 +206,7 @@ def group_name(group: str) -> str:
 
 
 def null_space_components(
-    builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor
+    builder: RowBuilder, samples: Samples, state: ContactState, vectors: torch.Tensor
 ) -> Iterator[torch.Tensor]:
     """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
 
@@ -221,12 +223,12 @@ def null_space_components(
 class ForceSums:
     """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space.
 
-    `whitened`: of the rows that a fit sees, V_x^T f of its sensors in units of their noise.
+    `whitened`: of the rows of a fit, V_x^T f of its sensors in units of their noise.
     """
 
     def __init__(self, n_rows: int) -> None:
         """Start empty."""
-        self.rows, self.projected, self.whitened = Squares(n_rows), Squares(1), Squares(1)
+        self.rows, self.projected, self.whitened = SumsOfSquares(n_rows), SumsOfSquares(1), SumsOfSquares(1)
 
     @classmethod
     def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
@@ -260,7 +262,7 @@ class ForceSums:
         return float(force), float(moment)
 
 
-class Squares:
+class SumsOfSquares:
     """Sums and sums of squares by row, over the samples where the row is known."""
 
     def __init__(self, rows: int) -> None:
@@ -268,7 +270,7 @@ class Squares:
         self.plain, self.sum, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
 
     def add(self, x: torch.Tensor, weight: float = 1.0) -> None:
-        """Add samples (N, rows), NaN where unknown, each of which stands for so many."""
+        """Add samples (N, rows), NaN where unknown, each of which counts as `weight` samples."""
         values = x.cpu().numpy()
         known = np.isfinite(values)
         values = np.where(known, values, 0.0)
@@ -299,8 +301,8 @@ class Squares:
             return np.nan
         return float(np.sqrt(max((self.sum[rows][known] - plain**2 / count).sum(), 0.0) / count.sum()))
 
-    def merge(self, other: Squares) -> None:
-        """Add what another has seen."""
+    def merge(self, other: SumsOfSquares) -> None:
+        """Add the sums of another."""
         self.plain += other.plain
         self.sum += other.sum
         self.count += other.count

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.compression import Part
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
 from torchid.problem.linear import LinearProblem, TriangularFactor
 from torchid.problem.rows import RowBuilder
@@ -37,13 +37,13 @@ _THINNED = 4  # one in so many of these shows the leverage
 _NORMAL = 0.6745  # median of |x| of standard normal x
 _CLIP = 3.0  # residuals are clipped at three robust standard deviations: impacts count as no more
 _CLIPPED = 0.99501  # E[min(x^2, 9)] of standard normal x
-_HELD = 0.005  # weight of the variances so far against what residuals say: settles what these cannot tell apart
+_HELD = 0.005  # weight of the variances so far against what residuals say: settles what these leave confounded
 _LEAST_STEP = 0.05  # of a variance, by which factor it may fall in one step
 _SHARE = 0.01  # least share of a group in the variance along its own directions: a tenth of the deviation there
-_SMALLEST = 1e-3  # of the stated noise, least standard deviation: what is left of exact logs is rounding
+_SMALLEST = 1e-3  # of the stated noise, least standard deviation: exact logs leave nothing but rounding
 _LEFT = 0.1  # least share of the residual's degrees of freedom that a group is taken to have
-_FEW = 20.0  # independent readings, fewer of which say nothing: a standard deviation to 16 %
-_UNSEEN = 1e-9  # share of a source's variance in the rows below which it is projected out
+_FEW = 20.0  # independent readings, fewer of which are too few: a standard deviation to 16 %
+_NEGLIGIBLE = 1e-9  # share of a source's variance in the rows below which it is projected out
 _STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions of any group, most steps
 _CONFOUNDED = 0.5  # relative standard error of a standard deviation
 
@@ -73,7 +73,7 @@ class _Chunk:
     """
 
     log: str
-    state: State
+    state: ContactState
     oversampling: float
     rows: Tensor
     sources: Tensor
@@ -84,8 +84,8 @@ class SampledRows:
 
     Attributes:
         builder: of the rows; its sensors' noise is the stated one, which variances are relative to.
-        groups: those that the sensors have, by place in `NOISE_GROUPS`' order.
-        group_of: (E,), place among `groups` of every source of noise.
+        groups: those that the sensors have, in `NOISE_GROUPS`' order.
+        group_of: (E,), index among `groups` of every source of noise.
     """
 
     @one_thread()
@@ -114,7 +114,7 @@ class SampledRows:
         counts = np.array([[len(chunk.rows), len(chunk.rows) / chunk.oversampling] for chunk in self.chunks]).sum(0)
         return float(counts[0] / counts[1])
 
-    def _chunk(self, samples: Samples, state: State) -> _Chunk:
+    def _chunk(self, samples: Samples, state: ContactState) -> _Chunk:
         rows, W = self.builder.rows_by_sample(samples.to(self.builder.device), state)
         sources = (self._ways(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
         return _Chunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
@@ -158,7 +158,7 @@ class SampledRows:
         With parameters of an earlier fit in the builder's columns, by log, rows that are far off count less, as in
         Huber's loss: what impacts do to the parameters would look like noise of all rows.
         """
-        parts: dict[tuple[str, State], Part] = {}
+        parts: dict[tuple[str, ContactState], Part] = {}
         every = tuple(range(self.builder.width))
         for chunk in self.whitened(variance):
             key = chunk.log, chunk.state
@@ -182,10 +182,10 @@ def _source_names(builder: RowBuilder) -> list[str]:
     return [*BASE_GROUPS[: builder.tree.base_rows], *dofs, *contacts]
 
 
-def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State]]:
+def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, ContactState]]:
     """About so many samples, at random so that no gait is in step with them, log by log and state by state.
 
-    Of filtered logs, four for every independent one: more would say little more.
+    Of filtered logs, four for every independent one: more would add little.
     """
     rng, share = np.random.default_rng(0), min(1.0, most / max(sum(map(len, logs)), 1))
     for log in logs:
@@ -284,7 +284,7 @@ class VarianceComponentEstimator:
         return GroupVariances(variance, share, self._blocks @ estimated > 0.0, error, _change(first, variance / start))
 
     def _step(self, M: Array, q: Array, estimated: np.ndarray) -> Array:
-        """Factors of the unknown variances, so that the squares are those expected; where M cannot tell, near 1."""
+        """Factors of the unknown variances, so that the squares are those expected; undetermined ones stay near 1."""
         B = self._blocks
         M, q = B.T @ M @ B, B.T @ q
         free, held = np.flatnonzero(estimated), _HELD * np.diag(M)
@@ -320,10 +320,10 @@ class VarianceComponentEstimator:
         q, t, n = (np.zeros(count) for _ in range(3))
         for group in range(count):
             own, scores = size[:, of == group], score[:, of == group]
-            seen = own > _UNSEEN
-            t[group], n[group] = own.sum(), seen.sum()
-            if seen.any():
-                q[group] = t[group] * _clipped_variance(scores[seen] / np.sqrt(own[seen]), own[seen])
+            present = own > _NEGLIGIBLE
+            t[group], n[group] = own.sum(), present.sum()
+            if present.any():
+                q[group] = t[group] * _clipped_variance(scores[present] / np.sqrt(own[present]), own[present])
         return M.numpy(), q / found.left, t, n
 
     def _residuals(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> _Residuals:
@@ -335,7 +335,7 @@ class VarianceComponentEstimator:
             leverage = (chunk.sources[some] @ (chunk.rows[some, :, :-1] @ directions)).square().sum((0, 2))
             np.add.at(taken, of, chunk.oversampling * leverage.numpy())
             np.add.at(size, of, own[some].sum(0).numpy())
-            np.add.at(readings, of, (own > _UNSEEN).sum(0).numpy() / chunk.oversampling)
+            np.add.at(readings, of, (own > _NEGLIGIBLE).sum(0).numpy() / chunk.oversampling)
         left = 1.0 - np.divide(taken, size, out=np.zeros_like(size), where=size > 0.0)
         r = [chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1] for chunk in rows.chunks]
         U = [chunk.sources for chunk in rows.chunks]
@@ -344,10 +344,10 @@ class VarianceComponentEstimator:
 
 def _relative_errors(M: Array) -> Array:
     """Of the standard deviations, (G,), of normal noise whose variances are determined by the equations of M / 2."""
-    seen = np.diag(M) > 0.0
-    size = np.where(seen, np.diag(M), 1.0) ** -0.5
+    present = np.diag(M) > 0.0
+    size = np.where(present, np.diag(M), 1.0) ** -0.5
     values, V = np.linalg.eigh(M * size * size[:, None])
-    return np.where(seen, size * np.sqrt(0.5 * (np.square(V) / np.maximum(values, 1e-9)).sum(1)), np.inf)
+    return np.where(present, size * np.sqrt(0.5 * (np.square(V) / np.maximum(values, 1e-9)).sum(1)), np.inf)
 
 
 def _change(M: Array, factor: Array) -> float:

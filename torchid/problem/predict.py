@@ -15,7 +15,7 @@ from torch import Tensor
 from torchid.logs.spill import Spill
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
-from torchid.problem.contact_state import State, contact_extra_column, dof_extra_column
+from torchid.problem.contact_state import ContactState, contact_extra_column, dof_extra_column
 from torchid.problem.extras import ACTUATORS, Extra
 from torchid.problem.rows import ChunkDynamics, RowBuilder
 from torchid.problem.samples import Samples
@@ -26,7 +26,7 @@ _ROWS = 2**16  # of a log on the disk that are in memory at a time
 
 
 def calibrate_readings(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
-    """Samples whose readings are the forces they stand for: s y - o for an offset o and a scale s of the reading y.
+    """Samples whose readings are the forces themselves: s y - o for an offset o and a scale s of the reading y.
 
     Readings without unknowns are shared with `samples`; those that change lie on the disk if `samples` do.
 
@@ -69,7 +69,7 @@ def _readings(samples: Samples, known: Sequence[tuple[Extra, float]], tree: Kine
 
 
 @dataclass(frozen=True)
-class Forces:
+class GeneralizedForces:
     """Generalized forces of some samples, rows as in K: base force, base moment, joints.
 
     `measured`, (B, n_rows): S^T tau + J_C^T lambda [N, N m], NaN where a force that enters was not measured. `torque`,
@@ -81,7 +81,7 @@ class Forces:
     predicted: Tensor
 
 
-def predicted_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
+def predict_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
     """K phi, (n_rows, B), for parameters in the builder's columns, (columns,), without extras.
 
     Bodies' wrenches, summed over subtrees, work along screw axes: the rows of K are never formed.
@@ -93,7 +93,7 @@ def predicted_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) 
         by_body[body, start:end] = phi[start:end]
     wrench = by_body @ dynamics.wrenches  # (6, L, B)
     below = tree.ancestors.T @ wrench
-    torque = (dynamics.directions * below).sum(0)
+    torque = (dynamics.screw_axes * below).sum(0)
     coulomb, viscous = phi[layout.count : builder.columns.count].unflatten(0, (-1, 2)).unbind(1)
     velocity = dynamics.joints.velocity[1:]
     torque[1:] += coulomb[:, None] * tree.coulomb_sign(velocity) + viscous[:, None] * velocity
@@ -101,7 +101,7 @@ def predicted_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) 
     return torch.cat([wrench.sum(1), joints]) if tree.base_rows else joints
 
 
-def contact_forces(builder: RowBuilder, samples: Samples, state: State, dynamics: ChunkDynamics) -> Tensor:
+def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, dynamics: ChunkDynamics) -> Tensor:
     """J_C^T lambda, (n_rows, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
     tree = builder.tree
     total = samples.time.new_zeros(tree.n_rows, len(samples))
@@ -114,11 +114,13 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: State, dynamics
             wrench = (wrenches_at_base(dynamics.states, body, units) * components).sum(1, keepdim=True)
             joints = builder.columns.joints_above(body)  # and no others, where an unmeasured force would be NaN
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
-            total[rows] += generalized_forces(tree, dynamics.directions, body, wrench, joints)[0]
+            total[rows] += generalized_forces(tree, dynamics.screw_axes, body, wrench, joints)[0]
     return total
 
 
-def measured_and_predicted(builder: RowBuilder, samples: Samples, state: State, phi: Tensor) -> Forces:
+def measured_and_predicted_forces(
+    builder: RowBuilder, samples: Samples, state: ContactState, phi: Tensor
+) -> GeneralizedForces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
 
     Sensors count as calibrated: of the extras, those of actuators alone enter.
@@ -127,12 +129,12 @@ def measured_and_predicted(builder: RowBuilder, samples: Samples, state: State, 
     base_rows = builder.tree.base_rows
     torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
     measured = torque + contact_forces(builder, samples, state, dynamics).T
-    predicted = torch.stack([predicted_forces(builder, dynamics, p).T for p in phi])
+    predicted = torch.stack([predict_forces(builder, dynamics, p).T for p in phi])
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
         if extra.dof is not None and extra.what in ACTUATORS:
             column = dof_extra_column(extra, samples, builder.tree)
             predicted[..., base_rows + extra.dof] += phi[:, number, None] * column
-    return Forces(measured, torque, predicted)
+    return GeneralizedForces(measured, torque, predicted)
 
 
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
@@ -142,7 +144,7 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
     measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
     with torch.no_grad(), one_thread():
         for state, index in chunks_by_state(samples):
-            found = measured_and_predicted(builder, samples[index].to(builder.device), state, columns)
+            found = measured_and_predicted_forces(builder, samples[index].to(builder.device), state, columns)
             where = index if isinstance(index, slice) else index.numpy()
             measured[where] = found.measured.cpu().numpy()
             predicted[:, where] = found.predicted.cpu().numpy()
@@ -150,7 +152,7 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
 
 
 def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
-    """V_x V_x^T f of generalized forces (M, N, n_rows): what is left of each row inside the builder's null space."""
+    """V_x V_x^T f of generalized forces (M, N, n_rows): the part of each row inside the builder's null space."""
     out, base = forces.copy(), builder.tree.base_rows
     with torch.no_grad(), one_thread():
         for state, index in chunks_by_state(samples):
@@ -158,7 +160,7 @@ def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Arr
             coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
             for part, V in builder.null_space_bases(samples[index].to(builder.device), state):
                 chosen = where[part if isinstance(part, slice) else part.cpu().numpy()]
-                place = np.ix_(np.arange(len(forces)), chosen, coupled)
-                inside = V @ (V.mT @ torch.from_numpy(forces[place]).to(V)[..., None])
-                out[place] = inside[..., 0].cpu().numpy()
+                at = np.ix_(np.arange(len(forces)), chosen, coupled)
+                inside = V @ (V.mT @ torch.from_numpy(forces[at]).to(V)[..., None])
+                out[at] = inside[..., 0].cpu().numpy()
     return out

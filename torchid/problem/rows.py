@@ -14,9 +14,9 @@ from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.contact_state import (
     Columns,
+    ContactState,
     ContactStateLayout,
     ContactStateLayouts,
-    State,
     dof_extra_column,
     extra_columns,
 )
@@ -48,11 +48,19 @@ class Workspace:
 
 @dataclass(frozen=True)
 class ChunkDynamics:
-    """Dynamics of a chunk of samples: everything that rows and predictions are made of."""
+    """Dynamics of B samples: everything that rows and predictions are made of.
+
+    Attributes:
+        joints: motion of all joints.
+        states: of the joint frames of all nodes.
+        screw_axes: (6, L, B), see `joint_screw_axes`.
+        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter.
+        rotation_world_base: (B, 3, 3), None where it was not recorded.
+    """
 
     joints: JointMotion
     states: BodyStates
-    directions: Tensor
+    screw_axes: Tensor
     wrenches: Tensor
     rotation_world_base: Tensor | None
 
@@ -67,7 +75,7 @@ class ChunkDynamics:
         return ChunkDynamics(
             JointMotion(*map(pick, vars(self.joints).values())),
             BodyStates(*map(pick, vars(self.states).values())),
-            pick(self.directions),
+            pick(self.screw_axes),
             pick(self.wrenches),
             None if self.rotation_world_base is None else self.rotation_world_base[index],
         )
@@ -86,7 +94,14 @@ class RowBuilder(nn.Module):
     def __init__(
         self, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms | None = None
     ) -> None:
-        """Fix robot, contacts, sensors, and which unknowns there are beside the bodies' parameters."""
+        """Build the constants.
+
+        Args:
+            robot: the robot.
+            contacts: all contacts, by the columns of the samples' `active`.
+            sensors: which forces are measured, with their noise.
+            terms: unknowns beside the bodies' parameters; by default none.
+        """
         super().__init__()
         terms = terms or ExtraTerms()
         self.extras = list_extras(robot, contacts, sensors, terms)
@@ -103,7 +118,7 @@ class RowBuilder(nn.Module):
 
     @property
     def frames(self) -> list[tuple[int, Array]]:
-        """Body of each contact, and the pose (4, 4) of the contact frame in the body's joint frame."""
+        """Node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]."""
         return self._layouts.frames
 
     @property
@@ -122,8 +137,8 @@ class RowBuilder(nn.Module):
         """Where the rows are computed."""
         return self.tree.ancestors.device
 
-    def layout(self, state: State) -> ContactStateLayout:
-        """What is constant in a contact state: columns, joints and wrench directions that take part."""
+    def layout(self, state: ContactState) -> ContactStateLayout:
+        """What is constant in a contact state: columns, joints and wrenches that take part."""
         return self._layouts.layout(state)
 
     def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
@@ -131,21 +146,21 @@ class RowBuilder(nn.Module):
         motion = samples.motion()
         joints = joint_motion(self.tree, motion)
         states = body_states(self.tree, motion, joints)
-        directions = joint_screw_axes(self.tree, states)
+        screw_axes = joint_screw_axes(self.tree, states)
         column_layout, out = self.columns.layout, None
         if workspace is not None:
             out = workspace.zeros("wrenches", states.position, 6, column_layout.count, len(samples))
         wrenches = all_wrench_columns(states, column_layout, out)
-        return ChunkDynamics(joints, states, directions, wrenches, samples.base.rotation)
+        return ChunkDynamics(joints, states, screw_axes, wrenches, samples.base.rotation)
 
     def rows(
-        self, samples: Samples, state: State, workspace: Workspace | None = None
+        self, samples: Samples, state: ContactState, workspace: Workspace | None = None
     ) -> Iterator[tuple[tuple[int, ...], Tensor]]:
         """Blocks of rows for samples that share a contact state; no gradient flows through reused buffers.
 
         Yields:
             (columns, rows): rows are (M, len(columns) + 1), the right-hand side last, valid until the next
-                is asked for.
+                is requested.
         """
         workspace = workspace or Workspace()
         layout, dynamics = self.layout(state), self.dynamics(samples, workspace)
@@ -155,7 +170,7 @@ class RowBuilder(nn.Module):
             columns, rows = self._uncoupled_row(joint, samples, dynamics)
             yield columns, rows.T
 
-    def rows_by_sample(self, samples: Samples, state: State) -> tuple[Tensor, Tensor]:
+    def rows_by_sample(self, samples: Samples, state: ContactState) -> tuple[Tensor, Tensor]:
         """The same rows sample by sample, for samples that share a contact state.
 
         Returns:
@@ -180,21 +195,21 @@ class RowBuilder(nn.Module):
             W[:, base + joint, slot] = 1.0 / self._layouts.dof_std[joint]
         return rows, W
 
-    def null_space_bases(self, samples: Samples, state: State) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    def null_space_bases(self, samples: Samples, state: ContactState) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
         layout, dynamics = self.layout(state), self.dynamics(samples)
         yield from null_space(self._contact_rows(layout, dynamics)[0])
 
     def contact_jacobian(self, samples: Samples) -> Tensor:
-        """Jacobian of every contact frame along its own axes, active or not, (B, C, 6, n_rows)."""
+        """Jacobians of all contact frames along their own axes, active or not, (B, C, 6, n_rows)."""
         motion = samples.motion()
         states = body_states(self.tree, motion, joint_motion(self.tree, motion))
-        directions, joints = joint_screw_axes(self.tree, states), range(self.tree.n_dofs)
+        screw_axes, joints = joint_screw_axes(self.tree, states), range(self.tree.n_dofs)
         J = motion.joint_position.new_zeros(len(samples), len(self.frames), 6, self.tree.n_rows)
         for contact, (body, T_joint_frame) in enumerate(self.frames):
             units = J.new_tensor(wrench_transform(T_joint_frame).T.copy())
             at_base = wrenches_at_base(states, body, units)
-            J[:, contact] = generalized_forces(self.tree, directions, body, at_base, joints).permute(2, 0, 1)
+            J[:, contact] = generalized_forces(self.tree, screw_axes, body, at_base, joints).permute(2, 0, 1)
         return J
 
     def noise_axes(self, rotation_world_base: Tensor | None) -> Tensor | None:
@@ -204,7 +219,7 @@ class RowBuilder(nn.Module):
         )
 
     def recorded_wrench(self, samples: Samples, contact: int, dynamics: ChunkDynamics) -> Tensor:
-        """Recorded wrench of a contact along its frame's axes, (B, 6)."""
+        """Recorded wrench of a contact along its frame's axes, (B, 6) [N, N m], NaN where not recorded."""
         if samples.wrench is None:
             return samples.time.new_full((len(samples), 6), torch.nan)
         wrench = samples.wrench[:, contact]
@@ -220,14 +235,14 @@ class RowBuilder(nn.Module):
         return rotation if dynamics.rotation_world_base is None else dynamics.rotation_world_base @ rotation
 
     def recorded_torque(self, samples: Samples) -> Tensor:
-        """Recorded torques and wrenches in limbs, (B, n + 6 F), NaN where there are none."""
+        """Recorded joint torques and wrenches in limbs, (B, n + 6 F) [N m, N], NaN where not recorded."""
         if samples.torque is None:
             return samples.time.new_full((len(samples), self.tree.n_dofs), torch.nan)
         return samples.torque
 
     def _uncoupled_row(self, joint: int, samples: Samples, dynamics: ChunkDynamics) -> tuple[tuple[int, ...], Tensor]:
         row = self.columns.joint_rows[joint]
-        inertial = joint_row(row, self.tree, self.columns.layout, dynamics.directions, dynamics.wrenches)
+        inertial = joint_row(row, self.tree, self.columns.layout, dynamics.screw_axes, dynamics.wrenches)
         friction = [x for _, *pair in friction_columns(row, self.tree, dynamics.joints) for x in pair]
         own = {self.columns.count + number: extra for number, extra in enumerate(self.extras) if extra.dof == joint}
         extra = [dof_extra_column(extra, samples, self.tree) for extra in own.values()]
@@ -291,27 +306,27 @@ class RowBuilder(nn.Module):
         for body in range(1, tree.n_nodes):
             above = carried[:, tree.parents[body]]
             if body in moved:
-                torch.addcmul(above, dynamics.directions[:, body, None], own[moved[body]], out=carried[:, body])
+                torch.addcmul(above, dynamics.screw_axes[:, body, None], own[moved[body]], out=carried[:, body])
             else:
                 carried[:, body] = above
-        for kept, bodies in column_layout.runs(layout.bodies):
+        for kept, bodies in column_layout.runs(layout.nodes):
             if kept:
                 start, end = column_layout.starts[bodies.start], column_layout.starts[bodies.stop]
                 shape = (len(bodies), len(kept))
-                pulling = sum(column < parameters.INERTIA.start for column in kept)
+                n_with_force = sum(column < parameters.INERTIA.start for column in kept)
                 columns = X[start - inertial.start : end - inertial.start].unflatten(0, shape)
                 wrenches = dynamics.wrenches[:, start:end].unflatten(1, shape)
-                self._carry(wrenches, carried[:, bodies.start : bodies.stop], pulling, columns)
+                self._carry(wrenches, carried[:, bodies.start : bodies.stop], n_with_force, columns)
         return X
 
     @staticmethod
-    def _carry(wrenches: Tensor, carried: Tensor, pulling: int, out: Tensor) -> None:
-        """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `pulling` columns have a force."""
+    def _carry(wrenches: Tensor, carried: Tensor, n_with_force: int, out: Tensor) -> None:
+        """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `n_with_force` c have forces."""
         torch.mul(wrenches[3].unsqueeze(2), carried[3].unsqueeze(1), out=out)
         for k in (4, 5):
             out.addcmul_(wrenches[k].unsqueeze(2), carried[k].unsqueeze(1))
         for k in (0, 1, 2):
-            out[:, :pulling].addcmul_(wrenches[k, :, :pulling].unsqueeze(2), carried[k].unsqueeze(1))
+            out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), carried[k].unsqueeze(1))
 
     def _contact_rows(self, layout: ContactStateLayout, dynamics: ChunkDynamics) -> tuple[Tensor, Tensor]:
         """Rows of J_C, unmeasured and measured, in base and coupled joints, (B, k, base rows + coupled joints)."""
@@ -325,19 +340,20 @@ class RowBuilder(nn.Module):
             for kind, wrenches in enumerate((contact.unmeasured, contact.measured)):
                 if len(wrenches):
                     at_base = wrenches_at_base(dynamics.states, contact.body, wrenches)
-                    rows = generalized_forces(self.tree, dynamics.directions, contact.body, at_base, joints)
+                    rows = generalized_forces(self.tree, dynamics.screw_axes, contact.body, at_base, joints)
                     target = both[starts[kind] : starts[kind] + len(wrenches)]
                     target.index_copy_(1, self._index(columns), rows)
                     starts[kind] += len(wrenches)
         return tuple(both.permute(2, 0, 1).split(sizes, dim=1))
 
-    def _index(self, places: Iterable[int]) -> Tensor:
-        return torch.tensor(list(places), dtype=torch.int64, device=self.device)
+    def _index(self, indices: Iterable[int]) -> Tensor:
+        return torch.tensor(list(indices), dtype=torch.int64, device=self.device)
 
     def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""
-        places = [place for body in layout.contact_bodies for place in body.components]
+        components = [component for body in layout.contact_bodies for component in body.components]
         local = {
-            contact: self.recorded_wrench(samples, contact, dynamics) for contact in {contact for contact, _ in places}
+            contact: self.recorded_wrench(samples, contact, dynamics)
+            for contact in {contact for contact, _ in components}
         }
-        return torch.stack([local[contact][:, k] for contact, k in places], dim=1)
+        return torch.stack([local[contact][:, k] for contact, k in components], dim=1)

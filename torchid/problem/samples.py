@@ -34,18 +34,18 @@ class Samples:
         source: the log's file, for messages and tables.
         time: (N,) [s].
         joint_position, joint_velocity, joint_acceleration: (N, n).
-        base: how the base moves and, if known, stands; None for a bolted base.
+        base: how the base moves and, if known, its orientation; None for a bolted base.
         torque: (N, n + 6 F) [N m, N, N m] by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs;
             NaN where not measured, or None.
         wrench: (N, C, 6), NaN where not measured, or None; along world axes if `wrench_in_world`, else the frames'.
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
-        share: (N, C), what is left of a constant contact reading, as `Log.contact_share`; None where it is `active`.
+        share: (N, C), filtered share of a constant contact reading, as `Log.contact_share`; None where it is `active`.
         unloaded: (N, C, 6), what the contacts' sensors read in the air, NaN elsewhere, as `Log.contact_unloaded`; None
             where there is no such reading.
         folder: on whose disk the tensors of a log larger than memory lie, None for one in memory.
-        fold: number of the block of all logs that these samples are in, see `in_folds`.
+        fold: number of the block of all logs that these samples are in, see `split_into_folds`.
     """
 
     source: str
@@ -88,11 +88,11 @@ class Samples:
 
     @property
     def rotation_world_base(self) -> Tensor | None:
-        """(N, 3, 3), or None where nobody recorded it."""
+        """Rotation base to world, (N, 3, 3), None where it was not recorded."""
         return self.base.rotation
 
     def motion(self) -> Motion:
-        """What the regressor needs of these samples."""
+        """The motion of these samples, as the regressor takes it."""
         base, still = self.base, self.time.new_zeros(len(self), 3)
         force = base.specific_force
         if force is None:  # of a bolted base
@@ -107,7 +107,7 @@ class Samples:
         """Generalized coordinates q, v, a as `Regressor` takes them.
 
         Base position and base linear velocity are 0: the dynamics do not depend on them, and logs need not hold them.
-        Nor do they depend on an orientation that nobody measured beside the specific force: it is the identity then.
+        Nor do they depend on the orientation beside the specific force: where it was not measured it is the identity.
         A bolted base has joints only.
         """
         joints = (self.joint_position, self.joint_velocity, self.joint_acceleration)
@@ -171,7 +171,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
 
 
 def oversampling(time: FloatArray, noise_bandwidth_hz: float | None) -> float:
-    """Half the sample rate of stamps (N,) [s] over the bandwidth that a filter has left of the noise, at least 1."""
+    """Half the sample rate of stamps (N,) [s] over the bandwidth of the noise behind a filter, at least 1."""
     if noise_bandwidth_hz is None or len(time) < 2:
         return 1.0
     rate = 1.0 / float(np.median(np.diff(time)))

@@ -51,12 +51,12 @@ def full_layout(tree: KinematicTree) -> ColumnLayout:
 
 
 def reduced_layout(tree: KinematicTree) -> ColumnLayout:
-    """The columns that are left after regrouping; a fixed base has none."""
+    """The columns that remain after regrouping into the parents' (Gautier 1990); a fixed base has none."""
     kept = {
         "base": ALL_INERTIAL if tree.base_rows else (),
         "revolute": _REVOLUTE_KEPT,
         "prismatic": _PRISMATIC_KEPT,
-        "welded": ALL_INERTIAL,  # the sensor sees what no joint does
+        "welded": ALL_INERTIAL,  # the sensor measures all six components of the wrench
         "massless": (),
     }
     return ColumnLayout(tuple(kept[kind] for kind in tree.kinds))
@@ -91,7 +91,7 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
 
     Args:
         states: of the frames the parameters are expressed in, k of them.
-        columns: places in the order of `torchid.parameters`, ascending, below 10.
+        columns: indices in the order of `torchid.parameters`, ascending, below 10.
         out: (6, k, len(columns), B), zero in the force rows of inertia columns; receives force [N], then moment about
             the base origin [N m], per unit of the parameter.
 
@@ -102,22 +102,24 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
         rotate_vectors(inverse, x)
         for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
     )
-    spinning = [column for column in columns if column >= parameters.INERTIA.start]
-    pulling = len(columns) - len(spinning)
-    if pulling:
-        axes = [column - parameters.FIRST_MOMENT.start for column in columns[:pulling] if column != parameters.MASS]
+    with_moment_only = [column for column in columns if column >= parameters.INERTIA.start]
+    n_with_force = len(columns) - len(with_moment_only)
+    if n_with_force:
+        axes = [
+            column - parameters.FIRST_MOMENT.start for column in columns[:n_with_force] if column != parameters.MASS
+        ]
         pushes, twists = _first_moment_wrenches(omega, alpha, force)
         forces = _to_base(states.rotation, [pushes[k] for k in axes])
         moments = _to_base(states.rotation, [twists[k] for k in axes])
         if parameters.MASS in columns:
             forces = torch.cat([states.specific_force[:, :, None], forces], 2)
             moments = torch.nn.functional.pad(moments, (0, 0, 1, 0))
-        out[:3, :, :pulling] = forces
-        out[3:, :, :pulling] = moments + cross_product(states.position[:, :, None], forces)
-    if spinning:
+        out[:3, :, :n_with_force] = forces
+        out[3:, :, :n_with_force] = moments + cross_product(states.position[:, :, None], forces)
+    if with_moment_only:
         by_axes = _inertia_moments(omega, alpha)
-        spins = [by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in spinning]
-        out[3:, :, pulling:] = _to_base(states.rotation, spins)
+        spins = [by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in with_moment_only]
+        out[3:, :, n_with_force:] = _to_base(states.rotation, spins)
 
 
 def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:

@@ -23,35 +23,35 @@ from torchid.robot import Robot
 
 
 def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor) -> Tensor:
-    """Wrenches that are constant in a body's joint frame, (k, 6), at the base origin in base axes, (6, k, B)."""
+    """Wrenches, (k, 6) in a node's joint frame, at the base origin in base axes, (6, k, B) [N, N m]."""
     rotation, position = states.rotation[:, :, body], states.position[:, body]
     force = wrenches[:, :3] @ rotation
     return torch.cat([force, wrenches[:, 3:] @ rotation + cross_product(position[:, None].expand_as(force), force)])
 
 
 def generalized_forces(
-    tree: KinematicTree, directions: Tensor, body: int, wrenches: Tensor, joints: Sequence[int]
+    tree: KinematicTree, screw_axes: Tensor, body: int, wrenches: Tensor, joints: Sequence[int]
 ) -> Tensor:
     """Work of wrenches on a body, per unit of base twist and joint velocity.
 
     Args:
         tree: the robot's constants.
-        directions: from `joint_screw_axes`, (6, L, B).
-        body: which body.
-        wrenches: at the base origin, (6, k, B).
+        screw_axes: from `joint_screw_axes`, (6, L, B).
+        body: the node that they act on.
+        wrenches: at the base origin, (6, k, B) [N, N m].
         joints: independent joints to give columns for, after the base's six (none for a fixed base).
 
     Returns:
         (k, base rows + len(joints), B).
     """
     path = tree.path(body)
-    screws = tree.joint_map[path][:, list(joints)].T @ directions[:, path]
+    screws = tree.joint_map[path][:, list(joints)].T @ screw_axes[:, path]
     torque = (wrenches[:, :, None] * screws[:, None]).sum(0)
     return torch.cat([wrenches.transpose(0, 1), torque], dim=1) if tree.base_rows else torque
 
 
 def wrench_transform(T: Array) -> Array:
-    """Matrix (6, 6) that takes a wrench at a frame, in its axes, to the frame that `T` (4, 4) gives its pose in."""
+    """Matrix (6, 6) that expresses a wrench at a frame, in its axes, in another, where `T`, (4, 4) [m], is its pose."""
     R, p = T[:3, :3], T[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [np.cross(np.eye(3), p) @ R, R]])
 
@@ -77,9 +77,9 @@ class FrameJacobian(nn.Module):
         self._joints = range(robot.n_dofs)
 
     def forward(self, q: Tensor) -> Tensor:
-        """Jacobian (B, 6, nv) at coordinates `q`, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
+        """Jacobian (B, 6, n_rows) at coordinates `q`, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
 
-        Force/torque sensors in limbs add six columns each, after those of the joints.
+        n_rows = nv + 6 F: force/torque sensors in limbs add six columns each, after those of the joints.
         """
         tree = self.tree
         still = q.new_zeros(q.shape[0], tree.n + tree.base_rows)

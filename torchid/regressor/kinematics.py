@@ -1,4 +1,4 @@
-"""A motion, and the poses, twists and accelerations of all bodies in it, batch-last, in the base frame."""
+"""Forward kinematics: from a motion to poses, twists and accelerations of all frames, batch-last, in the base frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The regressor K(q, v, a): its rows, batch-last, and a module for anybody's training loop."""
+"""The regressor K(q, v, a): a differentiable module, and the batch-last functions that compute its rows."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ class Regressor(nn.Module):
         return self.from_motion(motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity))
 
     def from_motion(self, motion: Motion) -> Tensor:
-        """As `forward`, from a `Motion` (which knows no base position, heading or linear velocity)."""
+        """As `forward`, from a `Motion` (which has no base position, heading or linear velocity)."""
         tree, layout = self.tree, self._layout
         joints = joint_motion(tree, motion)
         states = body_states(tree, motion, joints)
-        directions = joint_screw_axes(tree, states)
+        screw_axes = joint_screw_axes(tree, states)
         wrenches = all_wrench_columns(link_states(tree, states), layout)
         K = wrenches.new_zeros(tree.base_rows + len(self._rows), tree.n_nodes, parameters.PER_BODY, wrenches.shape[-1])
         inertial = K[:, :, parameters.INERTIAL]
@@ -82,7 +82,7 @@ class Regressor(nn.Module):
         if tree.base_rows:
             inertial[: tree.base_rows] = wrenches.unflatten(1, (-1, width))
         for index, row in enumerate(self._rows, start=tree.base_rows):
-            part = joint_row(row, tree, layout, directions, wrenches)
+            part = joint_row(row, tree, layout, screw_axes, wrenches)
             inertial[index, row.start // width : row.end // width] = part.unflatten(0, (-1, width))
             for body, coulomb, viscous in friction_columns(row, tree, joints):
                 K[index, body, parameters.COULOMB] = coulomb
@@ -116,15 +116,15 @@ def joint_rows(tree: KinematicTree, layout: ColumnLayout) -> list[JointRow]:
     return rows
 
 
-def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, directions: Tensor, wrenches: Tensor) -> Tensor:
+def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, screw_axes: Tensor, wrenches: Tensor) -> Tensor:
     """Inertial part of one joint's row, (row.end - row.start, B)."""
     body, ratio = row.moved[0]
     if len(row.moved) == 1:
-        return ratio * _torque(directions[:, body], wrenches[:, row.start : row.end])
+        return ratio * _torque(screw_axes[:, body], wrenches[:, row.start : row.end])
     total = wrenches.new_zeros(row.end - row.start, wrenches.shape[-1])
     for body, ratio in row.moved:
         start, end = layout.starts[body], layout.starts[tree.subtree_end[body]]
-        part = ratio * _torque(directions[:, body], wrenches[:, start:end])
+        part = ratio * _torque(screw_axes[:, body], wrenches[:, start:end])
         total = total + torch.nn.functional.pad(part, (0, 0, start - row.start, row.end - end))
     return total
 
@@ -142,7 +142,7 @@ def friction_columns(row: JointRow, tree: KinematicTree, joints: JointMotion) ->
 
 
 def joint_screw_axes(tree: KinematicTree, states: BodyStates) -> Tensor:
-    """Screw axes of all joints, (6, L, B): `direction . wrench at the base origin` is the torque about the joint."""
+    """Screw axes of all joints, (6, L, B): `screw_axis . wrench at the base origin` is the torque about the joint."""
     axis = states.rotation[:, 2]
     linear = cross_product(states.position, axis) * tree.revolute + axis * tree.prismatic
     return torch.cat([linear, axis * tree.revolute])
@@ -154,7 +154,7 @@ def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | N
     Args:
         states: of the frames that `layout`'s parameters are expressed in.
         layout: which columns to compute.
-        out: a buffer of the result's shape to write to, as it was left by an earlier call with the same layout.
+        out: a buffer of the result's shape to write to, unchanged since an earlier call with the same layout, or zero.
     """
     if out is None:
         out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
@@ -165,8 +165,8 @@ def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | N
     return out
 
 
-def _torque(direction: Tensor, wrenches: Tensor) -> Tensor:
-    total = direction[0] * wrenches[0]
+def _torque(screw_axis: Tensor, wrenches: Tensor) -> Tensor:
+    total = screw_axis[0] * wrenches[0]
     for k in range(1, 6):
-        total.addcmul_(direction[k], wrenches[k])
+        total.addcmul_(screw_axis[k], wrenches[k])
     return total

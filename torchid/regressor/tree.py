@@ -18,8 +18,8 @@ class Node:
     """A frame that a joint moves.
 
     `kind`: "base", "revolute", "prismatic", "welded" (the body beyond a force/torque sensor) or "massless" (a node
-    before it). `body`: of the robot; None if massless. `motion`, (n + 6 F,), and `offset`: the joint's position from
-    the robot's degrees of freedom. Poses as in `JointGeometry`.
+    before it). `body`: of the robot; None if massless. `position_map`, (n + 6 F,), and `offset`: the position is
+    `position_map @ dofs + offset`, with the robot's degrees of freedom. Poses as in `JointGeometry`.
     """
 
     kind: str
@@ -29,7 +29,7 @@ class Node:
     slides: bool
     T_parent_joint: Array
     T_joint_link: Array
-    motion: Array
+    position_map: Array
     offset: float
 
 
@@ -54,17 +54,17 @@ def tree_nodes(robot: Robot) -> list[Node]:
                         slides=k < 3,
                         T_parent_joint=np.eye(4) if k else T_parent_joint,
                         T_joint_link=T_joint_link if last else np.eye(4),
-                        motion=dofs[first + k],
+                        position_map=dofs[first + k],
                         offset=0.0,
                     )
                 )
         else:
             slides = bool(geometry.prismatic[index])
             kind = "base" if not index else "prismatic" if slides else "revolute"
-            motion = np.pad(matrix[index - 1], (0, robot.n_dofs - robot.n)) if index else np.zeros(robot.n_dofs)
+            position_map = np.pad(matrix[index - 1], (0, robot.n_dofs - robot.n)) if index else np.zeros(robot.n_dofs)
             offset = float(constant[index - 1]) if index else 0.0
             axis = geometry.axis[index]
-            nodes.append(Node(kind, index, parent, axis, slides, T_parent_joint, T_joint_link, motion, offset))
+            nodes.append(Node(kind, index, parent, axis, slides, T_parent_joint, T_joint_link, position_map, offset))
         node_of.append(len(nodes) - 1)
     return nodes
 
@@ -138,7 +138,7 @@ class KinematicTree(nn.Module):
         self._register("revolute", (moving & ~np.array(self.slides))[:, None])
         self._register("prismatic", np.array(self.slides)[:, None])
         self._register("ancestors", is_ancestor)
-        self._register("joint_map", np.stack([node.motion for node in nodes]))
+        self._register("joint_map", np.stack([node.position_map for node in nodes]))
         self._register("joint_constant", np.array([node.offset for node in nodes])[:, None])
         parent = np.maximum(self.parents, 0)
         level_start = np.repeat(np.cumsum([0, 0, *self.level_sizes[:-1]])[:-1], self.level_sizes)

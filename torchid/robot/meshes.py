@@ -73,14 +73,14 @@ def _package(urdf: Path) -> Path:
 
 
 def _in_package(urdf: Path, package: Path, name: str) -> list[Path]:
-    """Places that a path may mean, from the URDF's folder upwards, as far as they are in the package."""
+    """Paths that a path may mean, from the URDF's folder upwards, as far as they are in the package."""
     folders = [folder for folder in urdf.absolute().parents if folder.is_relative_to(package)]
     paths = [Path(os.path.normpath(folder / name)) for folder in folders]
     return [path for path in paths if path.is_relative_to(package)]
 
 
 def _in_packages(urdf: Path, package: Path, name: str) -> list[Path]:
-    """Places that `package://name` may mean: a package above the URDF, one beside its own, or its own renamed."""
+    """Paths that `package://name` may mean: a package above the URDF, one beside its own, or its own renamed."""
     parts = PurePosixPath(name.lstrip("/")).parts
     if not parts or ".." in parts:
         return []

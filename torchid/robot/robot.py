@@ -1,4 +1,4 @@
-"""The robot as the rest of torchid sees it: named bodies in a tree, independent joints, nominal parameters."""
+"""A robot: named bodies in a tree, independent joints, nominal parameters."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Robot:
 
     @property
     def n_dofs(self) -> int:
-        """Number of `dof_names`, n + 6 F."""
+        """Number of `dof_names`: n joints and six components of each force/torque sensor in a limb, n + 6 F."""
         return len(self.dof_names)
 
     @property

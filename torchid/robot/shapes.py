@@ -58,7 +58,7 @@ class _Shape:
     axes: Array
 
     def moved(self, T: Array) -> _Shape:
-        """Seen from another frame, `T` the pose of this one in it."""
+        """Expressed in another frame; `T`, (4, 4) [m], is the pose of this one in it."""
         R = T[:3, :3]
         return _Shape(self.points @ R.T + T[:3, 3], R @ self.spread, R @ self.axes)
 

@@ -37,7 +37,7 @@ def mirror_pairs(
 ) -> tuple[MirrorPair, ...]:
     """Pairs of bodies whose names become each other's if `left` and `right` change places in them.
 
-    All of them do, or else one alone: LAnkleRoll and RAnkleRoll differ in one of three letters L and R. With all joints
+    All of them do, or else one alone: LAnkleRoll and RAnkleRoll differ in one letter of three, L and R. With all joints
     at 0 the two bodies must be mirror images with respect to the plane through the base link's origin whose normal is
     the base link's axis `normal`: with D the reflection, D p_i = p_j for the origins, to `TOLERANCE`, and D a_i
     parallel to a_j for the joints' axes. From one link frame to the other the reflection is R_j^T D R_i.
@@ -45,7 +45,7 @@ def mirror_pairs(
     Args:
         robot: any.
         left: part of the names of bodies on one side, as "l_".
-        right: what stands there in the names of their mirror images.
+        right: the part in its stead in the names of their mirror images.
         normal: "x", "y" or "z".
         source: the file that names them; the URDF if None.
         field: of that file, for errors.
@@ -100,7 +100,7 @@ def _by_name(
 
 
 def _images(name: str, left: str, right: str, names: tuple[str, ...]) -> list[str]:
-    """Bodies whose name is this one with left and right exchanged wherever they stand alone, or else in one place."""
+    """Bodies whose name is this one with left and right exchanged wherever they are words, or else once anywhere."""
     exchanged = _exchanged(name, left, right)
     if exchanged != name and exchanged in names:
         return [exchanged]

@@ -189,7 +189,7 @@ def _inverse(T: Array) -> Array:
 
 
 def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None) -> BodyJoint:
-    """The joint as seen from the base: turned around, its frame sits at the child link and its axis flips."""
+    """The joint on the path from the base: if turned around, its frame sits at the child link and its axis flips."""
     body, T_body_near = tree.links[joint.child if reverse else joint.parent]
     weld = joint.type not in MOVING_TYPES
     axis = np.array([0.0, 0.0, 1.0]) if weld else joint.axis / np.linalg.norm(joint.axis)

@@ -125,7 +125,7 @@ def _check_name(path: Path, field: str, name: str) -> None:
 
 
 def _check_numbers(path: Path, owner: etree._Element) -> None:
-    """Refuse what is no decimal number, before a parser that would not say where it stands."""
+    """Refuse what is no decimal number, before a parser that would not name the element."""
     of = f"{owner.tag!s} '{owner.get('name')}'"
     for part in owner:
         for element in part.iter():

@@ -33,8 +33,8 @@ class Projection(nn.Module):
     """V_x, V_x^T K and V_x^T f for one sensor set.
 
     The unmeasured forces enter through `A_x = [S_x; J_x]`: rows of unit vectors for unmeasured joint torques, rows of
-    the contact Jacobian for unmeasured wrench components of active contacts. `V_x` spans its null space; whatever is
-    unmeasured has no place in `V_x^T K phi = V_x^T A_m^T [tau_m; lambda_m]`.
+    the contact Jacobian for unmeasured wrench components of active contacts. `V_x` spans its null space, so that no
+    unmeasured force is in `V_x^T K phi = V_x^T A_m^T [tau_m; lambda_m]`.
 
     Gradients flow to all arguments, the Jacobian included: through `V_x` too, whose choice is arbitrary, so that only
     losses that do not depend on it (squares of projected forces, their sum over a batch) have one that means
@@ -137,7 +137,7 @@ class Projection(nn.Module):
         return groups
 
     def _bases(self, J_x: Tensor, J_m: Tensor, measured: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
-        """Of what is left free on the rows that are kept: the others' torques are unknown."""
+        """Null-space bases on the rows of the base and of measured torques: in the others the torque is unknown."""
         kept = self.get_buffer("kept")
         if not self._whiten:
             return null_space(J_x[:, :, kept])
@@ -236,12 +236,12 @@ def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
         regular = torch.nonzero(~suspect)[:, 0]
         if len(regular):
             yield regular, V[regular]
-    left = torch.nonzero(suspect)[:, 0]
-    _, values, Vh = torch.linalg.svd(A[left], full_matrices=True)
+    remaining = torch.nonzero(suspect)[:, 0]
+    _, values, Vh = torch.linalg.svd(A[remaining], full_matrices=True)
     rank = (values > tolerance * values[:, :1].clamp_min(torch.finfo(A.dtype).tiny)).sum(1)
     for r in rank.unique().tolist():
         same = rank == r
-        yield left[same], Vh[same, r:].mT
+        yield remaining[same], Vh[same, r:].mT
 
 
 def _differentiable(A: Tensor, V: Tensor) -> Tensor:

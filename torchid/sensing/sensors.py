@@ -29,7 +29,7 @@ class Contact:
     line_axis: str = "y"
 
     def __post_init__(self) -> None:
-        """Refuse what is no contact.
+        """Validate kind and line axis.
 
         Raises:
             SensorError: an unknown kind or line axis.
@@ -41,7 +41,7 @@ class Contact:
 
     @property
     def components(self) -> tuple[int, ...]:
-        """Places in `WRENCH_COMPONENTS` that can differ from zero."""
+        """Indices in `WRENCH_COMPONENTS` of the components that can differ from zero."""
         if self.kind == "point":
             return _FORCES
         if self.kind == "flat":
@@ -80,13 +80,13 @@ PerAxis = float | tuple[float, float, float]
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Standard deviations of the sensors, and the least that a base row is ever trusted to.
+    """Standard deviations of the sensors, and those of the base rows beside the sensors' [N, N m].
 
-    `base_force` and `base_moment` stand for what no force sensor sees (differentiated motion, soft contacts): without
-    them a base row in flight, where no sensor contributes noise, would count as exact. By default one contact sensor's
-    noise. So are force/torque sensors in limbs. Three numbers are for the axes x, y, z of the levelled base, see
-    `torchid.problem.base_motion.levelled`. The defaults are a guess, for library users and as the point that
-    `torchid.problem.noise` starts from.
+    `base_force` and `base_moment` are the errors of the base rows that are no force sensor's (differentiated motion,
+    soft contacts): without them a base row in flight, where no sensor contributes noise, would count as exact. By
+    default they are one contact sensor's noise, and so are those of force/torque sensors in limbs. Three numbers are
+    for the axes x, y, z of the levelled base, see `torchid.problem.base_motion.levelled_base_axes`. The defaults are
+    rough, for library users and as the start of the estimation in `torchid.problem.noise`.
     """
 
     joint_torque: float = 0.5
@@ -99,29 +99,29 @@ class SensorNoise:
 
     @property
     def base_std(self) -> Array:
-        """Floor of the six base rows along the levelled base's axes, (6,) [N, N m]."""
+        """Standard deviations of the six base rows along the levelled base's axes, (6,) [N, N m]."""
         force = self.contact_force if self.base_force is None else self.base_force
         moment = self.contact_moment if self.base_moment is None else self.base_moment
         return np.concatenate([np.broadcast_to(np.asarray(x, dtype=float), 3) for x in (force, moment)])
 
     @property
     def base_axes_differ(self) -> bool:
-        """Whether the floors of the base rows differ from axis to axis."""
+        """Whether the standard deviations of the base rows differ from axis to axis."""
         return bool(np.ptp(self.base_std.reshape(2, 3), axis=1).any())
 
     @property
     def limb_std(self) -> tuple[float, float]:
-        """Of a force and of a moment that a sensor in a limb reads [N, N m]."""
+        """Standard deviations of a force and of a moment that a force/torque sensor in a limb reads [N, N m]."""
         force = self.contact_force if self.ft_force is None else self.ft_force
         moment = self.contact_moment if self.ft_moment is None else self.ft_moment
         return force, moment
 
     def dof_std(self, n: int, count: int) -> Array:
-        """Of n joint torques, then of the wrenches of force/torque sensors in limbs, (count,) [N m, N, N m]."""
+        """Standard deviations by `Robot.dof_names`: n joint torques, then wrenches in limbs, (count,) [N m, N, N m]."""
         return np.append(np.full(n, self.joint_torque), np.tile(np.repeat(self.limb_std, 3), (count - n) // 6))
 
     def scaled(self, factor: float) -> SensorNoise:
-        """All of them, larger by a factor."""
+        """All standard deviations times a factor."""
         scaled: dict[str, Any] = {
             name: tuple(factor * one for one in x) if isinstance(x, tuple) else factor * x
             for name, x in vars(self).items()
@@ -131,7 +131,7 @@ class SensorNoise:
 
     @property
     def wrench_std(self) -> Array:
-        """Of the six wrench components, (6,) [N, N m]."""
+        """Standard deviations of the six components of a contact wrench, (6,) [N, N m]."""
         return np.array([self.contact_force] * 3 + [self.contact_moment] * 3)
 
 

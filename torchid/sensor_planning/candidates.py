@@ -22,7 +22,7 @@ class Candidate:
     """A sensor that may be chosen.
 
     `kind`: one of `KINDS`. `dofs`: places among the robot's `dof_names` that a torque sensor, or a force/torque sensor
-    in a limb, reads. `contact`: place among the contacts, and `components`: places in `COMPONENTS`, of a force/torque
+    in a limb, reads. `contact`: index among the contacts, and `components`, in `WRENCH_COMPONENTS`, of a force/torque
     sensor there. `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it.
     """
 

@@ -25,7 +25,7 @@ import numpy as np
 from torchid.identifiability.structure import random_postures, resting_samples
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact
@@ -98,7 +98,7 @@ def span_basis(vectors: Array) -> Array:
 def demands(
     robot: Robot,
     contacts: Sequence[Contact],
-    states: Iterable[State],
+    states: Iterable[ContactState],
     candidates: Sequence[Candidate],
     seed: int = 0,
     joint_position: Array | None = None,
@@ -126,7 +126,7 @@ def demands(
     return [_demand(group, tuple(joints[group]), contacts, J, candidates) for group in groups]
 
 
-def _groups(above: Sequence[AbstractSet[int]], state: State) -> list[tuple[int, ...]]:
+def _groups(above: Sequence[AbstractSet[int]], state: ContactState) -> list[tuple[int, ...]]:
     """Active contacts, grouped by shared joints among those `above` each."""
     active = [place for place, touching in enumerate(state) if touching]
     return [tuple(active[k] for k in group) for group in connected_groups([above[place] for place in active])]

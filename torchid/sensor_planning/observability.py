@@ -13,7 +13,7 @@ from torchid.identifiability.structure import random_postures, resting_samples
 from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.chunks import one_thread
-from torchid.problem.contact_state import State, state_name
+from torchid.problem.contact_state import ContactState, state_name
 from torchid.robot import Robot
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorSet
@@ -39,7 +39,7 @@ class BaseObservability:
         dependent: if the rank falls at position zero only, for each unmet demand the sensors that are dependent there.
     """
 
-    state: State
+    state: ContactState
     name: str
     generic: PostureSummary
     zero: PostureSummary
@@ -90,12 +90,12 @@ class LostBase:
 def assess_sensors(
     robot: Robot,
     contacts: Sequence[Contact],
-    states: Iterable[State],
+    states: Iterable[ContactState],
     sensors: SensorSet,
     choice: Sequence[Candidate],
     samples: int = 64,
     seed: int = 0,
-    postures: Mapping[State, Array] | None = None,
+    postures: Mapping[ContactState, Array] | None = None,
 ) -> list[BaseObservability]:
     """Rank of the base with a sensor set in every contact state, by the projection itself; nothing for a bolted base.
 
@@ -125,7 +125,7 @@ def assess_sensors(
     return checks
 
 
-def base_values(builder: RowBuilder, state: State, postures: Array) -> torch.Tensor:
+def base_values(builder: RowBuilder, state: ContactState, postures: Array) -> torch.Tensor:
     """Singular values of S_b V_x, (N, 6), at joint positions (N, n) in a contact state."""
     found = torch.zeros(len(postures), 6, dtype=torch.float64)
     for start in range(0, len(postures), _CHUNK):
@@ -215,7 +215,7 @@ class _Cause:
 
 
 def _assess_state(
-    builder: RowBuilder, state: State, drawn: Array, recorded: Array | None, cause: _Cause
+    builder: RowBuilder, state: ContactState, drawn: Array, recorded: Array | None, cause: _Cause
 ) -> BaseObservability:
     zero = np.zeros((1, drawn.shape[1]))
     generic, straight = base_values(builder, state, drawn), base_values(builder, state, zero)
@@ -234,7 +234,7 @@ def _assess_state(
     )
 
 
-def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> LostBase:
+def _lost(builder: RowBuilder, state: ContactState, posture: Array, cause: _Cause) -> LostBase:
     [(_, V)] = builder.null_space_bases(resting_samples(posture, state), state)
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
     directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]

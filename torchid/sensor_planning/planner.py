@@ -14,7 +14,7 @@ from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
 from torchid.problem.chunks import subsample_states
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
@@ -57,7 +57,7 @@ class PlanningProblem:
 
     robot: Robot
     contacts: tuple[Contact, ...]
-    states: tuple[State, ...]
+    states: tuple[ContactState, ...]
     candidates: tuple[Candidate, ...]
     prior: Array
     keep: frozenset[Candidate] = frozenset()
@@ -203,7 +203,7 @@ def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None)
 
 def assess_set(problem: PlanningProblem, sensors: SensorSet) -> list[BaseObservability]:
     """Observability of the base with a sensor set, by contact state, over the postures of the logs as well."""
-    pieces: dict[State, list[Array]] = {}
+    pieces: dict[ContactState, list[Array]] = {}
     for samples, state, _ in subsample_states(problem.logs, _POSTURES):
         pieces.setdefault(state, []).append(samples.joint_position.numpy())
     postures = {state: np.concatenate(found) for state, found in pieces.items()}
@@ -218,7 +218,7 @@ def assess_set(problem: PlanningProblem, sensors: SensorSet) -> list[BaseObserva
     )
 
 
-def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State]) -> tuple[Branch, ...]:
+def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[ContactState]) -> tuple[Branch, ...]:
     """All branches with joints of their own, depth first; a finger that only mimics has none."""
     used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
     tree = KinematicTree(robot)
@@ -238,7 +238,7 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[State])
 
 
 def contact_requirements(
-    robot: Robot, contacts: Sequence[Contact], states: Iterable[State], seed: int = 0
+    robot: Robot, contacts: Sequence[Contact], states: Iterable[ContactState], seed: int = 0
 ) -> tuple[ContactRequirement, ...]:
     """Of every group of contacts, if all joint torques and contact components could be measured."""
     states = tuple(states)

@@ -21,7 +21,7 @@ from torchid.identifiability.structure import structural_problem, structural_sam
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import one_thread, run_in_workers, subsample_states, worker_count
-from torchid.problem.contact_state import State
+from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensor_planning.candidates import Candidate, sensor_set
@@ -47,7 +47,7 @@ class MotionStack:
         self,
         robot: Robot,
         contacts: Sequence[Contact],
-        states: Sequence[State],
+        states: Sequence[ContactState],
         candidates: Sequence[Candidate],
         seed: int = 0,
     ) -> None:
@@ -151,7 +151,7 @@ class SetRanking:
                 Q = reading_directions(ways, W)
                 self._states.append(_StateRows(weight, owners, Q, Q @ R))
 
-    def _ways(self, builder: RowBuilder, samples: Samples, state: State) -> tuple[list[int], Tensor]:
+    def _ways(self, builder: RowBuilder, samples: Samples, state: ContactState) -> tuple[list[int], Tensor]:
         """How each channel of the candidates enters the generalized force, (B, c, n_rows), and whose it is."""
         J = builder.contact_jacobian(samples)
         base, owners, ways = builder.tree.base_rows, [], []

@@ -1,4 +1,4 @@
-"""Simulated robots on a floor: motions, exact recordings, and what imperfect sensors make of them."""
+"""Simulated robots on a floor: reference motions, exact recordings, and logs of imperfect sensors."""
 
 from torchid.simulation.motion import LEAD_S
 from torchid.simulation.sensors import sensor_log

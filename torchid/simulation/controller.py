@@ -52,9 +52,9 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
             raise UnknownNameError(source, "posture", name, plant.joint_names)
     low, high = plant.limits.T
     for name, value in posture.items():
-        place = plant.joint_names.index(name)
-        if not low[place] <= value <= high[place]:
-            accepted = f"{low[place]:g} to {high[place]:g}, the joint's limits"
+        joint = plant.joint_names.index(name)
+        if not low[joint] <= value <= high[joint]:
+            accepted = f"{low[joint]:g} to {high[joint]:g}, the joint's limits"
             raise InputError(source, f"posture.{name}", f"{value:g}", accepted)
     joints = np.clip([posture.get(name, 0.0) for name in plant.joint_names], low, high)
     plant.place(np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 0.0], joints]))
@@ -113,7 +113,7 @@ def _flattened(R: Array, foot: Foot, source: object) -> Array:
 
 @dataclass(frozen=True)
 class Goal:
-    """What to do at one instant; `p`, `v`, `a` stand for position, velocity, acceleration.
+    """What to do at one instant; `p`, `v`, `a`: position, velocity, acceleration.
 
     Attributes:
         com: (3, 3), rows p, v, a of the centre of mass, world axes.
@@ -197,7 +197,7 @@ class Controller:
     def _contact_forces(self, base: Array, load: Array, feet: list[FootMotion]) -> Array:
         """Generalized force (nv,) of the smallest point forces that give the base what it needs, (6,).
 
-        Points that would have to pull are left out, as far as enough others remain.
+        Points that would have to pull on the floor are dropped, as far as enough others remain.
         """
         maps, shares = [], []
         for foot, share, motion in zip(self._feet, load, feet, strict=True):
@@ -219,7 +219,7 @@ class Controller:
 
 
 def rotation_error(start: Array, end: Array) -> Array:
-    """The turn from one rotation to another, (3,): axis in the outer frame times the sine of the angle."""
+    """Error between two rotations (3, 3), (3,): axis in the outer frame times the sine of the angle."""
     R = end @ start.T
     return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 

@@ -1,4 +1,4 @@
-"""What the robot is to do: sine waves of its centre of mass, base and joints, and feet lifted in turn."""
+"""Reference motions: sine waves of the centre of mass, base and joints, and feet lifted in turn."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEAD_S = 2.0  # waves grow to their amplitude in this time, before the log begin
 
 
 class ReferenceMotion:
-    """A motion of a robot that starts from a stance: a goal for every control step from -LEAD_S to its end.
+    """The reference of a motion from a stance: a goal for every control step from -LEAD_S to its end.
 
     Args:
         config: waves and steps.

@@ -50,7 +50,7 @@ class Foot:
 
     @property
     def constrained(self) -> int:
-        """How many of its six velocities the floor can hold: the linear three, and the rest if it stands flat."""
+        """Number of its six velocities that the floor constrains: three, or all six if it stands flat."""
         return 6 if form_polygon(np.array(self.points)) else 3
 
 
@@ -105,7 +105,7 @@ def _sphere(urdf: Path, frame: str, shape: object) -> tuple[tuple[float, float, 
 
 
 def form_polygon(points: Array) -> bool:
-    """Whether contact points, (k, 3) [m], do not all lie on a line."""
+    """Whether contact points, (k, 3) [m], form a polygon: do not all lie on a line."""
     return len(points) > 2 and float(np.linalg.svd(points - points.mean(axis=0))[1][1]) > _NARROWEST
 
 
@@ -157,7 +157,7 @@ class Plant:
             self.model = spec.compile()
         except ValueError as error:
             raise UrdfError(urdf, "URDF", f"MuJoCo refuses it: {error}", "a robot that MuJoCo can simulate") from error
-        mujoco.set_mju_user_warning(lambda _: None)  # `unstable` tells; MuJoCo would write a log file
+        mujoco.set_mju_user_warning(lambda _: None)  # see `unstable`; MuJoCo would write a log file
         self.data = mujoco.MjData(self.model)
         model = self.model
         if friction is not None:

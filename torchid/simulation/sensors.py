@@ -1,4 +1,4 @@
-"""What the sensors make of a motion: noise, bias and gain, delay; and which feet seem to stand."""
+"""Logs of imperfect sensors: noise, bias and gain, delay, and contact states by a threshold."""
 
 from __future__ import annotations
 

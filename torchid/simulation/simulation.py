@@ -17,7 +17,7 @@ from torchid.simulation.controller import Controller, Stance, find_stance
 from torchid.simulation.motion import ReferenceMotion
 from torchid.simulation.plant import Foot, Plant, find_feet, form_polygon
 
-_REPORT_S = 0.25  # simulated seconds between two looks at how the robot stands
+_REPORT_S = 0.25  # simulated seconds between two checks of whether the robot stands
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Recording:
 
 
 def require_field(log: Log, name: str) -> Array:
-    """A field of a truth log.
+    """A field of an exact log, which must have it.
 
     Raises:
         LogError: the log lacks it.
@@ -140,7 +140,7 @@ class Stability:
     unloaded: tuple[float, ...]
 
     def require_within(self, bounds: BoundsConfig, motion: str, source: object) -> None:
-        """Refuse a motion that the robot did not do standing.
+        """Require that the robot stayed within the bounds of standing.
 
         Raises:
             InputError: a bound is broken.
@@ -197,18 +197,18 @@ def stability(
     )
 
 
-def _slip(place: Array, standing: BoolArray) -> float:
+def _slip(position: Array, standing: BoolArray) -> float:
     """Most that a point, (N, 2), moved from where it was when it began to stand."""
     begins = np.flatnonzero(np.diff(standing.astype(int), prepend=0) == 1)
     if not len(begins):
         return 0.0
-    began = begins[np.maximum(np.cumsum(np.isin(np.arange(len(place)), begins)) - 1, 0)]
-    return float(np.linalg.norm(place - place[began], axis=1)[standing].max())
+    began = begins[np.maximum(np.cumsum(np.isin(np.arange(len(position)), begins)) - 1, 0)]
+    return float(np.linalg.norm(position - position[began], axis=1)[standing].max())
 
 
-def _zmp_margin(place: Array, force: Array, moment: Array, stance: Stance, feet: tuple[Foot, ...]) -> float:
+def _zmp_margin(position: Array, force: Array, moment: Array, stance: Stance, feet: tuple[Foot, ...]) -> float:
     """Least distance from the zero-moment point to the border of the support polygon, per set of feet on the floor."""
-    arm = np.cross(place, force) + moment
+    arm = np.cross(position, force) + moment
     total, turning = force.sum(axis=1), arm.sum(axis=1)
     aloft = total[:, 2] < 1.0
     zmp = np.stack([-turning[:, 1], turning[:, 0]], axis=1) / np.where(aloft, np.nan, total[:, 2])[:, None]
@@ -239,7 +239,7 @@ class Simulation:
     stance: Stance
 
     def reference(self, config: MotionConfig) -> ReferenceMotion:
-        """The goals of a motion.
+        """The reference of a motion: a goal for every control step.
 
         Raises:
             UnknownNameError: it moves what the robot does not have.
@@ -254,7 +254,7 @@ class Simulation:
         return motion
 
     def require_support(self, support: BoolArray, field: str) -> None:
-        """Refuse to stand on feet, (F,) bool, that cannot hold a robot.
+        """Require that feet, (F,) bool, can support a robot.
 
         Raises:
             InputError: their contact points lie on a line.
@@ -292,7 +292,7 @@ def set_up_simulation(config: SimulationConfig, source: object = "simulation") -
     """Put the robot on its feet.
 
     Raises:
-        InputError: the URDF, the feet or the posture are of no use.
+        InputError: the URDF, the feet or the posture cannot be simulated.
     """
     feet = find_feet(config.feet, config.robot.urdf, source)
     plant = Plant(config.robot.urdf, feet, config.physics_hz, config.friction.levels)
