@@ -86,7 +86,7 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
     """What solves a compressed problem in one go, `least_squares` or `consistent`.
 
     Raises:
-        InputError: the certified method without CVXPY and Clarabel.
+        InputError: the certified method without Clarabel.
     """
     if settings.name == "least_squares":
         return settings.least_squares
