@@ -2,7 +2,7 @@
 
     python scripts/benchmark.py [--samples 65536] [--repeats 5]
 
-Needs the packages pin and example-robot-data (extra `[oracle]`), CVXPY and Clarabel (extra `[certified]`). Pipelines
+Needs the packages pin and example-robot-data (extra `[oracle]`) and Clarabel (extra `[certified]`). Pipelines
 start from the arrays of a log and end with parameters, `joints` sensors: torques measured, contact forces not, two
 thirds of the samples on all feet. Consistent parameters are timed on a log of Solo12 that a robot with other, possible
 parameters could have left, with noise.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from typing import Any
@@ -187,7 +189,7 @@ def test_a_solver_that_stops_short_says_so(method: Method, monkeypatch: pytest.M
         monkeypatch.setattr("torchid.estimators.barrier._STAGES", 2)
     else:
         run = certified._run
-        monkeypatch.setattr(certified, "_run", lambda programme, _: run(programme, 1e-2))
+        monkeypatch.setattr(certified, "_run", lambda program, _: run(program, 1e-2))
     with pytest.warns(NumericalWarning, match="stopped at a gap of"):
         estimate = Consistent(1e-3, method=method).solve(problem)
     assert estimate.gap > 1e-6 * estimate.objective
@@ -252,3 +254,18 @@ def test_friction_alone_can_be_free(method: Method, prior: Prior) -> None:
 def test_an_unknown_method_or_prior_is_refused(change: dict[str, str]) -> None:
     with pytest.raises(ValueError, match="accepted"):
         Consistent(**change)
+
+
+@pytest.mark.parametrize("change", [{"method": "certified"}, {"certify": True}], ids=str)
+def test_without_clarabel_the_certified_method_is_refused_before_any_work(
+    change: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchid.estimators.consistent.find_spec", lambda _: None)
+    with pytest.raises(InputError, match="needs Clarabel, which is not installed; accepted: pip install"):
+        Consistent(**change)
+    assert Consistent().method == "barrier"
+
+
+def test_a_conic_solution_needs_no_modelling_language() -> None:
+    script = "import sys; from torchid.estimators.certified import solve_certified; assert 'cvxpy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", script], check=True)

@@ -169,7 +169,7 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
         """A consistent fit with these settings.
 
         Raises:
-            InputError: the certified method without CVXPY and Clarabel.
+            InputError: the certified method without Clarabel.
         """
         return self._settings(Consistent, conditions=conditions)
 

@@ -130,8 +130,8 @@ class FileKind(Generic[T]):
         name: of the kind, as in "a YAML experiment file".
         keys: the chief keys, as in "a mapping with robot, logs, ...".
         list_example: an override that gives a list as a whole.
-        paths: places that hold a path, such as `robot.urdf`; `logs.train.*` is every item of the list `logs.train`.
-        outputs: places that hold the path of a result.
+        paths: keys that hold a path, such as `robot.urdf`; `logs.train.*` is every item of the list `logs.train`.
+        outputs: keys that hold the path of a result.
         prepare: takes settings and those that will override them, and returns the settings to merge; it is called for
             the file and nothing, then, for each override, for all before and it, and for it and nothing.
         accepted: the accepted values in messages, by place (`*` for a name from the file), where the type alone says
@@ -252,8 +252,8 @@ def _container(config: Any) -> Any:
     return OmegaConf.to_container(config, resolve=True)
 
 
-def _absolute(source: object, settings: Settings, places: Sequence[str], folder: Path) -> Settings:
-    for place in places:
+def _absolute(source: object, settings: Settings, keys: Sequence[str], folder: Path) -> Settings:
+    for place in keys:
         try:
             settings = _absolute_at(settings, place.split("."), folder)
         except (RuntimeError, ValueError) as error:
@@ -291,7 +291,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
     field = ".".join(place)
     if first["type"] == "unexpected_keyword_argument":
         keys = _keys_at(kind.settings, place[:-1])
-        elsewhere = list(_places_of(place[-1], kind.settings))
+        elsewhere = list(_keys_named(place[-1], kind.settings))
         valid = [*get_close_matches(place[-1], keys, cutoff=0.5), *elsewhere] if elsewhere else keys
         return UnknownNameError(path, ".".join(place[:-1]) or "key", place[-1], valid)
     missing = [list(map(str, e["loc"])) for e in complaints if e["type"] == "missing"]
@@ -333,13 +333,13 @@ def _hint_at(settings: Any, place: Sequence[str]) -> Any:
     return hint
 
 
-def _places_of(name: str, settings: Any, place: str = "") -> Iterator[str]:
-    """Other places in a dataclass with a key of that name, for one that is written in the wrong place."""
+def _keys_named(name: str, settings: Any, place: str = "") -> Iterator[str]:
+    """All keys of a name in a dataclass and those inside it, for one that is written in the wrong mapping."""
     for key, hint in get_type_hints(settings).items():
         if key == name:
             yield place + key
         if dataclasses.is_dataclass(inner := _not_none(hint)):
-            yield from _places_of(name, inner, f"{place}{key}.")
+            yield from _keys_named(name, inner, f"{place}{key}.")
 
 
 def _described(hint: Any) -> str:

@@ -70,11 +70,11 @@ class Consistent(Regularized):
 
         Raises:
             ValueError: names the first that is not accepted.
-            InputError: the certified method without CVXPY and Clarabel.
+            InputError: the certified method without Clarabel.
         """
         super().__post_init__()
-        if (self.certify or self.method == "certified") and not (find_spec("cvxpy") and find_spec("clarabel")):
-            found = "needs CVXPY and Clarabel, which are not installed"
+        if (self.certify or self.method == "certified") and not find_spec("clarabel"):
+            found = "needs Clarabel, which is not installed"
             raise InputError("estimator", "certified", found, f"{how_to_install('certified')}, or barrier alone")
 
     @report_rounding("consistent")
