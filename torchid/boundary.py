@@ -1,4 +1,4 @@
-"""The boundary between a command and its user: whatever stops a command is told in one line of plain text."""
+"""The boundary between a command and its user: whatever stops a command is reported in one line of plain text."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _HOW = "--debug shows where"
 
 
 def run_guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
-    """Run a command so that whatever stops it is told in one line.
+    """Run a command so that whatever stops it is reported in one line.
 
-    What is written meanwhile, by whomever, has control characters as escapes. Libraries' warnings of numbers become a
-    line of ours, for they may touch results; their other warnings, and what they log, tell users nothing that they
-    could mend, often in texts out of files, and are shown with `debug` only.
+    Control characters in all output are escaped. Numerical warnings of libraries become a line of ours, for they may
+    affect results; their other warnings and log messages, often with text out of files, are no help to users and are
+    shown with `debug` only.
 
     Args:
         program: its name.
@@ -35,8 +35,8 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
         debug: whether to show tracebacks and all warnings.
 
     Returns:
-        The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else, silently where nobody
-        reads what is written any more.
+        The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else, silently if the
+        output pipe was closed.
     """
     with plain_streams(), warnings.catch_warnings(), _libraries_silent(debug):
         warnings.simplefilter("always", TorchidWarning)
@@ -47,21 +47,21 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
                 status = command() or 0
             sys.stdout.flush()
             return status
-        except BrokenPipeError:  # `torchid ... | head`: who has read enough wants no line about it
+        except BrokenPipeError:  # `torchid ... | head` is no error
             _forget(sys.stdout)
             return 1
         except KeyboardInterrupt as interrupt:
             _say(program, str(interrupt) or f"interrupted; {list_written()} was written")
             return 1
-        except Exception as error:  # a full disk, or a bug: still no wall of text unless asked for
+        except Exception as error:  # a full disk, or a bug: no traceback unless `debug`
             if debug:
                 traceback.print_exc()
-            status, line = exit_status(error)
+            status, line = describe_failure(error)
             _say(program, line)
             return status
 
 
-def exit_status(error: Exception) -> tuple[int, str]:
+def describe_failure(error: Exception) -> tuple[int, str]:
     """Exit status and the one line that says what stopped a command."""
     if isinstance(error, (InputError, BaseLostError)):
         return 2, str(error)

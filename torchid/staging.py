@@ -1,4 +1,4 @@
-"""Results that appear whole or not at all: folders made in hiding, files replaced at once, interruptions held back."""
+"""Atomic writing of results: hidden staging folders, files replaced at once, interrupts deferred meanwhile."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _written: list[str] = []
 
 @contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Let Ctrl-C act when the block is done: what stands in it is short, and must happen as a whole.
+    """Defer Ctrl-C until the block is done, which is short and must happen as a whole.
 
     Raises:
         KeyboardInterrupt: after a block that Ctrl-C fell into, unless it is ignored.
@@ -67,17 +67,17 @@ def _as_interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def forget_written() -> None:
-    """A command begins: it has written nothing yet."""
+    """Start the list of results that a command has written."""
     _written.clear()
 
 
 def note_written(result: object) -> None:
-    """A command has written a file or folder that stays."""
+    """Add a file or folder that stays to the list of what the command has written."""
     _written.append(str(result))
 
 
 def list_written() -> str:
-    """What a command has written, in words."""
+    """The results that the command has written so far, as text."""
     return ", ".join(_written) or "nothing"
 
 
@@ -133,7 +133,7 @@ def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
 
 
 def leftovers(target: Path) -> Iterator[Path]:
-    """Staging folders beside `target` whose process is gone, each removed when the next is asked for, but for `old`."""
+    """Staging folders beside `target` whose process is gone, each removed before the next, but for `old`."""
     prefix = f".{target.name}-"
     with suppress(OSError):
         for path in sorted(target.parent.iterdir()):

@@ -1,4 +1,4 @@
-"""A folder of results that one run at a time claims, that appears complete or not at all, and replaces nothing else."""
+"""Folders of results: claimed by one run at a time, created whole or not at all, replacing only what torchid wrote."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
 
 
 def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> FolderContents:
-    """What is in a folder that torchid wrote, and nobody else.
+    """Contents of a folder in which torchid wrote every file.
 
     Args:
         folder: to be replaced or removed.
@@ -246,7 +246,7 @@ def parent_folders(output: Path) -> Iterator[None]:
 
 @contextmanager
 def creation_errors_explained(output: Path) -> Iterator[None]:
-    """Say in one line that something cannot be made beside `output`."""
+    """Turn an OSError into a ConfigError: nothing can be created beside `output`."""
     try:
         yield
     except OSError as error:
@@ -267,7 +267,7 @@ def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
         except OSError as error:
             raise ConfigError(output, "output", f"cannot be replaced ({error.strerror})", "a new folder") from error
         try:
-            found = require_replaceable(folder / OLD, kind, output)  # where nobody puts anything any more
+            found = require_replaceable(folder / OLD, kind, output)  # moved aside, it cannot change any more
             done = _renamed(folder / NEW, output)
         except BaseException:
             with suppress(OSError):

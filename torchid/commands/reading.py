@@ -79,7 +79,7 @@ class LargeLog:
             derived = lacks_derivatives(first)
             timeline = timeline_of(blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
             coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
-            time = blocks.time if timeline is None else blocks.time[0] + timeline.at
+            time = blocks.time if timeline is None else blocks.time[0] + timeline.output_stamps
             contacts = self._contacts(blocks, first)
             kept = None if contacts is None else self._away_from_changes(contacts, time)
             in_the_air = None if contacts is None else _in_the_air(contacts)
@@ -101,7 +101,7 @@ class LargeLog:
 
     def _coverage(self, blocks: LogBlocks, first: Log, timeline: Timeline) -> dict[str, Coverage]:
         """Which channels were measured throughout, which takes a pass over the log."""
-        found = {name: Coverage.of(getattr(first, name).shape[1:]) for name in gapless_fields(first, timeline)}
+        found = {name: Coverage.empty(getattr(first, name).shape[1:]) for name in gapless_fields(first, timeline)}
         for piece in self._pieces(blocks, len(blocks)) if found else ():
             log = blocks.read(piece, only=(*found, "contact_active"))
             for name, coverage in found.items():

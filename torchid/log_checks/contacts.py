@@ -24,6 +24,8 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
 from torchid.text import count_of
 
+# ------------------------------------------------------------------------------------------------- flags against forces
+
 #: Share of the weight that an inactive contact must not carry. Thresholds of flags are 20 to 50 N, for 60 kg 3 to 8 %.
 LOADED = 0.1
 #: Share of the weight below which an active contact carries nothing.
@@ -162,6 +164,8 @@ def _delay(log: Log, contact: _Contact, size: FloatArray, weight: float) -> Iter
     yield Finding("delay", SUSPICIOUS, "contact_active", text, advice, (contact.name,), spans)
 
 
+# ------------------------------------------------------------------------------------------------------ feet that stand
+
 #: Motion of standing feet, in that of the base above them, from which on mistakes are tried; soft soles and feet that
 #: roll leave 0.05 to 0.2.
 MOVES = 0.3
@@ -169,7 +173,7 @@ MOVES = 0.3
 BETTER = 1.0 / 3.0
 #: Time [s] at either end of a stance that heel and toe take, and the shortest stance that is left to be judged.
 _ENDS, _SHORTEST = 0.05, 0.15
-#: Samples looked at, and how much the base must move above its feet [rad, and 0.3 m] for anything to be told.
+#: Samples used, and how much the base must move above its feet [rad, and 0.3 m] for the check to be meaningful.
 _SAMPLES, _STILL = 1500, 0.01
 _LENGTH = 0.3
 _FIELDS = ("joint_names", "joint_position", "base_quat_xyzw", "contact_names", "contact_active")
@@ -199,7 +203,7 @@ def check_standing_feet(log: Log, robot: Robot | None, contacts: Sequence[Contac
 
 
 def _after(mistake: Mistake, log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
-    return measure_foot_slip(mistake.mended(log), robot, contacts)
+    return measure_foot_slip(mistake.corrected(log), robot, contacts)
 
 
 def _thinned(log: Log) -> Log:
@@ -209,7 +213,7 @@ def _thinned(log: Log) -> Log:
 
 
 def measure_foot_slip(log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
-    """How much standing feet move in the world, in how much they move in the base; None where nothing can be told.
+    """Motion of standing feet in the world as a share of that in the base; None where the base hardly moves.
 
     Feet that are flat must not turn, feet that stand together keep what lies between them, and where the base's
     position is known, each stays where it is.
@@ -254,9 +258,11 @@ def _motion(
     return out
 
 
+# ---------------------------------------------------------------------------------------------- limb sensors in the air
+
 #: Samples in the air that it takes.
 _FEW_IN_AIR = 20
-#: Correlation from which on the weight beyond a sensor is told from its offset: the limb must turn against gravity.
+#: Correlation above which the weight beyond a sensor is not confounded with its offset: the limb must turn in gravity.
 _CLEAR = 0.9
 _LIMB_SENSORS = "limb sensors in the air"
 
@@ -271,7 +277,7 @@ def check_limb_sensors(
         parts = bind_some_samples(
             preprocess_pieces(log, cutoff_hz or default_cutoff_hz(log)), robot, contacts, 4 * COMPARED
         )
-    except InputError:  # said by `check_forces_against_urdf`
+    except InputError:  # reported by `check_forces_against_urdf`
         return
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names)))
     series = [force_series(builder, part, robot.nominal.flatten()[None]) for part in parts]

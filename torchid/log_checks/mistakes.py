@@ -1,4 +1,4 @@
-"""The usual mistakes in a log, each as the log that it would be without."""
+"""Usual mistakes in logs, each with the function that corrects it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchid.logs.log import WRENCHES
 from torchid.logs.quaternion import compose, inverse, make_sign_continuous
 from torchid.text import join_names
 
-#: Parts of names that tell the sides, and the ends, of a robot apart.
+#: Parts of names that distinguish the sides, and the ends, of a robot.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")
 _ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH")
 _PARTS = re.compile(r"([A-Za-z0-9]+)")
@@ -65,7 +65,7 @@ def _by_first_letter(names: Sequence[str]) -> tuple[str, ...] | None:
     return found if found != tuple(names) else None
 
 
-#: What follows from positions and orientation, whoever gives it.
+#: Fields that follow from positions and orientation.
 _JOINT_RATES = ("joint_velocity", "joint_acceleration")
 _BASE_RATES = ("base_angular_velocity_base", "base_angular_acceleration_base")
 #: What is given along the world's axes, and what half a turn about x makes of such a vector.
@@ -81,12 +81,12 @@ _MOMENTS_IN_MILLI = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 
 @dataclass(frozen=True)
 class Mistake:
-    """A usual mistake: the field, what is wrong with it, what to do, and what takes it back."""
+    """A usual mistake: the field, what is wrong with it, what to do, and the function that corrects a log."""
 
     field: str
     found: str
     advice: str
-    mended: Callable[[Log], Log]
+    corrected: Callable[[Log], Log]
 
 
 def possible_mistakes(log: Log) -> Iterator[Mistake]:

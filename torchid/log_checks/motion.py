@@ -24,6 +24,8 @@ from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.text import join_names
 
+# ---------------------------------------------------------------------------------------------- unit of joint positions
+
 #: Two turns [rad]: a joint with stops goes nowhere near.
 TWO_TURNS = 4.0 * np.pi
 #: Speed [rad/s] that half of a robot's joints do not exceed: motors of legs reach 20 to 30.
@@ -55,7 +57,9 @@ def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
             yield Finding("unit", SUSPICIOUS, "joint_position", text, _ADVICE)
 
 
-#: Across which time values are compared [s]: a tenth of a second sees motion up to 5 Hz without loss.
+# -------------------------------------------------------------------- a derivative against what it is the derivative of
+
+#: Time [s] across which differences are compared: a tenth of a second resolves motion up to 5 Hz.
 LAG = 0.1
 #: Shifts tried on either side [samples].
 MAX_DELAY = 20
@@ -137,6 +141,8 @@ def _refined(correlation: FloatArray, best: np.ndarray) -> FloatArray:
     return np.where(inside == best, best + np.clip(offset, -0.5, 0.5), best)
 
 
+# ----------------------------------------------------------------------------------------- velocities and accelerations
+
 #: A delay [samples] worth a word: half a sample comes from integrators and central differences.
 DELAYED = 1.5
 #: How far the ratio of a derivative to what it should be may be from 1. Filters in a driver take a tenth.
@@ -200,7 +206,7 @@ def derivative_findings(found: Comparison, name: str, base: str, channels: tuple
 
 
 def _frame(log: Log, name: str, base: str, order: int, found: Comparison) -> Iterator[Finding]:
-    """Whether a vector of the base is given in another frame than its name says, or contains gravity."""
+    """Findings about a vector of the base in another frame than its name states, or that contains gravity."""
     if name == "base_linear_acceleration_world" and abs(abs(found.excess[2] / GRAVITY_WORLD[2]) - 1.0) < _CLOSE:
         text = f"{found.excess[2]:+.2f} m/s^2 along z on average beyond the derivative of {base}: it contains gravity"
         advice = "give d/dt of the velocity, or name it imu_specific_force"
@@ -220,6 +226,8 @@ def _finding(
     chosen = tuple(channel for channel, here in zip(channels, where, strict=True) if here)
     return Finding(name, severity, field, f"{join_names(list(chosen))}: {text}", advice, chosen)
 
+
+# ------------------------------------------------------------------------------------- angular velocity and orientation
 
 _TURNING = "angular velocity against orientation"
 

@@ -1,4 +1,4 @@
-"""Scales that forces tell against the URDF and any near it: of time, of single torques, and the point of wrenches."""
+"""Scales that forces determine for any URDF near the given one: of time, of torques, and the point of wrenches."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
+# ---------------------------------------------------------------------------------- equations of a URDF and any near it
+
 #: What a URDF may be off by, in units of `parameter_scale`: 0.1 is a mass, and an inertia, 15 to 20 % off.
 URDF_ERROR = 0.1
 #: Friction that a URDF lacks, in the joint's rms torque.
 FRICTION = 0.2
 #: What no parameters explain (flexibility, filters, shape of friction), as a share of the rms of each kind of force.
 UNMODELLED = 0.05
-#: Samples after one another that say the same: of 240 out of ten seconds, what friction and flexibility leave of them.
+#: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.
 CORRELATED_SAMPLES = 10.0
 #: Blocks of time that must agree.
 BLOCKS = 6
@@ -131,6 +133,8 @@ def accumulate_blocks(K: FloatArray, terms: FloatArray, equations: BoolArray) ->
     return NormalEquations(np.array(inside), np.array(across), np.array(own), int(equations.sum()))
 
 
+# -------------------------------------------------------------------------------------------------------- scale of time
+
 #: Samples compared.
 SAMPLES = 240
 #: A stretch of time after which nothing moves.
@@ -150,13 +154,13 @@ _GAIN, _POINT = 0.5, 0.3
 class TimeScale:
     """What time should be multiplied by, of all samples and of each block, and what stays unexplained.
 
-    `mended`, `recorded`, `still`: rms of what no URDF near the given one explains, in `UNMODELLED` of the forces, with
-    time so multiplied, as it is, and if nothing moved.
+    `corrected`, `recorded`, `still`: rms of what no URDF near the given one explains, in `UNMODELLED` of the forces:
+    with time so multiplied, as it is, and if nothing moved.
     """
 
     factor: float
     blocks: FloatArray
-    mended: float
+    corrected: float
     recorded: float
     still: float
 
@@ -182,7 +186,7 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
     """How time would have to be multiplied for gravity and inertia to make up the forces.
 
     Derived velocities and accelerations scale with the inverse of time and its square, gravity does not: three
-    stretches tell the predicted forces at all.
+    scales determine the predicted forces at all others.
 
     Raises:
         InputError: the log cannot be filtered, or does not fit the robot.
@@ -233,6 +237,9 @@ def _best(found: NormalEquations) -> TimeScale:
     best, one = int(np.argmin(every)), int(np.argmin(np.abs(np.log(_STRETCHES))))
     left = np.sqrt(np.maximum(every, 0.0) / max(found.rows, 1))
     return TimeScale(float(_STRETCHES[best]), blocks, *(float(left[i]) for i in (best, one, -1)))
+
+
+# -------------------------------------------------------------------------- gains of torques, and the point of wrenches
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,14 +14,16 @@ from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_STEP
 from torchid.text import count_of, join_names
 
+# --------------------------------------------------------------------------------------------------------------- values
+
 #: Share of NaN above which a channel counts as one that was not recorded, and not as one with holes.
 MOSTLY_THERE = 0.2
-#: Size in any unit that nothing on a robot has: what is larger is no number but rubbish.
+#: Size in any unit that no quantity of a robot has: uninitialised memory, or an overflow.
 ABSURD = 1e12
 
 
 def check_magnitudes(log: Log) -> Iterator[Finding]:
-    """Findings about values that nothing can have."""
+    """Findings about values larger than any quantity of a robot."""
     for field in log.arrays():
         if field in NO_SIGNALS:
             continue
@@ -86,11 +88,13 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
         yield Finding("not measured", severity, field, f"{join_names(list(gone))}: NaN {how}", advice, tuple(gone))
 
 
-#: A median step [s] above which no acceleration can be seen: robots move at 0.5 to 5 Hz.
+# ---------------------------------------------------------------------------------------------------------- time stamps
+
+#: A median step [s] above which accelerations cannot be derived: robots move at 0.5 to 5 Hz.
 SLOWEST_STEP = 0.5
 #: Units that stamps are mistaken in, by how many there are in a second.
 _TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-#: Jitter, in median steps, below which nobody needs to hear of it: 1e-3 of a step at 1 rad/s and 1 kHz is 1e-6 rad.
+#: Jitter, in median steps, that is not reported: 1e-3 of a step at 1 rad/s and 1 kHz is 1e-6 rad.
 WORTH_A_NOTE = 1e-3
 #: Deviations of a step, in rms deviations, by which samples are chosen to ask whether the motion follows the stamps.
 _STRONG = 3.0
@@ -145,7 +149,7 @@ def _motion_ignores(log: Log, steps: FloatArray, strong: float, long: BoolArray)
     """Whether joint positions are smoother in the sample number than in the time stamps, where stamps are off most."""
     before, after = steps[:-1], steps[1:]
     where = 1 + np.flatnonzero((np.abs(before - after) > strong) & ~long[:-1] & ~long[1:])
-    if len(where) < 10:  # too few to tell
+    if len(where) < 10:  # too few to judge
         return False
     ahead, behind = (log.joint_position[where + k] - log.joint_position[where] for k in (1, -1))
     left, right = steps[where - 1, None], steps[where, None]

@@ -51,7 +51,7 @@ def log_bytes(path: Path, limit: float) -> int:
             most = _SMALL * path.stat().st_size
             return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
         with open_container(path, whole=False) as container:
-            return sum(container.sizes().values())
+            return sum(container.declared_bytes().values())
 
 
 def count_samples_from(start: int, error: LogError) -> LogError:
@@ -145,7 +145,7 @@ def open_log_blocks(path: Path, folder: Path) -> Iterator[LogBlocks]:
 
 def _of_container(container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a container."""
-    given = list(container.sizes())
+    given = list(container.declared_bytes())
     check_fields_given(given)
     names: dict[str, NDArray[Any]] = {}
     fields: dict[str, LazyArray] = {}
@@ -154,7 +154,7 @@ def _of_container(container: Container, folder: Path) -> tuple[dict[str, NDArray
             if _is_text(name):
                 names[name] = container.load(name)
             else:
-                fields[name] = container.sliced(name, folder)
+                fields[name] = container.lazy(name, folder)
     return names, fields
 
 

@@ -42,7 +42,7 @@ class Npz:
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
 
-    def sizes(self) -> dict[str, int]:
+    def declared_bytes(self) -> dict[str, int]:
         """Declared bytes of each array, by name."""
         entries = self._archive.infolist()
         check_fields((entry.filename for entry in entries), len(entries))
@@ -60,7 +60,7 @@ class Npz:
                 array = np.lib.format.read_array(stream, allow_pickle=False)
         return array
 
-    def sliced(self, name: str, folder: Path) -> LazyArray:
+    def lazy(self, name: str, folder: Path) -> LazyArray:
         """The array `name`, unpacked to a file in `folder`."""
         entry = self._entry(name)
         with self._archive.open(entry) as stream:
@@ -118,13 +118,13 @@ _LONGEST_TEXT = 200
 class Container(Protocol):
     """An open file: what it declares, and its arrays one at a time."""
 
-    def sizes(self) -> dict[str, int]:
+    def declared_bytes(self) -> dict[str, int]:
         """Declared bytes of each array, by name."""
 
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`; text is an array of str or of UTF-8 bytes."""
 
-    def sliced(self, name: str, folder: Path) -> LazyArray:
+    def lazy(self, name: str, folder: Path) -> LazyArray:
         """The array `name`, not read before it is sliced; what has to be unpacked goes to a file in `folder`."""
 
 
@@ -168,7 +168,7 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
             else:
                 h5py = import_h5py(path)
                 container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
-            total = sum(container.sizes().values())
+            total = sum(container.declared_bytes().values())
         if whole and total > MAX_ARRAYS:
             raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
         check_unpacked_size(path, total)

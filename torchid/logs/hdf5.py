@@ -146,7 +146,7 @@ class Hdf5:
     def __init__(self, file: Any, h5py: Any, file_size: int) -> None:
         self._file, self._h5py, self._file_size = file, h5py, file_size
 
-    def sizes(self) -> dict[str, int]:
+    def declared_bytes(self) -> dict[str, int]:
         """Declared bytes of each array, by name."""
         check_fields(self._file if len(self._file) else (), len(self._file))
         return {name: self._size(name) for name in self._file}
@@ -166,7 +166,7 @@ class Hdf5:
             return np.broadcast_to(np.array(None, dtype=object), item.shape)
         return np.asarray(item[()])
 
-    def sliced(self, name: str, folder: Path) -> LazyArray:
+    def lazy(self, name: str, folder: Path) -> LazyArray:
         """The array `name`, read where it is sliced."""
         item = self._plain(name)
         chunk = chunk_bytes(item, self._file_size)

@@ -44,7 +44,7 @@ class Coverage:
     last: NDArray[np.intp]
 
     @classmethod
-    def of(cls, channels: tuple[int, ...]) -> Coverage:
+    def empty(cls, channels: tuple[int, ...]) -> Coverage:
         """Of no samples yet."""
         return cls(0, *(np.zeros(channels, dtype=np.intp) for _ in range(5)))
 
@@ -93,7 +93,7 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
 def measure_coverage(log: Log, name: str) -> Coverage:
     """Coverage of the field `name` of a log."""
     values: FloatArray = getattr(log, name)
-    found = Coverage.of(values.shape[1:])
+    found = Coverage.empty(values.shape[1:])
     found.add(values, log.contact_active if name in WRENCHES else None)
     return found
 
@@ -116,7 +116,7 @@ def resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverag
         return values[timeline.kept]
     flags = log.contact_active if name in WRENCHES else None
     complete = np.argwhere(coverage.complete)
-    out = np.full((len(timeline.at), *values.shape[1:]), np.nan)
+    out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
     for start in range(0, len(complete), CHANNELS_TOGETHER):
         columns = (slice(None), *complete[start : start + CHANNELS_TOGETHER].T)
         clean = values[columns]
@@ -290,7 +290,7 @@ def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Covera
 def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:
     """All that differs in the preprocessed log."""
     fields: dict[str, Any] = {
-        "time": log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.at,
+        "time": log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.output_stamps,
     }
     for chain in DERIVATIVE_CHAINS:
         fields |= _chain(log, chain, timeline)
@@ -300,12 +300,12 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
         if getattr(log, name) is not None:
             fields[name] = resample_measured(log, name, timeline, coverage.get(name))
     if log.contact_active is not None:
-        fields["contact_active"] = timeline.active(log.contact_active)
+        fields["contact_active"] = timeline.widen_flags(log.contact_active)
         if timeline.low_pass is not None or timeline.output is not None:
             share = log.contact_active if log.contact_share is None else log.contact_share
             fields["contact_share"] = timeline.evaluate(timeline.smooth(share.astype(np.float64)), (0,))[0]
     if (readings := unloaded_readings(log)) is not None:
-        fields["contact_unloaded"] = timeline.held(readings)
+        fields["contact_unloaded"] = timeline.hold(readings)
     if timeline.bandwidth_hz is not None:
         fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
     return fields

@@ -96,7 +96,7 @@ def check_fields_given(names: Collection[str]) -> None:
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz or HDF5 file, none of them before all names are known to be right."""
     with open_container(path) as container:
-        names = list(container.sizes())
+        names = list(container.declared_bytes())
         check_fields_given(names)
         raw: dict[str, NDArray[Any]] = {}
         for name in names:

@@ -115,7 +115,7 @@ class Timeline:
     bandwidth_hz: float | None = None
 
     @property
-    def at(self) -> FloatArray:
+    def output_stamps(self) -> FloatArray:
         """Stamps (K,) of the preprocessed log, counted from the log's first sample."""
         return self.grid[self.kept] if self.output is None else self.output
 
@@ -130,7 +130,7 @@ class Timeline:
         The same numbers come out as from the whole, but for a remainder of `_SETTLED` and rounding: filter and spline
         reach into the neighbourhood, and the spline is drawn through the same blocks of samples.
         """
-        at = self.at[first:last]
+        at = self.output_stamps[first:last]
         beyond = SPLINE_OVERLAP + (0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding)
         grid = _around(self.grid, at, beyond)
         samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], SPLINE_OVERLAP)
@@ -153,19 +153,19 @@ class Timeline:
     def evaluate(self, smoothed: FloatArray, orders: Sequence[int]) -> list[FloatArray]:
         """Derivatives (K, ...) of the given orders of channels on the grid (M, ...), at the output's stamps."""
         if self.output is None and orders[0] == 0:
-            rest = spline_derivatives(self.grid, smoothed, self.at, orders[1:]) if len(orders) > 1 else []
+            rest = spline_derivatives(self.grid, smoothed, self.output_stamps, orders[1:]) if len(orders) > 1 else []
             return [smoothed[self.kept], *rest]
-        return spline_derivatives(self.grid, smoothed, self.at, orders)
+        return spline_derivatives(self.grid, smoothed, self.output_stamps, orders)
 
-    def held(self, values: FloatArray) -> FloatArray:
+    def hold(self, values: FloatArray) -> FloatArray:
         """Values (N, ...) as recorded, at the output's stamps (K, ...): each holds until the next sample."""
         if self.keeps_stamps:
             return values[self.kept]
         slack = JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
-        last = np.searchsorted(self.native, self.at + slack, side="right") - 1
+        last = np.searchsorted(self.native, self.output_stamps + slack, side="right") - 1
         return values[np.maximum(last, 0)]
 
-    def active(self, flags: BoolArray) -> BoolArray:
+    def widen_flags(self, flags: BoolArray) -> BoolArray:
         """Flags (N, ...) at the output's stamps (K, ...): true where they are within `reach` of the stamp.
 
         A flag holds until the next sample.
@@ -174,7 +174,7 @@ class Timeline:
             return flags[self.kept]
         slack = JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
         first, last = (
-            np.searchsorted(self.native, self.at + slack + reach, side="right") - 1
+            np.searchsorted(self.native, self.output_stamps + slack + reach, side="right") - 1
             for reach in (-self.reach, self.reach)
         )
         count = np.concatenate([np.zeros((1, *flags.shape[1:]), dtype=np.intp), np.cumsum(flags, axis=0)])

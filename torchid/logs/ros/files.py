@@ -102,7 +102,7 @@ class McapFile:
             if isinstance(record, McapChannel) and record.topic in topics:
                 wanted[record.id] = record.topic
             elif isinstance(record, Message) and record.channel_id in wanted:
-                budget.message()
+                budget.spend_message()
                 share = self._stream.tell() / self._size
                 yield Record(wanted[record.channel_id], record.log_time, record.data, share)
 
@@ -127,7 +127,7 @@ def _records(stream: BinaryIO, whole: bool, messages: bool, budget: Budget) -> I
     mcap's own loop also reads attachments, and takes minutes for the zeros that a crash may leave in a file.
     """
     while head := stream.read(_HEAD.size):
-        budget.record()
+        budget.spend_record()
         kind, size = _HEAD.unpack(head)
         if not kind:
             raise ValueError("zeros in place of a record")
@@ -216,7 +216,7 @@ class Ros1File:
         total = max(sum(x.msgcount for x in connections), 1)
         if connections:  # none would stand for all
             for i, (connection, received, data) in enumerate(self._reader.messages(connections)):
-                self._reader.budget.message()
+                self._reader.budget.spend_message()
                 yield Record(connection.topic, received, data, i / total)
 
 
@@ -260,10 +260,10 @@ class SqliteFile:
         (total,) = self._connection.execute("SELECT count(*) FROM messages").fetchone()
         rows = self._connection.execute("SELECT topic_id, timestamp, data FROM messages")
         for i, (topic, received, data) in enumerate(rows):
-            budget.record()
+            budget.spend_record()
             if names.get(topic) not in topics:
                 continue
-            budget.message()
+            budget.spend_message()
             if not (isinstance(received, int) and isinstance(data, bytes) and len(data) <= MAX_RECORD):
                 raise ValueError(f"message {i} has no time or no data")
             yield Record(names[topic], received, data, i / total)
@@ -275,7 +275,7 @@ def decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
     Raises:
         ValueError: another compression, or more bytes than the budget of the file has left.
     """
-    limit = budget.most()
+    limit = budget.next_chunk_bytes()
     if compression in ("", "none"):
         out = data
     elif compression == "bz2":
@@ -289,5 +289,5 @@ def decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
         raise ValueError(f"chunks compressed by '{excerpt(compression)}'")
     if len(out) > limit:
         raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
-    budget.expand(len(out))
+    budget.spend_bytes(len(out))
     return out

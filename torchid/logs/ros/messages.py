@@ -89,7 +89,7 @@ class JointStates:
         self._orders: dict[tuple[str, ...], list[int] | slice | None] = {}
 
     @property
-    def others(self) -> tuple[str, ...]:
+    def other_joints(self) -> tuple[str, ...]:
         """Joints of messages that were left out."""
         left_out = (names for names, order in self._orders.items() if order is None)
         return tuple(dict.fromkeys(name for names in left_out for name in names))
@@ -261,7 +261,7 @@ class TopicMessages:
         if 8 * len(self._values) > MAX_ARRAYS:
             raise FieldError(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
 
-    def series(self) -> TopicSeries:
+    def to_series(self) -> TopicSeries:
         """All messages in the order of their stamps, each once.
 
         Raises:
@@ -271,9 +271,9 @@ class TopicMessages:
         Warns:
             TorchidWarning: messages come twice.
         """
-        if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.others:
+        if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.other_joints:
             place, (name, *_) = "logs.topics.joint_states.joints", self._decoder.names
-            raise UnknownNameError(current_file(), place, name, self._decoder.others)
+            raise UnknownNameError(current_file(), place, name, self._decoder.other_joints)
         if not self._stamps:
             raise FieldError(self.topic, "no messages", "at least one")
         stamps: Stamps = np.array(self._stamps, dtype=np.int64)

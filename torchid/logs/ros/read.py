@@ -50,7 +50,7 @@ class CommonClock:
         """Other stamps (K,) [ns] in seconds of this clock."""
         return (stamps - self.stamps[0]) / 1e9
 
-    def aligned(self, series: TopicSeries) -> dict[str, FloatArray]:
+    def align(self, series: TopicSeries) -> dict[str, FloatArray]:
         """The fields of a topic at the log's stamps: as they are where it has these, by a quintic spline elsewhere.
 
         Quaternions are interpolated as in `preprocess`, component by component without sign flips, then normalised.
@@ -68,7 +68,7 @@ class CommonClock:
         run = self._unbroken(series)
         return {name: self._interpolated(series, run, name) for name in series.fields}
 
-    def held(self, series: TopicSeries, values: FloatArray) -> FloatArray:
+    def hold(self, series: TopicSeries, values: FloatArray) -> FloatArray:
         """Values (K, ...) of a topic as they were last said, (N, ...)."""
         return np.asarray(values[np.searchsorted(series.stamps, self.stamps, side="right") - 1])
 
@@ -194,7 +194,7 @@ def read_bag(
         raise FieldError("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
     bag = _Bag(topics, channels)
     _read(bag, files, progress or (lambda share: None))
-    series = {role: rows.series() for role, rows in bag.rows.items()}
+    series = {role: rows.to_series() for role, rows in bag.rows.items()}
     unstamped = dict.fromkeys(x.topic for x in series.values() if not x.stamped)
     if unstamped:
         what = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
@@ -269,7 +269,7 @@ def _motion(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) ->
     out: dict[str, NDArray[Any]] = {}
     for role in ("joint_states", "odometry", "imu"):
         if role in series:
-            out |= clock.aligned(series[role])
+            out |= clock.align(series[role])
         decoder = bag.decoders.get(role)
         if isinstance(decoder, JointStates):
             out["joint_names"] = np.array(decoder.names, dtype=np.str_)
@@ -306,20 +306,20 @@ def _active(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], na
         said = series.get(f"contact_active.{name}")
         if said is None:
             return np.ones(len(clock.stamps), dtype=np.bool_)
-        return clock.held(said, said.fields["active"])[:, 0] != 0.0
+        return clock.hold(said, said.fields["active"])[:, 0] != 0.0
     measured, threshold = series[f"contact_wrenches.{name}"], bag.topics.contact_force_threshold
     with np.errstate(over="ignore"):  # infinite is above any threshold
         force = np.linalg.norm(measured.fields["wrench"][:, :3], axis=1)
     if np.isnan(force).any() or threshold is None:
         accepted = "forces to compare with contact_force_threshold, or contact_active"
         raise FieldError(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
-    return clock.held(measured, force) > threshold
+    return clock.hold(measured, force) > threshold
 
 
 def _wrench(
     bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
 ) -> FloatArray:
-    return clock.aligned(series[role])["wrench"] if nothing is None or role in series else nothing
+    return clock.align(series[role])["wrench"] if nothing is None or role in series else nothing
 
 
 def _ft_sensors(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
