@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning, activity_of
-from torchid.staging import forget_written, list_written, termination_as_interrupt
+from torchid.staging import list_written, reset_written, termination_as_interrupt
 from torchid.text import EscapedStream, one_line
 
 #: What the machine refuses, and not the user's files nor the program: no room, no memory, no permission.
@@ -42,7 +42,7 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
         warnings.simplefilter("always", TorchidWarning)
         warnings.showwarning = _Warnings(program, debug)
         try:
-            forget_written()
+            reset_written()
             with termination_as_interrupt():
                 status = command() or 0
             sys.stdout.flush()

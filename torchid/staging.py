@@ -66,7 +66,7 @@ def _as_interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
 
-def forget_written() -> None:
+def reset_written() -> None:
     """Start the list of results that a command has written."""
     _written.clear()
 
@@ -169,13 +169,13 @@ def _made(target: Path) -> tuple[Path, int]:
             return folder, -1
         with suppress(FileNotFoundError):
             lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            if lock_file(lock, folder / _LOCK) is not False:
+            if try_lock(lock, folder / _LOCK) is not False:
                 return folder, lock
             os.close(lock)
     raise FileNotFoundError(f"{target.parent}: another process removes every folder that is made there")
 
 
-def lock_file(handle: int, path: Path) -> bool | None:
+def try_lock(handle: int, path: Path) -> bool | None:
     """Whether a descriptor of a file now locks what is at its path; None where the file system knows no locks."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -197,7 +197,7 @@ def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
             return
         if _LOCK in names:
             lock = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            if not lock_file(lock, folder / _LOCK):
+            if not try_lock(lock, folder / _LOCK):
                 return
         yield folder
         if not keep:

@@ -65,6 +65,6 @@ def join_names(names: Sequence[str], most: int = 4) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def count_of(count: int, what: str) -> str:
+def format_count(count: int, what: str) -> str:
     """A number with its noun, as in "1 gap" and "3 gaps"."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"

@@ -11,43 +11,8 @@ from pathlib import Path
 
 from torchid.commands.manifest import MANIFEST, FolderContents, FolderKind, inspect_folder, make_manifest, read_manifest
 from torchid.errors import ConfigError
-from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, lock_file, note_written, staging_folder
+from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, note_written, staging_folder, try_lock
 from torchid.text import excerpt, join_names
-
-
-@contextmanager
-def claim_folder(folder: Path) -> Iterator[None]:
-    """Keep other processes that claim it from a folder that need not be there yet, until the block or this one ends.
-
-    Raises:
-        ConfigError: another process is at work there.
-    """
-    if not CAN_LOCK:
-        yield
-        return
-    lock, handle = folder.with_name(f".{folder.name}.lock"), -1
-    with parent_folders(folder):
-        try:
-            with interrupts_deferred():
-                handle = _locked(lock, folder)
-            yield
-        finally:
-            with interrupts_deferred():
-                if handle >= 0:
-                    lock.unlink(missing_ok=True)
-                    os.close(handle)
-
-
-def _locked(lock: Path, folder: Path) -> int:
-    """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
-    for _ in range(_TRIES):
-        with creation_errors_explained(folder):
-            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        if lock_file(handle, lock) is not False:  # None, no locks there: one run at a time is then the user's affair
-            return handle
-        os.close(handle)  # another has it, or has just removed it
-    raise ConfigError(folder, "output", "another run is at work there", "another output, or patience")
-
 
 EVENTS = "events.out.tfevents*"
 EVALUATION = FolderKind("an evaluation")
@@ -288,3 +253,37 @@ def _renamed(folder: Path, name: Path) -> bool:
             return False
         raise
     return True
+
+
+@contextmanager
+def claim_folder(folder: Path) -> Iterator[None]:
+    """Keep other processes that claim it from a folder that need not be there yet, until the block or this one ends.
+
+    Raises:
+        ConfigError: another process is at work there.
+    """
+    if not CAN_LOCK:
+        yield
+        return
+    lock, handle = folder.with_name(f".{folder.name}.lock"), -1
+    with parent_folders(folder):
+        try:
+            with interrupts_deferred():
+                handle = _locked(lock, folder)
+            yield
+        finally:
+            with interrupts_deferred():
+                if handle >= 0:
+                    lock.unlink(missing_ok=True)
+                    os.close(handle)
+
+
+def _locked(lock: Path, folder: Path) -> int:
+    """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
+    for _ in range(_TRIES):
+        with creation_errors_explained(folder):
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        if try_lock(handle, lock) is not False:  # None, no locks there: one run at a time is then the user's affair
+            return handle
+        os.close(handle)  # another has it, or has just removed it
+    raise ConfigError(folder, "output", "another run is at work there", "another output, or patience")

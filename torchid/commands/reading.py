@@ -28,9 +28,9 @@ from torchid.logs.preprocess import (
     find_unloaded,
     gapless_fields,
     lacks_derivatives,
+    make_timeline,
     move_to_timeline,
     preprocess,
-    timeline_of,
     unloaded_readings,
     warn_of_gaps,
 )
@@ -77,7 +77,7 @@ class LargeLog:
         with about_file(self.path), open_log_blocks(self.path, self.folder) as blocks:
             first, settings = blocks.read(slice(0, min(len(blocks), 2))), self.settings
             derived = lacks_derivatives(first)
-            timeline = timeline_of(blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
+            timeline = make_timeline(blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
             coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
             time = blocks.time if timeline is None else blocks.time[0] + timeline.output_stamps
             contacts = self._contacts(blocks, first)

@@ -14,7 +14,7 @@ from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Sk
 from torchid.log_checks.mistakes import Mistake, possible_mistakes
 from torchid.log_checks.model import COMPARED, bind_some_samples, default_cutoff_hz, link_poses, preprocess_pieces
 from torchid.log_checks.statistics import NORMAL
-from torchid.log_checks.weight import GRAVITY, WRONG
+from torchid.log_checks.weight import GRAVITY, WRONG_MASS
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
@@ -22,7 +22,7 @@ from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
-from torchid.text import count_of
+from torchid.text import format_count
 
 # ------------------------------------------------------------------------------------------------- flags against forces
 
@@ -121,7 +121,7 @@ def _contradictions(log: Log, contact: _Contact, size: FloatArray, weight: float
     """Forces without a contact, and contacts without a force."""
     loaded = ~contact.active & (size > LOADED * weight)
     if loaded.any():
-        samples = count_of(int(loaded.sum()), "sample")
+        samples = format_count(int(loaded.sum()), "sample")
         text = f"{contact.name}: inactive with up to {size[loaded].max():.3g} N, in {samples}"
         advice = "set the flag where there is a force: what an inactive contact exerts is not counted"
         spans = tuple(find_spans(loaded, contact.name))
@@ -130,7 +130,7 @@ def _contradictions(log: Log, contact: _Contact, size: FloatArray, weight: float
     light = contact.active & (size < UNLOADED * weight)
     spans = tuple(span for span in find_spans(light, contact.name) if len(span) > patience)
     if spans:
-        samples = count_of(sum(len(span) for span in spans), "sample")
+        samples = format_count(sum(len(span) for span in spans), "sample")
         never = " though the flag never changes" if contact.active.all() else ""
         text = f"{contact.name}: active without a force (below {UNLOADED * weight:.2g} N) in {samples}{never}"
         advice = "costs data, not truth; clear the flag where the foot is in the air"
@@ -319,13 +319,13 @@ def _judged(name: str, read: FloatArray, carried: FloatArray, robot: Robot) -> I
         advice = "reverse it: the wrench that the parent side exerts on the child side"
         yield Finding("sign", CONDEMNED, "ft_wrench", told, advice, (name,))
         return
-    if abs(share - 1.0) > WRONG:
+    if abs(share - 1.0) > WRONG_MASS:
         advice = "look at the sensor's unit and gain, and at what is mounted beyond it"
         yield Finding("weight", SUSPICIOUS, "ft_wrench", told, advice, (name,))
     left = read - share * carried
     offset = np.median(left, axis=0)
     size, spread = float(np.linalg.norm(offset)), NORMAL * float(np.median(np.linalg.norm(left - offset, axis=1)))
-    known = UNLOADED * GRAVITY * float(robot.nominal[:, 0].sum()) + (0.0 if clear else WRONG * weight)
+    known = UNLOADED * GRAVITY * float(robot.nominal[:, 0].sum()) + (0.0 if clear else WRONG_MASS * weight)
     if size > max(known, spread):
         text = f"{name}: reads a steady {size:.3g} N in the air beside the {weight:.3g} N that hang on it by the URDF"
         mixed = "" if clear else "; a load of that weight would look the same"

@@ -12,7 +12,7 @@ from torchid.log_checks.channels import ChannelGroup
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
 from torchid.log_checks.statistics import finite_median, neighbours_of
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
-from torchid.text import count_of, join_names
+from torchid.text import format_count, join_names
 
 #: Samples at the very same extreme value from which on it is a limit and no coincidence.
 AT_LIMIT = 5
@@ -139,7 +139,7 @@ def _spans(group: ChannelGroup, channel: str, runs: Runs, skip: int = 1) -> Iter
 def _frozen(group: ChannelGroup, what: str, stuck: _Stuck, count: int) -> Finding:
     spans = tuple(span for name, runs in stuck for span in _spans(group, name, runs))
     longest = max(spans, key=len)
-    times = f"{count_of(len(longest), 'sample')} at {longest}"
+    times = f"{format_count(len(longest), 'sample')} at {longest}"
     if count > 1:
         times = f"{count} times, the longest {times}"
     whose = f"{group.name}, " if group.name else ""

@@ -15,7 +15,7 @@ from torchid.log_checks.motion import TWO_TURNS
 from torchid.log_checks.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
-from torchid.logs.quaternion import compose, inverse, make_sign_continuous
+from torchid.logs.quaternion import inverse_rotation, make_sign_continuous
 from torchid.text import join_names
 
 #: Parts of names that distinguish the sides, and the ends, of a robot.
@@ -76,6 +76,8 @@ _WORLD = (
     "contact_wrench_world",
 )
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
+#: Its product with a quaternion xyzw is (w, -z, y, -x): the components in reverse order, with these signs.
+_HALF_TURN_QUAT = np.array([1.0, -1.0, 1.0, -1.0])
 _MOMENTS_IN_MILLI = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 
 
@@ -108,7 +110,7 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
         order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, -1, axis=1)))
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, 1, axis=1)))
-        yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _quaternions(inverse))
+        yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _quaternions(inverse_rotation))
     if log.imu_specific_force is not None:
         reading = "reversed: gravity minus acceleration"
         yield Mistake(
@@ -148,10 +150,9 @@ def _reordered(fields: Sequence[str], order: list[int]) -> Callable[[Log], Log]:
 
 def flip_world(log: Log) -> Log:
     """The log in a world half a turn about x from the one that it has."""
-    half = np.array([1.0, 0.0, 0.0, 0.0])
     fields: dict[str, Any] = {}
     if log.base_quat_xyzw is not None:
-        fields["base_quat_xyzw"] = compose(half, log.base_quat_xyzw)
+        fields["base_quat_xyzw"] = log.base_quat_xyzw[:, ::-1] * _HALF_TURN_QUAT
     for name in _WORLD:
         if (given := getattr(log, name)) is not None:
             fields[name] = given * (_HALF_TURN if given.shape[-1] == 3 else np.tile(_HALF_TURN, 2))

@@ -15,7 +15,7 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
 from torchid.logs.quaternion import (
     angular_velocity_base,
-    inverse,
+    inverse_rotation,
     make_sign_continuous,
     rotate_to_base,
     rotate_to_world,
@@ -297,7 +297,7 @@ def _mistakes(quat: FloatArray, omega: FloatArray) -> Iterator[_Mistake]:
             yield _Mistake(order, "rename base_quat_wxyz and base_quat_xyzw", "base_quat_xyzw", other, value)
     yield _Mistake("the sign is reversed", "reverse it", "", quat, -omega)
     name = "rotates world to base, not base to world"
-    yield _Mistake(name, "give the inverse", "base_quat_xyzw", inverse(quat), omega)
+    yield _Mistake(name, "give the inverse", "base_quat_xyzw", inverse_rotation(quat), omega)
 
 
 def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> _Mistake | None:

@@ -15,7 +15,7 @@ from torchid.log_checks.statistics import NORMAL, block_spread, finite_median, n
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
-from torchid.text import count_of, join_names
+from torchid.text import format_count, join_names
 
 POSES = ("joint_position", "base_quat_xyzw", "base_position_world")
 #: Fields whose lasting steps are reported; those of velocities and accelerations come from impacts and commands.
@@ -105,7 +105,7 @@ def _finding(
     text = f"{channel} by {size:.3g} {unit} {where}, {clearest.spreads:.3g} times the noise around it"
     if len(found) > 1:
         count = len({(jump.first, jump.last) for _, jump in found})
-        text = f"{count_of(count, 'jump')} in {join_names(channels)}; the clearest: {text}"
+        text = f"{format_count(count, 'jump')} in {join_names(channels)}; the clearest: {text}"
     if spans is None:
         spans = tuple(_span(channel, jump) for channel, jump in found)
     return Finding(name, severity, field, text, advice, channels, spans)

@@ -18,7 +18,7 @@ from torchid.robot import Robot
 
 GRAVITY = -GRAVITY_WORLD[2]
 #: How far the carried mass may be from the URDF's without a word, and from where on no CAD model is that wrong.
-KNOWN, WRONG = 0.02, 0.2
+NEGLIGIBLE_MASS, WRONG_MASS = 0.02, 0.2
 #: What a force sensor's unit makes of 1 N, and how far the URDF's mass may then be off.
 UNITS = {"kN": 1e-3, "kg": 1.0 / GRAVITY, "lbf": 0.22481, "g": 1e3 / GRAVITY, "mN": 1e3}
 _UNIT_WITHIN = 0.15
@@ -73,10 +73,10 @@ def _judged(carried: float, when: str, field: str, robot: Robot | None) -> Itera
             text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {unit}?"
             yield Finding("unit", CONDEMNED, field, text, "convert forces to N and moments to N m")
             return
-    if abs(ratio - 1.0) > WRONG:
+    if abs(ratio - 1.0) > WRONG_MASS:
         advice = "look for a contact that is not measured, a payload, a sensor's offset or gain"
         yield Finding("weight", SUSPICIOUS, field, text, advice)
-    elif abs(ratio - 1.0) > KNOWN:
+    elif abs(ratio - 1.0) > NEGLIGIBLE_MASS:
         yield Finding(
             "weight", NOTE, field, text, "none if the URDF may be that far off; a sensor's offset looks the same"
         )

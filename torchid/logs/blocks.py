@@ -1,4 +1,4 @@
-"""Logs that are read a block of samples at a time, for those that no memory holds."""
+"""Logs larger than memory, read a block of samples at a time."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class LogBlocks:
         Signs of quaternions go on from those of the samples that were read before, if these reach up to them.
 
         Raises:
-            LogError: a value that is none; the message counts samples from the beginning.
+            LogError: an invalid value; the message counts samples from the beginning.
         """
         with about_file(self.source):
             raw = self._raw(samples, only)
@@ -182,7 +182,7 @@ def _is_text(name: str) -> bool:
 
 
 def _checked(source: str, names: dict[str, NDArray[Any]], fields: dict[str, LazyArray]) -> LogBlocks:
-    """The blocks, after checks of all that can be said before values are read."""
+    """The log, after all checks that need no values but the stamps."""
     time = fields.pop("time")
     check_shape("time", _empty(time), SHAPES["time"], {})
     with reader_errors_explained("time", _ACCEPTED):

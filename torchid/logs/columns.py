@@ -110,7 +110,7 @@ def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, Col
 
 
 def parse_column(text: str) -> Column:
-    """What the name of a column says: the field up to its first dot, a component after its last.
+    """The parts of a column's name: the field up to its first dot, a component after its last.
 
     Raises:
         LogError: no column has such a name.
@@ -142,7 +142,7 @@ def column_names(field: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str,
 
 
 def component_names(field: str) -> tuple[str, ...]:
-    """What the last part of a column's name may be, nothing for fields without components."""
+    """The values that the last part of a column's name may have; none for fields without components."""
     size = field_shape(field)[-1] if len(field_shape(field)) > 1 else None
     if size == 6:
         return COMPONENTS
@@ -158,6 +158,6 @@ def column_pattern(field: str) -> str:
 
 
 def _names_of(field: str) -> str:
-    """The field that names what a field has one of each for, or nothing."""
+    """The field with the names of a field's columns (`joint_names`, ...), or nothing."""
     letter = next((x for x in field_shape(field)[1:2] if isinstance(x, str)), None)
     return next((name for name, of in NAME_FIELDS.items() if of == letter), "")

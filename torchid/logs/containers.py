@@ -1,4 +1,4 @@
-"""Kinds of log files, and the two containers of arrays, .npz and HDF5, as names and one array for each."""
+"""Kinds of log files; containers of named arrays (.npz and HDF5), opened within limits and written whole."""
 
 from __future__ import annotations
 
@@ -22,94 +22,66 @@ from torchid.logs.spill import LazyArray, Spill
 from torchid.staging import atomic_file
 from torchid.text import excerpt
 
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+# --------------------------------------------------------------------------------------------------- kinds of log files
 
-_PIECE = 2**22  # bytes that are unpacked at a time
-_ENTRY, _DIRECTORY = b"PK\x01\x02", 2**20  # how entries begin; bytes at the end of a file, that hold those of a log
-
-
-def open_archive(path: Path) -> zipfile.ZipFile:
-    """Open a zip archive; ValueError if it has far too many entries, which `zipfile` takes seconds to list."""
-    with path.open("rb") as stream:
-        stream.seek(max(0, path.stat().st_size - _DIRECTORY))
-        check_fields((), stream.read().count(_ENTRY))
-    return zipfile.ZipFile(path)
-
-
-class Npz:
-    """The arrays of a zip archive."""
-
-    def __init__(self, archive: zipfile.ZipFile) -> None:
-        self._archive = archive
-
-    def declared_bytes(self) -> dict[str, int]:
-        """Declared bytes of each array, by name."""
-        entries = self._archive.infolist()
-        check_fields((entry.filename for entry in entries), len(entries))
-        sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in entries}
-        if len(sizes) != len(entries):
-            raise ValueError("a name occurs twice")
-        return sizes
-
-    def load(self, name: str) -> NDArray[Any]:
-        """The array `name`."""
-        entry = self._entry(name)
-        with self._archive.open(entry) as stream:
-            array: NDArray[Any]
-            with _of_python_2():
-                array = np.lib.format.read_array(stream, allow_pickle=False)
-        return array
-
-    def lazy(self, name: str, folder: Path) -> LazyArray:
-        """The array `name`, unpacked to a file in `folder`."""
-        entry = self._entry(name)
-        with self._archive.open(entry) as stream:
-            shape, fortran_order, dtype = _read_header(stream)
-            if dtype.hasobject or not shape:
-                return self.load(name)
-            unpacked = Spill(self._archive.filename, folder)
-            while data := stream.read(_PIECE):
-                unpacked.write(data)
-        return unpacked.mapped(shape, dtype, fortran_order)
-
-    def _entry(self, name: str) -> zipfile.ZipInfo:
-        """Where the array `name` is; ValueError where it is not what it says."""
-        entry = self._archive.getinfo(f"{name}.npy")
-        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError("compressed in a way that NumPy does not use")
-        with self._archive.open(entry) as stream:
-            _check_header(stream, entry.file_size)
-        return entry
-
-
-@contextlib.contextmanager
-def _of_python_2() -> Iterator[None]:
-    """Without a warning of headers that Python 2 wrote."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield
-
-
-def _read_header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether in Fortran's order, and type of an array."""
-    version = np.lib.format.read_magic(stream)
-    if version not in _HEADERS:
-        raise ValueError(f"version {version} of the format, which numbers and names do not need")
-    with _of_python_2():
-        return _HEADERS[version](stream)
-
-
-def _check_header(stream: Any, size: int) -> None:
-    """Refuse an array that is not as large as its entry: NumPy makes room for whatever the header says."""
-    shape, _, dtype = _read_header(stream)
-    left = size - stream.tell()
-    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != left:
-        raise ValueError(f"{left} bytes for an array of shape {shape}, {dtype.itemsize} bytes each")
-    if dtype.kind in "US":
-        check_names(shape)
-
-
+#: Containers of named arrays.
 ARRAYS = (".npz", ".h5", ".hdf5")
+TABLES = (".csv", ".parquet")
+#: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
+BAGS = (".bag", ".mcap", ".db3")
+WRITABLE = (*ARRAYS, *TABLES)
+READABLE = (*WRITABLE, *BAGS)
+
+
+class LogKind(Enum):
+    """What a file holds: named arrays, one column per scalar, or messages."""
+
+    ARRAYS = "arrays"
+    TABLE = "table"
+    BAG = "bag"
+
+
+def existing_log_kind(path: Path) -> LogKind:
+    """The kind of an existing log.
+
+    Raises:
+        LogError: there is none, or its extension is unknown.
+    """
+    if os.path.isdir(path):  # Path.is_dir raises where a name is too long
+        if list_bag_files(path):
+            return LogKind.BAG
+        raise LogError(path, "file", "a folder", f"a log ({', '.join(READABLE)}), or a folder that ROS 2 recorded")
+    kind = _kind(path, READABLE)
+    if not os.path.isfile(path):
+        found = "a pipe, a device or a socket" if os.path.exists(path) else "no such file"
+        raise LogError(path, "file", found, f"an existing log ({', '.join(READABLE)})")
+    return kind
+
+
+def new_log_kind(path: Path) -> LogKind:
+    """The kind of a log to be written.
+
+    Raises:
+        LogError: no log with this extension is written.
+    """
+    return _kind(path, WRITABLE)
+
+
+def list_bag_files(path: Path) -> list[Path]:
+    """The files of a bag: `path` itself, or those in the folder that ROS 2 recorded to."""
+    if not os.path.isdir(path):
+        return [path] if path.suffix.lower() in BAGS else []
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS[1:] and file.is_file())
+
+
+def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:
+    suffix = path.suffix.lower()
+    if suffix not in accepted:
+        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(accepted))
+    return LogKind.ARRAYS if suffix in ARRAYS else LogKind.TABLE if suffix in TABLES else LogKind.BAG
+
+
+# ------------------------------------------------------------------------------------------------- containers of arrays
 
 #: Characters of another package's message that a message of ours repeats.
 _LONGEST_TEXT = 200
@@ -130,7 +102,7 @@ class Container(Protocol):
 
 @contextlib.contextmanager
 def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
-    """Turn whatever the readers raise on a damaged file, of which no list is ever complete, into one LogError."""
+    """Turn whatever the readers raise on a damaged file, which no list covers, into a FieldError."""
     try:
         yield
     except (TorchidError, Warning):
@@ -201,56 +173,90 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             save_hdf5(import_h5py(path), temporary, arrays)
 
 
-TABLES = (".csv", ".parquet")
-#: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
-BAGS = (".bag", ".mcap", ".db3")
-WRITABLE = (*ARRAYS, *TABLES)
-READABLE = (*WRITABLE, *BAGS)
+# --------------------------------------------------------------------------------------------------- the container .npz
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+_PIECE = 2**22  # bytes that are unpacked at a time
+_ENTRY, _DIRECTORY = b"PK\x01\x02", 2**20  # how entries begin; bytes at the end of a file, that hold those of a log
 
 
-class LogKind(Enum):
-    """What a file holds: named arrays, one column per scalar, or messages."""
-
-    ARRAYS = "arrays"
-    TABLE = "table"
-    BAG = "bag"
-
-
-def existing_log_kind(path: Path) -> LogKind:
-    """The kind of an existing log.
-
-    Raises:
-        LogError: there is none, or its extension is unknown.
-    """
-    if os.path.isdir(path):  # Path.is_dir raises where a name is too long
-        if list_bag_files(path):
-            return LogKind.BAG
-        raise LogError(path, "file", "a folder", f"a log ({', '.join(READABLE)}), or a folder that ROS 2 recorded")
-    kind = _kind(path, READABLE)
-    if not os.path.isfile(path):
-        found = "a pipe, a device or a socket" if os.path.exists(path) else "no such file"
-        raise LogError(path, "file", found, f"an existing log ({', '.join(READABLE)})")
-    return kind
+def open_archive(path: Path) -> zipfile.ZipFile:
+    """Open a zip archive; ValueError if it has far too many entries, which `zipfile` takes seconds to list."""
+    with path.open("rb") as stream:
+        stream.seek(max(0, path.stat().st_size - _DIRECTORY))
+        check_fields((), stream.read().count(_ENTRY))
+    return zipfile.ZipFile(path)
 
 
-def new_log_kind(path: Path) -> LogKind:
-    """The kind of a log to be written.
+class Npz:
+    """The arrays of a zip archive."""
 
-    Raises:
-        LogError: no log with this extension is written.
-    """
-    return _kind(path, WRITABLE)
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self._archive = archive
+
+    def declared_bytes(self) -> dict[str, int]:
+        """Declared bytes of each array, by name."""
+        entries = self._archive.infolist()
+        check_fields((entry.filename for entry in entries), len(entries))
+        sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in entries}
+        if len(sizes) != len(entries):
+            raise ValueError("a name occurs twice")
+        return sizes
+
+    def load(self, name: str) -> NDArray[Any]:
+        """The array `name`."""
+        entry = self._entry(name)
+        with self._archive.open(entry) as stream:
+            array: NDArray[Any]
+            with _of_python_2():
+                array = np.lib.format.read_array(stream, allow_pickle=False)
+        return array
+
+    def lazy(self, name: str, folder: Path) -> LazyArray:
+        """The array `name`, unpacked to a file in `folder`."""
+        entry = self._entry(name)
+        with self._archive.open(entry) as stream:
+            shape, fortran_order, dtype = _read_header(stream)
+            if dtype.hasobject or not shape:
+                return self.load(name)
+            unpacked = Spill(self._archive.filename, folder)
+            while data := stream.read(_PIECE):
+                unpacked.write(data)
+        return unpacked.mapped(shape, dtype, fortran_order)
+
+    def _entry(self, name: str) -> zipfile.ZipInfo:
+        """The entry of the array `name`; ValueError if it does not match its header."""
+        entry = self._archive.getinfo(f"{name}.npy")
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ValueError("compressed in a way that NumPy does not use")
+        with self._archive.open(entry) as stream:
+            _check_header(stream, entry.file_size)
+        return entry
 
 
-def list_bag_files(path: Path) -> list[Path]:
-    """The files of a bag: `path` itself, or those in the folder that ROS 2 recorded to."""
-    if not os.path.isdir(path):
-        return [path] if path.suffix.lower() in BAGS else []
-    return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS[1:] and file.is_file())
+@contextlib.contextmanager
+def _of_python_2() -> Iterator[None]:
+    """Without a warning of headers that Python 2 wrote."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
 
 
-def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:
-    suffix = path.suffix.lower()
-    if suffix not in accepted:
-        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(accepted))
-    return LogKind.ARRAYS if suffix in ARRAYS else LogKind.TABLE if suffix in TABLES else LogKind.BAG
+def _read_header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether in Fortran's order, and type of an array."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"version {version} of the format, which numbers and names do not need")
+    with _of_python_2():
+        return _HEADERS[version](stream)
+
+
+def _check_header(stream: Any, size: int) -> None:
+    """Refuse an array that is not as large as its entry: NumPy allocates what the header declares."""
+    shape, _, dtype = _read_header(stream)
+    left = size - stream.tell()
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != left:
+        raise ValueError(f"{left} bytes for an array of shape {shape}, {dtype.itemsize} bytes each")
+    if dtype.kind in "US":
+        check_names(shape)

@@ -1,4 +1,4 @@
-"""Filter, differentiate and resample a log, all channels alike, with care where contacts change or data are missing."""
+"""Preprocessing of a log: filter, differentiate and resample all channels alike; contact changes and missing data."""
 
 from __future__ import annotations
 
@@ -24,184 +24,6 @@ from torchid.logs.log import (
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline
 
-#: Channels that are filtered together: as many as make the copies of a long log small against it.
-CHANNELS_TOGETHER = 4
-
-
-@dataclass
-class Coverage:
-    """Which channels of a field were measured throughout, gathered block by block.
-
-    Of every channel: `measurable`, samples in which there is something to measure (all, or those in contact);
-    `missing`, those of them that are NaN, from the `first` to the `last`; `values`, samples with a value.
-    """
-
-    samples: int
-    measurable: NDArray[np.intp]
-    missing: NDArray[np.intp]
-    values: NDArray[np.intp]
-    first: NDArray[np.intp]
-    last: NDArray[np.intp]
-
-    @classmethod
-    def empty(cls, channels: tuple[int, ...]) -> Coverage:
-        """Of no samples yet."""
-        return cls(0, *(np.zeros(channels, dtype=np.intp) for _ in range(5)))
-
-    def add(self, values: FloatArray, active: BoolArray | None) -> None:
-        """Add samples (N, ...) of the field; `active`: (N, C) of a wrench's contacts."""
-        nan = np.isnan(values)
-        self.values += len(values) - nan.sum(axis=0)
-        self.measurable += len(values) if active is None else active.sum(axis=0)[:, None]
-        if active is not None:
-            nan &= active[..., None]
-        count = nan.sum(axis=0)
-        new = (count > 0) & (self.missing == 0)
-        self.first[new] = self.samples + np.argmax(nan, axis=0)[new]
-        self.last[count > 0] = self.samples + (len(nan) - 1 - np.argmax(nan[::-1], axis=0))[count > 0]
-        self.missing += count
-        self.samples += len(values)
-
-    @property
-    def complete(self) -> BoolArray:
-        """Channels with a value wherever there is something to measure, unless there are none at all."""
-        return np.asarray((self.missing == 0) & (self.values > 0))
-
-    @property
-    def broken(self) -> BoolArray:
-        """Channels with a value in some samples and NaN in others."""
-        return np.asarray((self.missing > 0) & (self.missing < self.measurable) & (self.values > 0))
-
-
-def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
-    """Warn of channels that become NaN throughout because they are NaN in some samples.
-
-    Warns:
-        TorchidWarning: names them.
-    """
-    labels = column_labels(name, log.names)
-    broken = [
-        f"{describe_element((0, *channel), labels).partition(', ')[2]}"
-        f" (samples {coverage.first[channel]} to {coverage.last[channel]})"
-        for channel in map(tuple, np.argwhere(coverage.broken).tolist())
-    ]
-    if broken:
-        message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
-        warn(message)
-
-
-def measure_coverage(log: Log, name: str) -> Coverage:
-    """Coverage of the field `name` of a log."""
-    values: FloatArray = getattr(log, name)
-    found = Coverage.empty(values.shape[1:])
-    found.add(values, log.contact_active if name in WRENCHES else None)
-    return found
-
-
-def resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
-    """The field `name` (N, ...) at the output's stamps (K, ...), filtered like all others.
-
-    A channel that is NaN throughout stays so. A wrench of an inactive contact is 0, whatever the log says. A channel
-    with NaN among other values can be neither filtered nor resampled: it becomes NaN throughout.
-
-    Args:
-        log: the log, or a part of one.
-        name: of the field.
-        timeline: stamps of the log and of the result.
-        coverage: of the field in the whole log; None where nothing is filtered or resampled.
-    """
-    values: FloatArray = getattr(log, name)
-    check_finite(name, values, allow_nan=True, labels=column_labels(name, log.names))
-    if coverage is None:
-        return values[timeline.kept]
-    flags = log.contact_active if name in WRENCHES else None
-    complete = np.argwhere(coverage.complete)
-    out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
-    for start in range(0, len(complete), CHANNELS_TOGETHER):
-        columns = (slice(None), *complete[start : start + CHANNELS_TOGETHER].T)
-        clean = values[columns]
-        if flags is not None:
-            clean[~flags[:, columns[1]]] = 0.0
-        out[columns] = timeline.evaluate(timeline.smooth(clean), (0,))[0]
-    return out
-
-
-#: How far from its contact [s] a sensor counts as unloaded. Flags come from thresholds of 20 to 50 N: a foot carries
-#: that much for some 10 ms before and after, and a sensor rings about as long when it lands.
-UNLOADED_MARGIN_S = 0.05
-
-
-def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray:
-    """Which of some stamps lie within a margin of a change of contact.
-
-    Args:
-        log: as recorded; a change lies between two of its samples.
-        time: (K,) [s].
-        margin: [s] before the last sample of the old and after the first of the new contact state.
-    """
-    near = np.zeros(len(time), dtype=bool)
-    if log.contact_active is None:
-        return near
-    changes = np.flatnonzero((log.contact_active[1:] != log.contact_active[:-1]).any(axis=1))
-    if len(changes):
-        margin += JITTER * float(np.median(np.diff(log.time)))  # a stamp at the margin is within, however it rounds
-    first = np.searchsorted(time, log.time[changes] - margin)
-    last = np.searchsorted(time, log.time[changes + 1] + margin, side="right")
-    for start, stop in zip(first, last, strict=True):
-        near[start:stop] = True
-    return near
-
-
-def away_from_changes(log: Log, time: FloatArray, margin: float) -> BoolArray | None:
-    """Which of some stamps are not `near_contact_changes`, None for all.
-
-    Raises:
-        LogError: none is.
-    """
-    near = near_contact_changes(log, time, margin)
-    if near.all():
-        found = f"no sample further than {margin:g} s from a change of contact"
-        raise LogError(log.source, "contact_active", found, "a smaller preprocessing.contact_margin_s")
-    return ~near if near.any() else None
-
-
-def find_unloaded(time: FloatArray, active: BoolArray, margin: float = UNLOADED_MARGIN_S) -> BoolArray:
-    """Which contacts are further than a margin from every sample in which they touch, (N, C).
-
-    Args:
-        time: (N,) [s].
-        active: (N, C).
-        margin: [s].
-    """
-    out = np.ones(active.shape, dtype=bool)
-    for contact in range(active.shape[1]):
-        touching = time[active[:, contact]]
-        if len(touching):
-            after = np.searchsorted(touching, time)
-            since = np.abs(time - touching[np.maximum(after - 1, 0)])
-            until = np.abs(touching[np.minimum(after, len(touching) - 1)] - time)
-            out[:, contact] = np.minimum(since, until) > margin
-    return out
-
-
-def unloaded_readings(log: Log, where: BoolArray | None = None) -> FloatArray | None:
-    """What the sensors of contacts read while nothing touches, (N, C, 6), NaN elsewhere; None if there is none.
-
-    Args:
-        log: as recorded.
-        where: (N, C), from `find_unloaded`, of a part of a log; the result is an array then, whatever it holds.
-    """
-    if log.contact_unloaded is not None:
-        return log.contact_unloaded
-    wrench = log.contact_wrench
-    if wrench is None or log.contact_active is None:
-        return None
-    chosen = find_unloaded(log.time, log.contact_active) if where is None else where
-    if where is None and not chosen.any():
-        return None
-    return np.where(chosen[..., None], wrench, np.nan)
-
-
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
 DERIVATIVE_CHAINS = (
     ("joint_position", "joint_velocity", "joint_acceleration"),
@@ -216,7 +38,7 @@ MIN_QUATERNION_NORM = 0.5
 
 
 def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float | None = None) -> Log:
-    """Fill in velocities and accelerations, after a zero-phase low-pass filter and before resampling if asked to.
+    """Fill in velocities and accelerations, after a zero-phase low-pass filter and before resampling, both optional.
 
     Derivatives that the log gives are used. A missing one is that of the nearest quantity before it that the log
     gives, by a quintic spline: joints from `joint_position`, the base's linear ones from `base_position_world`, its
@@ -250,7 +72,7 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
         TorchidWarning: a torque or wrench channel is NaN in some samples, or time stamps nearly coincide.
     """
     with about_file(log.source):
-        timeline = timeline_of(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
+        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
     if timeline is None:
         return log
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
@@ -259,7 +81,7 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     return move_to_timeline(log, timeline, coverage)
 
 
-def timeline_of(
+def make_timeline(
     time: FloatArray, differentiates: bool, cutoff_hz: float | None, sample_rate_hz: float | None
 ) -> Timeline | None:
     """How samples move in `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
@@ -357,3 +179,185 @@ def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, Fl
     if len(rates) > 1:
         out["base_angular_acceleration_base"] = angular_acceleration_base(q, rates[0], rates[1])
     return out
+
+
+# -------------------------------------------------------------------------------------------- fields that may have gaps
+
+#: Channels that are filtered together: as many as make the copies of a long log small against it.
+CHANNELS_TOGETHER = 4
+
+
+@dataclass
+class Coverage:
+    """Which channels of a field were measured throughout, gathered block by block.
+
+    Of every channel: `measurable`, samples in which there is something to measure (all, or those in contact);
+    `missing`, those of them that are NaN, from the `first` to the `last`; `values`, samples with a value.
+    """
+
+    samples: int
+    measurable: NDArray[np.intp]
+    missing: NDArray[np.intp]
+    values: NDArray[np.intp]
+    first: NDArray[np.intp]
+    last: NDArray[np.intp]
+
+    @classmethod
+    def empty(cls, channels: tuple[int, ...]) -> Coverage:
+        """Of no samples yet."""
+        return cls(0, *(np.zeros(channels, dtype=np.intp) for _ in range(5)))
+
+    def add(self, values: FloatArray, active: BoolArray | None) -> None:
+        """Add samples (N, ...) of the field; `active`: (N, C) of a wrench's contacts."""
+        nan = np.isnan(values)
+        self.values += len(values) - nan.sum(axis=0)
+        self.measurable += len(values) if active is None else active.sum(axis=0)[:, None]
+        if active is not None:
+            nan &= active[..., None]
+        count = nan.sum(axis=0)
+        new = (count > 0) & (self.missing == 0)
+        self.first[new] = self.samples + np.argmax(nan, axis=0)[new]
+        self.last[count > 0] = self.samples + (len(nan) - 1 - np.argmax(nan[::-1], axis=0))[count > 0]
+        self.missing += count
+        self.samples += len(values)
+
+    @property
+    def complete(self) -> BoolArray:
+        """Channels with a value wherever there is something to measure, unless there are none at all."""
+        return np.asarray((self.missing == 0) & (self.values > 0))
+
+    @property
+    def broken(self) -> BoolArray:
+        """Channels with a value in some samples and NaN in others."""
+        return np.asarray((self.missing > 0) & (self.missing < self.measurable) & (self.values > 0))
+
+
+def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
+    """Warn of channels that become NaN throughout because they are NaN in some samples.
+
+    Warns:
+        TorchidWarning: names them.
+    """
+    labels = column_labels(name, log.names)
+    broken = [
+        f"{describe_element((0, *channel), labels).partition(', ')[2]}"
+        f" (samples {coverage.first[channel]} to {coverage.last[channel]})"
+        for channel in map(tuple, np.argwhere(coverage.broken).tolist())
+    ]
+    if broken:
+        message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
+        warn(message)
+
+
+def measure_coverage(log: Log, name: str) -> Coverage:
+    """Coverage of the field `name` of a log."""
+    values: FloatArray = getattr(log, name)
+    found = Coverage.empty(values.shape[1:])
+    found.add(values, log.contact_active if name in WRENCHES else None)
+    return found
+
+
+def resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
+    """The field `name` (N, ...) at the output's stamps (K, ...), filtered like all others.
+
+    A channel that is NaN throughout stays so. A wrench of an inactive contact is 0, whatever was recorded. A channel
+    with NaN among other values can be neither filtered nor resampled: it becomes NaN throughout.
+
+    Args:
+        log: the log, or a part of one.
+        name: of the field.
+        timeline: stamps of the log and of the result.
+        coverage: of the field in the whole log; None where nothing is filtered or resampled.
+    """
+    values: FloatArray = getattr(log, name)
+    check_finite(name, values, allow_nan=True, labels=column_labels(name, log.names))
+    if coverage is None:
+        return values[timeline.kept]
+    flags = log.contact_active if name in WRENCHES else None
+    complete = np.argwhere(coverage.complete)
+    out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
+    for start in range(0, len(complete), CHANNELS_TOGETHER):
+        columns = (slice(None), *complete[start : start + CHANNELS_TOGETHER].T)
+        clean = values[columns]
+        if flags is not None:
+            clean[~flags[:, columns[1]]] = 0.0
+        out[columns] = timeline.evaluate(timeline.smooth(clean), (0,))[0]
+    return out
+
+
+# --------------------------------------------------------------------- contacts that change, and sensors without a load
+
+#: How far from its contact [s] a sensor counts as unloaded. Flags come from thresholds of 20 to 50 N: a foot carries
+#: that much for some 10 ms before and after, and a sensor rings about as long when it lands.
+UNLOADED_MARGIN_S = 0.05
+
+
+def near_contact_changes(log: Log, time: FloatArray, margin: float) -> BoolArray:
+    """Which of some stamps lie within a margin of a change of contact.
+
+    Args:
+        log: as recorded; a change lies between two of its samples.
+        time: (K,) [s].
+        margin: [s] before the last sample of the old and after the first of the new contact state.
+    """
+    near = np.zeros(len(time), dtype=bool)
+    if log.contact_active is None:
+        return near
+    changes = np.flatnonzero((log.contact_active[1:] != log.contact_active[:-1]).any(axis=1))
+    if len(changes):
+        margin += JITTER * float(np.median(np.diff(log.time)))  # a stamp at the margin is within, however it rounds
+    first = np.searchsorted(time, log.time[changes] - margin)
+    last = np.searchsorted(time, log.time[changes + 1] + margin, side="right")
+    for start, stop in zip(first, last, strict=True):
+        near[start:stop] = True
+    return near
+
+
+def away_from_changes(log: Log, time: FloatArray, margin: float) -> BoolArray | None:
+    """Which of some stamps are not `near_contact_changes`, None for all.
+
+    Raises:
+        LogError: none is.
+    """
+    near = near_contact_changes(log, time, margin)
+    if near.all():
+        found = f"no sample further than {margin:g} s from a change of contact"
+        raise LogError(log.source, "contact_active", found, "a smaller preprocessing.contact_margin_s")
+    return ~near if near.any() else None
+
+
+def find_unloaded(time: FloatArray, active: BoolArray, margin: float = UNLOADED_MARGIN_S) -> BoolArray:
+    """Which contacts are further than a margin from every sample in which they touch, (N, C).
+
+    Args:
+        time: (N,) [s].
+        active: (N, C).
+        margin: [s].
+    """
+    out = np.ones(active.shape, dtype=bool)
+    for contact in range(active.shape[1]):
+        touching = time[active[:, contact]]
+        if len(touching):
+            after = np.searchsorted(touching, time)
+            since = np.abs(time - touching[np.maximum(after - 1, 0)])
+            until = np.abs(touching[np.minimum(after, len(touching) - 1)] - time)
+            out[:, contact] = np.minimum(since, until) > margin
+    return out
+
+
+def unloaded_readings(log: Log, where: BoolArray | None = None) -> FloatArray | None:
+    """What the sensors of contacts read while nothing touches, (N, C, 6), NaN elsewhere; None if there is none.
+
+    Args:
+        log: as recorded.
+        where: (N, C), from `find_unloaded`, of a part of a log; the result is an array then, whatever it holds.
+    """
+    if log.contact_unloaded is not None:
+        return log.contact_unloaded
+    wrench = log.contact_wrench
+    if wrench is None or log.contact_active is None:
+        return None
+    chosen = find_unloaded(log.time, log.contact_active) if where is None else where
+    if where is None and not chosen.any():
+        return None
+    return np.where(chosen[..., None], wrench, np.nan)

@@ -117,7 +117,7 @@ def _check_names(names: Collection[str]) -> None:
 
 
 def _check_combination(names: Collection[str]) -> None:
-    """Raise LogError on fields that say the same thing twice or that need a field that is missing."""
+    """Raise LogError on fields that exclude each other, or that need a field that is missing."""
     for one, other in EXCLUSIVE:
         if one in names and other in names:
             raise FieldError(one, f"given together with {other}", "one of the two")

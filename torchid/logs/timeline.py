@@ -1,4 +1,4 @@
-"""How samples move from a log's time stamps to those of the preprocessed log: layout, filter, quintic splines."""
+"""Time stamps of a log and of the preprocessed log, with the filter and the quintic splines between the two."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from scipy.interpolate import make_interp_spline
 from torchid.errors import FieldError, InputError, current_file, warn
 from torchid.logs.log import BoolArray, FloatArray, check_time
 
+# -------------------------------------------------------------------------------------------------------------- splines
+
 #: Samples per spline. One spline through a long log needs 22 numbers a sample for its banded matrix alone; through
 #: blocks the temporaries stay small.
 SPLINE_BLOCK = 4096
-#: Samples added on both sides of a block: on a uniform grid a sample's influence fades by 0.43 per step, so nothing
-#: is left of the cut after 128.
+#: Samples added on both sides of a block: on a uniform grid a sample's influence fades by 0.43 per step, so the cut
+#: has no effect beyond 128.
 SPLINE_OVERLAP = 128
 
 
@@ -54,11 +56,13 @@ def spline_derivatives(
     return [derivative.reshape(len(at), *values.shape[1:]) for derivative in out]
 
 
+# ------------------------------------------------------------------------- stamps of a log, and the filter between them
+
 #: Steps that differ by less than this share of the median step count as uniform.
 JITTER = 1e-6
 _FREQUENCIES = 2**16
-#: What is left of a value that a block of a log does not hold: a hundredth of rounding, for modes of a filter that runs
-#: twice decay like a polynomial times an exponential.
+#: Remaining effect of a sample outside of a block: a hundredth of rounding, since modes of a filter that runs twice
+#: decay like a polynomial times an exponential.
 _SETTLED = 1e-18
 
 
@@ -79,7 +83,7 @@ class LowPass:
 
     @property
     def settling(self) -> int:
-        """Samples after which nothing is left of what lies before: the slowest mode has decayed to rounding."""
+        """Samples after which earlier ones have no effect: the slowest mode has decayed to rounding."""
         slowest = max(float(np.max(np.abs(np.roots(section[3:])))) for section in self.sections)
         return math.ceil(math.log(_SETTLED) / math.log(slowest))
 
@@ -190,6 +194,8 @@ def _around(stamps: FloatArray, at: FloatArray, beyond: int) -> slice:
         min(len(stamps), -(-last // SPLINE_BLOCK) * SPLINE_BLOCK + SPLINE_OVERLAP),
     )
 
+
+# --------------------------------------------------------------------------------------------------------------- layout
 
 #: Order of the Butterworth filter, which runs forward and backward: the gain at the cutoff is 1/2.
 FILTER_ORDER = 4

@@ -122,7 +122,7 @@ class McapFile:
 
 
 def _records(stream: BinaryIO, whole: bool, messages: bool, budget: Budget) -> Iterator[Any]:
-    """Schemas, channels, chunks and, if asked for, messages, but not what else there is; of a file, up to the footer.
+    """Schemas, channels, chunks and, with `messages`, messages, but no other records; of a file, up to the footer.
 
     mcap's own loop also reads attachments, and takes minutes for the zeros that a crash may leave in a file.
     """
@@ -157,7 +157,7 @@ _ROS1_MAGIC = b"#ROSBAG V2.0\n"
 
 
 class _Reader(rosbag1.Reader):
-    """The reader of rosbags, which trusts its files, with bounds on what a chunk and the index grow to."""
+    """The reader of rosbags, which has no limits, with limits on the size of an unpacked chunk and of the index."""
 
     _index_bytes = 0
 
@@ -214,14 +214,14 @@ class Ros1File:
         """The messages of some topics."""
         connections = [x for x in self._reader.connections if x.topic in topics]
         total = max(sum(x.msgcount for x in connections), 1)
-        if connections:  # none would stand for all
+        if connections:  # rosbags takes none for all
             for i, (connection, received, data) in enumerate(self._reader.messages(connections)):
                 self._reader.budget.spend_message()
                 yield Record(connection.topic, received, data, i / total)
 
 
 class SqliteFile:
-    """A .db3 file: tables of topics and messages, read without trusting what else a database can hold."""
+    """A .db3 file: tables of topics and messages; views and computed columns, which could run forever, are refused."""
 
     def __init__(self, path: Path) -> None:
         """Open the file, which may be on a read-only disk."""
@@ -288,6 +288,6 @@ def decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
     else:
         raise ValueError(f"chunks compressed by '{excerpt(compression)}'")
     if len(out) > limit:
-        raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
+        raise ValueError(f"a chunk of {len(data)} bytes that unpacks to more than {limit}")
     budget.spend_bytes(len(out))
     return out

@@ -43,7 +43,7 @@ class CommonClock:
 
     @property
     def time(self) -> FloatArray:
-        """Stamps (N,) [s], counted from the first: since 1970 a float64 would tell no less than 0.2 us apart."""
+        """Stamps (N,) [s], counted from the first: a float64 since 1970 would resolve no less than 0.2 us."""
         return self.seconds(self.stamps)
 
     def seconds(self, stamps: Stamps) -> FloatArray:
@@ -69,7 +69,7 @@ class CommonClock:
         return {name: self._interpolated(series, run, name) for name in series.fields}
 
     def hold(self, series: TopicSeries, values: FloatArray) -> FloatArray:
-        """Values (K, ...) of a topic as they were last said, (N, ...)."""
+        """The last values (K, ...) of a topic before each stamp, (N, ...)."""
         return np.asarray(values[np.searchsorted(series.stamps, self.stamps, side="right") - 1])
 
     def _unbroken(self, series: TopicSeries) -> slice:
@@ -177,7 +177,7 @@ def read_bag(
 
     Warns:
         TorchidWarning: messages without stamps, messages that come twice, channels that are NaN in part, a frame that
-            is not the one expected or that nothing says to expect.
+            is not the one expected, or where none is configured.
     """
     files = list_bag_files(path)
     if topics is not None:
@@ -301,7 +301,7 @@ def _contacts(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) 
 
 
 def _active(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
-    """Whether a contact touches, (N,), as was last said or as its force was last."""
+    """Whether a contact touches, (N,), by its last flag or its last force."""
     if name in bag.topics.contact_active:
         said = series.get(f"contact_active.{name}")
         if said is None:
@@ -333,10 +333,10 @@ def _ft_sensors(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]
 
 
 def _check_frame(bag: _Bag, role: str, expected: str | None, otherwise: str = "") -> None:
-    """Warn of a pose or wrench of another frame than it is taken for: nothing here could transform it.
+    """Warn of a pose or wrench in another frame than it is taken for, since nothing here can transform it.
 
-    Which link is the base, and which one a fixed joint carries, the URDF says, and that is not known here: where the
-    map of topics expects nothing, `otherwise` names what the frame is taken for, and the user has to compare.
+    The base link and the child links of fixed joints are in the URDF, which is not known here: where the map of topics
+    expects no frame, `otherwise` names the frame that is assumed, for the user to compare.
     """
     decoder = bag.decoders[role]
     if not isinstance(decoder, (Odometry, Wrench)):
