@@ -56,12 +56,12 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
         except Exception as error:  # a full disk, or a bug: no traceback unless `debug`
             if debug:
                 traceback.print_exc()
-            status, line = describe_failure(error)
+            status, line = _describe_failure(error)
             _say(program, line)
             return status
 
 
-def describe_failure(error: Exception) -> tuple[int, str]:
+def _describe_failure(error: Exception) -> tuple[int, str]:
     """Exit status and the one line that says what stopped a command."""
     if isinstance(error, (InputError, BaseLostError)):
         return 2, str(error)

@@ -71,7 +71,7 @@ class UnknownNameError(InputError, KeyError):
         """Take the name and the valid ones; `what` describes a name that is known, but not valid here."""
         self.name, self.valid, self.what = name, tuple(valid), what
         found = f"'{name}', {what}" if what else f"unknown name '{name}'"
-        super().__init__(source, field, found, nearest_names(name, self.valid))
+        super().__init__(source, field, found, _nearest_names(name, self.valid))
 
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self.source, self.field, self.name, self.valid, self.what)
@@ -165,7 +165,7 @@ def activity_of(error: BaseException) -> str:
     return str(getattr(error, "_torchid_doing", ""))
 
 
-def nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:
+def _nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:
     """The names in `valid` closest to `name`, or the first few of them, as one readable string."""
     valid = list(valid)
     close = difflib.get_close_matches(name, valid, n=limit, cutoff=0.5)

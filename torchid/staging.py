@@ -123,7 +123,7 @@ def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be written.
     """
-    clear_leftovers(path)
+    _clear_leftovers(path)
     with staging_folder(path) as folder:
         yield folder / NEW
         with interrupts_deferred():
@@ -141,7 +141,7 @@ def leftovers(target: Path) -> Iterator[Path]:
                 yield from _taken_over(path)
 
 
-def clear_leftovers(target: Path) -> None:
+def _clear_leftovers(target: Path) -> None:
     """Remove what killed processes left of results that were to become `target`."""
     for _ in leftovers(target):
         pass

@@ -183,8 +183,8 @@ def new_folder(
         ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
     """
     check_free(output, overwrite, kind)
-    with parent_folders(output), ExitStack() as stack:
-        with creation_errors_explained(output):
+    with _parent_folders(output), ExitStack() as stack:
+        with _creation_errors_explained(output):
             folder = stack.enter_context(staging_folder(output))
             (folder / NEW).mkdir()
         yield folder / NEW
@@ -196,11 +196,11 @@ def new_folder(
 
 
 @contextmanager
-def parent_folders(output: Path) -> Iterator[None]:
+def _parent_folders(output: Path) -> Iterator[None]:
     """The folders above `output`, which go with the block if they came with it and it leaves nothing in them."""
     made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
     try:
-        with interrupts_deferred(), creation_errors_explained(output):
+        with interrupts_deferred(), _creation_errors_explained(output):
             output.parent.mkdir(parents=True, exist_ok=True)
         yield
     finally:
@@ -210,7 +210,7 @@ def parent_folders(output: Path) -> Iterator[None]:
 
 
 @contextmanager
-def creation_errors_explained(output: Path) -> Iterator[None]:
+def _creation_errors_explained(output: Path) -> Iterator[None]:
     """Turn an OSError into a ConfigError: nothing can be created beside `output`."""
     try:
         yield
@@ -266,7 +266,7 @@ def claim_folder(folder: Path) -> Iterator[None]:
         yield
         return
     lock, handle = folder.with_name(f".{folder.name}.lock"), -1
-    with parent_folders(folder):
+    with _parent_folders(folder):
         try:
             with interrupts_deferred():
                 handle = _locked(lock, folder)
@@ -281,7 +281,7 @@ def claim_folder(folder: Path) -> Iterator[None]:
 def _locked(lock: Path, folder: Path) -> int:
     """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
     for _ in range(_TRIES):
-        with creation_errors_explained(folder):
+        with _creation_errors_explained(folder):
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
         if try_lock(handle, lock) is not False:  # None, no locks there: one run at a time is then the user's affair
             return handle

@@ -52,7 +52,7 @@ def check_forces_against_urdf(
     try:
         logs = preprocess_pieces(log, cutoff)
     except InputError as error:  # too short, or too fast: by its stamps
-        yield time_scale_finding(fit_time_scale_of_log(log, robot, contacts)) or Skipped(
+        yield _time_scale_finding(_fit_time_scale_of_log(log, robot, contacts)) or Skipped(
             _NAME, f"{error.field}: {error.found}"
         )
         return
@@ -66,8 +66,8 @@ def check_forces_against_urdf(
         return
     fit = fit_nominal_model(samples, robot, contacts)
     wrong = _explained(log, robot, contacts, cutoff, fit) if fit.misfit > WRONG else None
-    timed = fit_time_scale_of_log(log, robot, contacts) if wrong is None else None
-    wrong = wrong or time_scale_finding(timed)
+    timed = _fit_time_scale_of_log(log, robot, contacts) if wrong is None else None
+    wrong = wrong or _time_scale_finding(timed)
     if wrong is None and fit.misfit > WRONG and (timed is None or timed.recorded > NEAR):
         text = f"{_apart(fit)}, and no usual mistake explains it"
         advice = "look at units, frames, the order of joints and contacts, friction, the URDF's base link and masses"
@@ -78,7 +78,7 @@ def check_forces_against_urdf(
     signs = [] if fit.torque is None else list(_signs(log, robot, fit.torque))
     yield from signs
     if not any(isinstance(one, Finding) for one in signs):
-        yield from gain_and_point_findings(log, samples, robot, contacts)
+        yield from _gain_and_point_findings(log, samples, robot, contacts)
 
 
 def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit) -> Finding | None:
@@ -168,7 +168,7 @@ SAME = 0.5
 _KNOWN, _ENOUGH = 0.1, 3
 
 
-def fit_time_scale_of_log(log: Log, robot: Robot, contacts: Sequence[Contact]) -> TimeScale | None:
+def _fit_time_scale_of_log(log: Log, robot: Robot, contacts: Sequence[Contact]) -> TimeScale | None:
     """What time is worth by the forces; None where nothing moves, or the log is too short."""
     cutoff = motion_cutoff_hz(log)
     try:
@@ -177,7 +177,7 @@ def fit_time_scale_of_log(log: Log, robot: Robot, contacts: Sequence[Contact]) -
         return None
 
 
-def time_scale_finding(found: TimeScale | None) -> Finding | None:
+def _time_scale_finding(found: TimeScale | None) -> Finding | None:
     """That time is in another unit, if gravity and inertia only make up the forces in that unit.
 
     Noise in positions makes accelerations that no force answers to, which looks like time that is too short: so inertia
@@ -197,7 +197,7 @@ def time_scale_finding(found: TimeScale | None) -> Finding | None:
     return Finding("unit", CONDEMNED, "time", text, advice)
 
 
-def gain_and_point_findings(
+def _gain_and_point_findings(
     log: Log, samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]
 ) -> Iterator[Finding]:
     """Findings about torques of another size and wrenches about another point."""

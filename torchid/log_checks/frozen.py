@@ -71,13 +71,13 @@ def check_repeats(groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
             continue
         rests = _at_rest(group, steps, positions)
         together = ((steps == 0.0) & ~rests)[:, ~constant].all(axis=1) & group.joined
-        if every := mean_hold(group.values[:, ~constant], together):
+        if every := _mean_hold(group.values[:, ~constant], together):
             yield _held(group, [(name, every) for name in group.names])
             continue
         moving = group.values[:, ~constant]
-        runs = implausible_runs(moving, together)
+        runs = _implausible_runs(moving, together)
         if group.field in DEAD_BANDS:
-            runs = runs.select(~in_dead_band(moving, runs))
+            runs = runs.select(~_in_dead_band(moving, runs))
         if len(runs):
             what = f"all {len(group.names)} channels" if len(group.names) > 1 else group.names[0]
             yield _frozen(group, what, [(name, runs) for name in group.names], len(runs))
@@ -100,13 +100,13 @@ def _by_channel(group: ChannelGroup, all_repeated: BoolArray, columns: np.ndarra
     stuck: _Stuck = []
     dead: list[tuple[str, float, float]] = []
     limits: list[tuple[str, Runs, float]] = []
-    every = {column: mean_hold(group.values[:, [column]], all_repeated[:, column]) for column in columns}
+    every = {column: _mean_hold(group.values[:, [column]], all_repeated[:, column]) for column in columns}
     for column in (column for column in columns if not every[column]):
         repeated = all_repeated[:, column]
         name, values = group.names[column], group.values[:, column]
-        runs = implausible_runs(values[:, None], repeated)
+        runs = _implausible_runs(values[:, None], repeated)
         zeros = values[runs.first] == 0.0
-        quiet = in_dead_band(values[:, None], runs)
+        quiet = _in_dead_band(values[:, None], runs)
         if group.field in DEAD_BANDS and quiet.any() and 2 * quiet.sum() >= zeros.sum():
             dead.append((name, float(np.abs(values[values != 0.0]).min()), 100.0 * float(np.mean(values == 0.0))))
             runs = runs.select(~zeros)
@@ -216,7 +216,7 @@ _SMALLEST = (0.001, 0.005, 0.02)
 _MOST_RUNS = 20000
 
 
-def mean_hold(values: FloatArray, repeated: BoolArray) -> float:
+def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:
     """For how many samples values (M, c) are held on average whose steps (M - 1,) `repeated` all; 0 if they are not.
 
     Held values repeat at more or less regular times while the robot moves on: the change after a repeat is no single
@@ -228,7 +228,7 @@ def mean_hold(values: FloatArray, repeated: BoolArray) -> float:
     if len(changes) < NEIGHBOURS:
         return 0.0
     lengths = np.diff(changes)
-    quanta = np.array([estimate_resolution(column) for column in values.T])
+    quanta = np.array([_estimate_resolution(column) for column in values.T])
     after = changes[1:][lengths > 1]
     sizes = np.abs(values[after + 1] - values[after])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -242,7 +242,7 @@ def mean_hold(values: FloatArray, repeated: BoolArray) -> float:
     return mean if lengths[lengths > _LONG * mean].sum() <= _RESTING * lengths.sum() else 0.0
 
 
-def estimate_resolution(values: FloatArray) -> float:
+def _estimate_resolution(values: FloatArray) -> float:
     """Quantum of the grid that the steps of a channel (M,) lie on; 0 if they lie on none, inf if they are too few."""
     sizes = np.abs(np.diff(values))
     sizes = sizes[sizes > _SINGLE * np.abs(values).max()]
@@ -256,7 +256,7 @@ def estimate_resolution(values: FloatArray) -> float:
     return 0.0
 
 
-def implausible_runs(values: FloatArray, repeated: BoolArray) -> Runs:
+def _implausible_runs(values: FloatArray, repeated: BoolArray) -> Runs:
     """Runs of repeats (M - 1,) in values (M, c), all channels at once, that are neither chance nor rest."""
     runs = Runs.of_repeats(repeated)
     if not 0 < len(runs) <= _MOST_RUNS:
@@ -267,7 +267,7 @@ def implausible_runs(values: FloatArray, repeated: BoolArray) -> Runs:
         neighbours_of(sizes, runs.last, 1, NEIGHBOURS),
     ]  # (R, k, c)
     typical = finite_median(np.concatenate(sides, axis=1))
-    quanta = np.array([estimate_resolution(column) for column in values.T])
+    quanta = np.array([_estimate_resolution(column) for column in values.T])
     finest = np.maximum(_finest(sides, ROUNDING * np.abs(values).max(axis=0)), quanta)
     moving = np.ones(len(runs), bool)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -279,7 +279,7 @@ def implausible_runs(values: FloatArray, repeated: BoolArray) -> Runs:
     return runs.select((chance < CHANCE) & moving)
 
 
-def in_dead_band(values: FloatArray, runs: Runs) -> BoolArray:
+def _in_dead_band(values: FloatArray, runs: Runs) -> BoolArray:
     """Which runs (R,) of values (M, c) are of zeros amid the smallest readings that there are.
 
     A driver that reads 0 below some size goes to 0 and leaves it there; a sensor that is lost does so from any reading.

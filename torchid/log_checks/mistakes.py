@@ -40,7 +40,7 @@ def exchanged_names(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]
             yield what, other
 
 
-def exchanged_neighbours(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+def _exchanged_neighbours(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Names with two that follow each other in a short chain exchanged."""
     for i in range(len(names) - 1 if len(names) <= _SHORT else 0):
         yield f"{names[i]} and {names[i + 1]}", (*names[:i], names[i + 1], names[i], *names[i + 2 :])
@@ -106,7 +106,7 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
     yield from _of_orders(log)
     if log.base_quat_xyzw is not None:
         down, up = "in a world whose z axis points down", "turn positions, orientations and vectors so that z points up"
-        yield Mistake("base_quat_xyzw", down, up, flip_world)
+        yield Mistake("base_quat_xyzw", down, up, _flip_world)
         order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, -1, axis=1)))
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, 1, axis=1)))
@@ -128,7 +128,7 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
 
 def _of_orders(log: Log) -> Iterator[Mistake]:
     """Names of joints and contacts exchanged, flags that belong to other contacts."""
-    for what, other in (*exchanged_names(log.joint_names), *exchanged_neighbours(log.joint_names)):
+    for what, other in (*exchanged_names(log.joint_names), *_exchanged_neighbours(log.joint_names)):
         text, advice = f"{what} exchanged", "give joint_names in the order of the columns"
         yield Mistake("joint_names", text, advice, _renamed("joint_names", other))
     for what, other in exchanged_names(log.contact_names):
@@ -148,7 +148,7 @@ def _reordered(fields: Sequence[str], order: list[int]) -> Callable[[Log], Log]:
     return _change(lambda log: {field: getattr(log, field)[:, order] for field in fields})
 
 
-def flip_world(log: Log) -> Log:
+def _flip_world(log: Log) -> Log:
     """The log in a world half a turn about x from the one that it has."""
     fields: dict[str, Any] = {}
     if log.base_quat_xyzw is not None:

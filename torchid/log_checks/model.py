@@ -65,7 +65,7 @@ class TorqueFit:
     @property
     def wrong(self) -> BoolArray:
         """Joints (m,) whose torque is clearly reversed or of another size."""
-        return wrong_gains(self.gain, self.clear)
+        return _wrong_gains(self.gain, self.clear)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class ModelFit:
         return float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
 
 
-def wrong_gains(gain: FloatArray, clear: BoolArray) -> BoolArray:
+def _wrong_gains(gain: FloatArray, clear: BoolArray) -> BoolArray:
     """Which gains (m,) no error of a model can be, among those that are clear."""
     return clear & ((gain < 0.0) | (np.abs(np.log(np.maximum(np.abs(gain), _TINY))) > np.log(SCALE)))
 
@@ -209,7 +209,7 @@ def _projected_fit(
     gain = inverse @ (U.T @ y) / norms
     own = norms / np.sqrt(np.square(inverse).sum(axis=1))  # what of each torque the others cannot make up for
     clear = own * np.abs(gain) > CLEAR * np.linalg.norm(y - A @ gain)
-    corrected = np.where(wrong_gains(gain, clear), gain, 1.0)
+    corrected = np.where(_wrong_gains(gain, clear), gain, 1.0)
     size = max(float(np.linalg.norm(y)), _TINY)
     missed = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), corrected))
     return TorqueFit(joints, gain, clear, *missed)

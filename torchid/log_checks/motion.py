@@ -96,7 +96,7 @@ def compare_derivative(time: FloatArray, base: FloatArray, derivative: FloatArra
     if len(time) < order * lag + 6 * MAX_DELAY:
         return None
     for _ in range(order):
-        derivative = integrate(time, derivative)
+        derivative = _integrate(time, derivative)
     wanted, given = (_differences(values, lag, order) for values in (base, derivative))
     at = np.arange(MAX_DELAY, len(wanted) - MAX_DELAY, max(1, len(wanted) // _COMPARED))
     excess = (given[at] - wanted[at]).mean(axis=0) / (lag * step) ** order
@@ -119,7 +119,7 @@ def compare_derivative(time: FloatArray, base: FloatArray, derivative: FloatArra
     return Comparison(ratio, follows, delay, excess, min(misfits))
 
 
-def integrate(time: FloatArray, values: FloatArray) -> FloatArray:
+def _integrate(time: FloatArray, values: FloatArray) -> FloatArray:
     """Integral over time from the first sample on, (N, c), by the trapezoidal rule."""
     areas = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(areas, axis=0)])
@@ -173,10 +173,10 @@ def check_derivatives(log: Log) -> Iterator[Finding | Skipped]:
                 yield Skipped(_DERIVATIVES, f"{name}: the log is too short")
             else:
                 wrong = list(_frame(log, name, base, high - low, found))
-                yield from wrong or derivative_findings(found, name, base, channel_names(log, name))
+                yield from wrong or _derivative_findings(found, name, base, channel_names(log, name))
 
 
-def derivative_findings(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -> Iterator[Finding]:
+def _derivative_findings(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -> Iterator[Finding]:
     """Findings about one derivative, given with the names of its channels."""
     follows = np.abs(found.correlation) >= FOLLOWS  # so written, NaN does not follow
     lost = ~follows & np.isfinite(found.correlation)
@@ -245,13 +245,13 @@ def check_angular_velocity(log: Log, robot: Robot | None) -> Iterator[Finding | 
         nowhere = "an IMU, and no robot that says where it is"
         yield Skipped(_TURNING, nowhere if log.imu_frame else "no angular velocity of the base")
     for field, omega in given.items():
-        found = compare_derivative(log.time, integrate(log.time, _omega(log.time, quat)), omega)
+        found = compare_derivative(log.time, _integrate(log.time, _omega(log.time, quat)), omega)
         if found is None:
             yield Skipped(_TURNING, f"{field}: the log is too short")
             continue
         mistaken = _explaining(log.time, quat, omega, found.misfit) if found.misfit > WRONG else None
         if mistaken is None:
-            yield from derivative_findings(found, field, "base_quat", ("x", "y", "z"))
+            yield from _derivative_findings(found, field, "base_quat", ("x", "y", "z"))
         else:
             yield Finding("frame or order", CONDEMNED, mistaken.field or field, mistaken.found, mistaken.advice)
 
@@ -307,7 +307,7 @@ def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: f
     """
     best, least = None, BETTER * misfit
     for mistake in _mistakes(quat, omega):
-        found = compare_derivative(time, integrate(time, _omega(time, mistake.quat)), mistake.omega)
+        found = compare_derivative(time, _integrate(time, _omega(time, mistake.quat)), mistake.omega)
         if found is not None and found.misfit < least:
             best, least = mistake, found.misfit
     return best

@@ -38,7 +38,7 @@ def check_weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about the sum of the contact forces."""
     if robot is not None and robot.fixed_base and not log.contact_names:
         return  # what it is bolted to carries it
-    still = find_rest(log)
+    still = _find_rest(log)
     step = median_step(log)
     rests = still.sum() * step >= _REST
     if not rests and log.time[-1] - log.time[0] < _LONG:
@@ -118,7 +118,7 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
     """Findings about the IMU's specific force, at rest; its direction also on average over a long log."""
     if log.imu_specific_force is None:
         return
-    still = find_rest(log)
+    still = _find_rest(log)
     rests = still.sum() >= 10
     if not rests:
         yield Skipped(_IMU, f"the robot never rests for {_REST:g} s")
@@ -190,7 +190,7 @@ WINDOW = 0.5
 MOVED = 0.01
 
 
-def find_rest(log: Log) -> BoolArray:
+def _find_rest(log: Log) -> BoolArray:
     """Which samples (N,) are inside a window in which neither base nor joints move."""
     still = np.zeros(len(log), bool)
     if len(log) < 3:

@@ -136,7 +136,7 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
         with reader_errors_explained("file", kind):
             container: Container
             if suffix == ".npz":
-                container = Npz(stack.enter_context(open_archive(path)))
+                container = _Npz(stack.enter_context(_open_archive(path)))
             else:
                 h5py = import_h5py(path)
                 container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
@@ -181,7 +181,7 @@ _PIECE = 2**22  # bytes that are unpacked at a time
 _ENTRY, _DIRECTORY = b"PK\x01\x02", 2**20  # how entries begin; bytes at the end of a file, that hold those of a log
 
 
-def open_archive(path: Path) -> zipfile.ZipFile:
+def _open_archive(path: Path) -> zipfile.ZipFile:
     """Open a zip archive; ValueError if it has far too many entries, which `zipfile` takes seconds to list."""
     with path.open("rb") as stream:
         stream.seek(max(0, path.stat().st_size - _DIRECTORY))
@@ -189,7 +189,7 @@ def open_archive(path: Path) -> zipfile.ZipFile:
     return zipfile.ZipFile(path)
 
 
-class Npz:
+class _Npz:
     """The arrays of a zip archive."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:

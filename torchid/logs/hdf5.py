@@ -17,7 +17,7 @@ from torchid.errors import LogError
 from torchid.guards import CHUNK_BYTES, MAX_CHUNKS, MAX_SMALL, check_fields, check_names
 from torchid.logs.spill import LazyArray
 
-DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
+_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
 _SUM = 4  # bytes that a checksum adds
 _PIECE = 2**22  # bytes that are unpacked at a time
 _ACCEPTED = "gzip or lzf, shuffle and fletcher32, each once (h5repack rewrites others)"
@@ -39,7 +39,7 @@ class Hdf5:
         """The array `name`; text is an array of UTF-8 bytes."""
         item = self._plain(name)
         if item.chunks:
-            MeasuredDataset(item).measure(slice(None))
+            _MeasuredDataset(item).measure(slice(None))
         text = self._h5py.check_string_dtype(item.dtype)
         if text is not None:
             check_names(item.shape, text.length or 0)
@@ -53,12 +53,12 @@ class Hdf5:
     def lazy(self, name: str, folder: Path) -> LazyArray:
         """The array `name`, read where it is sliced."""
         item = self._plain(name)
-        chunk = chunk_bytes(item, self._file_size)
+        chunk = _chunk_bytes(item, self._file_size)
         if chunk > MAX_SMALL:
             raise ValueError(f"chunks of {chunk} bytes, more than the {MAX_SMALL} that are read at a time")
         if item.dtype.hasobject or not item.shape:
             return np.asarray(self.load(name))
-        return MeasuredDataset(item) if item.chunks else item
+        return _MeasuredDataset(item) if item.chunks else item
 
     def _plain(self, name: str) -> Any:
         """The dataset `name`; TypeError where it has no values in this file."""
@@ -80,7 +80,7 @@ class Hdf5:
         item = self._dataset(name)
         if item is None or item.shape is None:
             return 0
-        return max(int(item.dtype.itemsize) * math.prod(item.shape), chunk_bytes(item, self._file_size))
+        return max(int(item.dtype.itemsize) * math.prod(item.shape), _chunk_bytes(item, self._file_size))
 
     def _dataset(self, name: str) -> Any:
         """The dataset `name` of the file itself, None where there is none."""
@@ -123,7 +123,7 @@ def _check_room(path: Path, size: int) -> None:
 # ---------------------------------------------------------------------------- chunks, measured before they are unpacked
 
 
-def chunk_bytes(item: Any, file_size: int) -> int:
+def _chunk_bytes(item: Any, file_size: int) -> int:
     """Bytes of one chunk of a dataset as it is in memory, 0 if it has none.
 
     Raises:
@@ -138,7 +138,7 @@ def chunk_bytes(item: Any, file_size: int) -> int:
     return math.prod(item.chunks) * int(item.dtype.itemsize)
 
 
-class MeasuredDataset:
+class _MeasuredDataset:
     """A dataset of compressed chunks, each of which is measured before it is read for the first time."""
 
     def __init__(self, item: Any) -> None:
@@ -146,8 +146,8 @@ class MeasuredDataset:
         self._item, self._size = item, math.prod(item.chunks) * _stored_size(item)
         plist = item.id.get_create_plist()
         self._filters = [int(plist.get_filter(k)[0]) for k in range(plist.get_nfilters())]
-        pressed = [x for x in self._filters if x in (DEFLATE, LZF)]
-        known = set(self._filters) <= {DEFLATE, SHUFFLE, FLETCHER32, LZF}
+        pressed = [x for x in self._filters if x in (_DEFLATE, _LZF)]
+        known = set(self._filters) <= {_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF}
         if not known or len(pressed) > 1 or len(set(self._filters)) < len(self._filters):
             raise ValueError(f"chunks filtered by {self._filters}; these are read: {_ACCEPTED}")
         self._measured: set[int] = set()
@@ -192,10 +192,10 @@ class MeasuredDataset:
             kind = self._filters[place]
             if mask >> place & 1:
                 continue
-            if kind == FLETCHER32:
+            if kind == _FLETCHER32:
                 found, held = found - _SUM, held[:-_SUM]
-            elif kind in (DEFLATE, LZF):
-                found = (_inflated if kind == DEFLATE else _lzf)(held, self._size + _SUM)
+            elif kind in (_DEFLATE, _LZF):
+                found = (_inflated if kind == _DEFLATE else _lzf)(held, self._size + _SUM)
         if found != self._size:
             raise ValueError(f"a chunk that holds {found} bytes, where {self._size} are declared")
 

@@ -32,9 +32,9 @@ DERIVATIVE_CHAINS = (
     ("imu_specific_force",),
     ("imu_angular_velocity", "imu_angular_acceleration"),
 )
-ANGULAR = DERIVATIVE_CHAINS[2]
+_ANGULAR = DERIVATIVE_CHAINS[2]
 #: A filtered quaternion whose norm falls below this turns faster than the filter lets pass.
-MIN_QUATERNION_NORM = 0.5
+_MIN_QUATERNION_NORM = 0.5
 
 
 def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float | None = None) -> Log:
@@ -75,7 +75,7 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
         timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
     if timeline is None:
         return log
-    coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
+    coverage = {name: _measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
         warn_of_gaps(log, name, found)
     return move_to_timeline(log, timeline, coverage)
@@ -120,7 +120,7 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
         fields |= _orientation(log, make_sign_continuous(log.base_quat_xyzw), timeline)
     for name in NAN_ALLOWED:
         if getattr(log, name) is not None:
-            fields[name] = resample_measured(log, name, timeline, coverage.get(name))
+            fields[name] = _resample_measured(log, name, timeline, coverage.get(name))
     if log.contact_active is not None:
         fields["contact_active"] = timeline.widen_flags(log.contact_active)
         if timeline.low_pass is not None or timeline.output is not None:
@@ -135,7 +135,7 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
 
 def lacks_derivatives(log: Log) -> bool:
     """Whether any velocity or acceleration that can be derived is missing."""
-    if log.base_quat_xyzw is not None and any(getattr(log, name) is None for name in ANGULAR):
+    if log.base_quat_xyzw is not None and any(getattr(log, name) is None for name in _ANGULAR):
         return True
     for chain in DERIVATIVE_CHAINS:
         given = [getattr(log, name) is not None for name in chain]
@@ -170,7 +170,7 @@ def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, Fl
         orders = [0, 1, 2] if log.base_angular_acceleration_base is None else [0, 1]
     q, *rates = timeline.evaluate(smoothed, orders)
     norm = np.linalg.norm(q, axis=1, keepdims=True)
-    if timeline.low_pass is not None and np.min(norm) < MIN_QUATERNION_NORM:
+    if timeline.low_pass is not None and np.min(norm) < _MIN_QUATERNION_NORM:
         found = f"a cutoff that removes the base's rotation (norm of the filtered quaternion {np.min(norm):.2g})"
         raise InputError(log.source, "preprocessing.cutoff_hz", found, "a cutoff above the rate of that rotation")
     out = {"base_quat_xyzw": q / norm}
@@ -184,7 +184,7 @@ def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, Fl
 # -------------------------------------------------------------------------------------------- fields that may have gaps
 
 #: Channels that are filtered together: as many as make the copies of a long log small against it.
-CHANNELS_TOGETHER = 4
+_CHANNELS_TOGETHER = 4
 
 
 @dataclass
@@ -249,7 +249,7 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
         warn(message)
 
 
-def measure_coverage(log: Log, name: str) -> Coverage:
+def _measure_coverage(log: Log, name: str) -> Coverage:
     """Coverage of the field `name` of a log."""
     values: FloatArray = getattr(log, name)
     found = Coverage.empty(values.shape[1:])
@@ -257,7 +257,7 @@ def measure_coverage(log: Log, name: str) -> Coverage:
     return found
 
 
-def resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
+def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
     """The field `name` (N, ...) at the output's stamps (K, ...), filtered like all others.
 
     A channel that is NaN throughout stays so. A wrench of an inactive contact is 0, whatever was recorded. A channel
@@ -276,8 +276,8 @@ def resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverag
     flags = log.contact_active if name in WRENCHES else None
     complete = np.argwhere(coverage.complete)
     out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
-    for start in range(0, len(complete), CHANNELS_TOGETHER):
-        columns = (slice(None), *complete[start : start + CHANNELS_TOGETHER].T)
+    for start in range(0, len(complete), _CHANNELS_TOGETHER):
+        columns = (slice(None), *complete[start : start + _CHANNELS_TOGETHER].T)
         clean = values[columns]
         if flags is not None:
             clean[~flags[:, columns[1]]] = 0.0

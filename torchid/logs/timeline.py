@@ -24,7 +24,7 @@ SPLINE_BLOCK = 4096
 SPLINE_OVERLAP = 128
 
 
-def spline_degree(samples: int) -> int:
+def _spline_degree(samples: int) -> int:
     """The spline's degree: 5, or 3 or 1 where fewer than 6 or 4 samples leave no choice."""
     return 5 if samples >= 6 else 3 if samples >= 4 else 1
 
@@ -43,7 +43,7 @@ def spline_derivatives(
     """
     flat = values.reshape(len(time), -1)
     out = [np.zeros((len(at), flat.shape[1])) for _ in orders]
-    degree = spline_degree(len(time))
+    degree = _spline_degree(len(time))
     for start in range(0, len(time) if flat.size else 0, block):
         stop = start + block
         first = int(np.searchsorted(at, time[start])) if start else 0

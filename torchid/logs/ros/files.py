@@ -113,7 +113,7 @@ class McapFile:
             raise ValueError("no MCAP file")
         for record in _records(self._stream, True, messages, budget):
             if isinstance(record, Chunk):
-                data = decompress_chunk(record.data, record.compression, budget)
+                data = _decompress_chunk(record.data, record.compression, budget)
                 if record.uncompressed_crc and zlib.crc32(data) != record.uncompressed_crc:
                     raise ValueError("a chunk that does not match its checksum")
                 yield from _records(BytesIO(data), False, messages, budget)
@@ -176,7 +176,7 @@ class _Reader(rosbag1.Reader):
         compression = rosbag1.reader.Header.read(stream).get_string("compression")
         stream.seek(end)
         return chunk._replace(
-            decompressor=functools.partial(decompress_chunk, compression=compression, budget=self.budget)
+            decompressor=functools.partial(_decompress_chunk, compression=compression, budget=self.budget)
         )
 
     def read_index_data(self, pos: int, indexes: Any) -> None:
@@ -269,7 +269,7 @@ class SqliteFile:
             yield Record(names[topic], received, data, i / total)
 
 
-def decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
+def _decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
     """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
 
     Raises:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class CommonClock:
+class _CommonClock:
     """The stamps (N,) [ns] of a log: those of one topic within the time that all topics cover."""
 
     stamps: Stamps
@@ -102,9 +102,9 @@ class CommonClock:
         return out
 
 
-def make_common_clock(
+def _make_common_clock(
     rate: TopicSeries, others: Mapping[str, TopicSeries], events: Mapping[str, TopicSeries]
-) -> CommonClock:
+) -> _CommonClock:
     """The stamps of the topic `rate` within the time that all topics cover.
 
     Args:
@@ -126,7 +126,7 @@ def make_common_clock(
             f"{late.topic} starts at {late.stamps[0] / 1e9:.3f} s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
         )
         raise FieldError("time", f"no stamp of {rate.topic} that all topics cover: {found}", "one common clock")
-    return CommonClock(stamps)
+    return _CommonClock(stamps)
 
 
 #: What bags of any kind are read with.
@@ -184,7 +184,7 @@ def read_bag(
         check_topics(path, topics)
     channels: dict[str, Channel] = {}
     for file in files:
-        with open_bag_file(file) as opened:
+        with _open_bag_file(file) as opened:
             for channel in opened.channels():
                 first = channels.setdefault(channel.topic, channel)
                 if first != channel:
@@ -201,7 +201,7 @@ def read_bag(
         warn(f"{current_file()}: {', '.join(unstamped)}: {what}")
     sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
     events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
-    clock = make_common_clock(sampled[topics.rate_topic], sampled, events)
+    clock = _make_common_clock(sampled[topics.rate_topic], sampled, events)
     return {
         "time": clock.time,
         **_motion(bag, clock, series),
@@ -211,7 +211,7 @@ def read_bag(
 
 
 @contextmanager
-def open_bag_file(path: Path) -> Iterator[BagFile]:
+def _open_bag_file(path: Path) -> Iterator[BagFile]:
     """Open a .bag, .mcap or .db3 file.
 
     Raises:
@@ -255,7 +255,7 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
         users.setdefault(rows.topic, []).append(rows)
     make = {topic: make_deserializer(topic, bag.channels[topic]) for topic in users}
     for i, file in enumerate(files):
-        with open_bag_file(file) as opened:
+        with _open_bag_file(file) as opened:
             for n, record in enumerate(opened.records(users.keys())):
                 message = make[record.topic](record.data)
                 for rows in users[record.topic]:
@@ -264,7 +264,7 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
                     progress((i + record.share) / len(files))
 
 
-def _motion(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
+def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Joints, base and IMU."""
     out: dict[str, NDArray[Any]] = {}
     for role in ("joint_states", "odometry", "imu"):
@@ -284,7 +284,7 @@ def _motion(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) ->
     return out
 
 
-def _contacts(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
+def _contacts(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Contacts in the order of `Topics.contacts`; NaN for the wrench of one without a topic."""
     names = bag.topics.contacts
     if not names:
@@ -300,7 +300,7 @@ def _contacts(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) 
     return out
 
 
-def _active(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
+def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
     """Whether a contact touches, (N,), by its last flag or its last force."""
     if name in bag.topics.contact_active:
         said = series.get(f"contact_active.{name}")
@@ -317,12 +317,12 @@ def _active(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], na
 
 
 def _wrench(
-    bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
+    bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
 ) -> FloatArray:
     return clock.align(series[role])["wrench"] if nothing is None or role in series else nothing
 
 
-def _ft_sensors(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
+def _ft_sensors(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     names = tuple(bag.topics.ft_wrenches)
     if not names:
         return {}
