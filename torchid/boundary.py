@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from torchid.errors import BaseLostError, InputError, TorchidWarning, activity_of
-from torchid.staging import forget_written, list_written, termination_as_interrupt
+from torchid.staging import list_written, reset_written, termination_as_interrupt
 from torchid.text import EscapedStream, one_line
 
 #: What the machine refuses, and not the user's files nor the program: no room, no memory, no permission.
@@ -25,9 +25,9 @@ _HOW = "--debug shows where"
 def run_guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
     """Run a command so that whatever stops it is reported in one line.
 
-    What is written meanwhile, by whomever, has control characters as escapes. Libraries' warnings of numbers become a
-    line of ours, for they may touch results; their other warnings, and what they log, tell users nothing that they
-    could mend, often in texts out of files, and are shown with `debug` only.
+    Control characters in all output are escaped. Numerical warnings of libraries become a line of ours, for they may
+    affect results; their other warnings and log messages, often with text out of files, are no help to users and are
+    shown with `debug` only.
 
     Args:
         program: its name.
@@ -35,33 +35,33 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
         debug: whether to show tracebacks and all warnings.
 
     Returns:
-        The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else, silently where nobody
-        reads what is written any more.
+        The exit status: the command's own or 0 on success, 2 on bad input, 1 on anything else, silently if the
+        output pipe was closed.
     """
     with plain_streams(), warnings.catch_warnings(), _libraries_silent(debug):
         warnings.simplefilter("always", TorchidWarning)
         warnings.showwarning = _Warnings(program, debug)
         try:
-            forget_written()
+            reset_written()
             with termination_as_interrupt():
                 status = command() or 0
             sys.stdout.flush()
             return status
-        except BrokenPipeError:  # `torchid ... | head`: who has read enough wants no line about it
+        except BrokenPipeError:  # `torchid ... | head` is no error
             _forget(sys.stdout)
             return 1
         except KeyboardInterrupt as interrupt:
             _say(program, str(interrupt) or f"interrupted; {list_written()} was written")
             return 1
-        except Exception as error:  # a full disk, or a bug: still one line, unless --debug is given
+        except Exception as error:  # a full disk, or a bug: no traceback unless `debug`
             if debug:
                 traceback.print_exc()
-            status, line = describe_error(error)
+            status, line = _describe_failure(error)
             _say(program, line)
             return status
 
 
-def describe_error(error: Exception) -> tuple[int, str]:
+def _describe_failure(error: Exception) -> tuple[int, str]:
     """Exit status and the one line that says what stopped a command."""
     if isinstance(error, (InputError, BaseLostError)):
         return 2, str(error)

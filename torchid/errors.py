@@ -61,17 +61,17 @@ class SensorError(InputError):
 
 
 class ImplausibleFitError(InputError):
-    """A fit that no robot can have left: something about the data, not about the robot, is wrong."""
+    """A fit that is impossible for any robot: the data, not the robot, are wrong."""
 
 
 class UnknownNameError(InputError, KeyError):
-    """A name that nothing answers to; the message lists the nearest valid names."""
+    """An unknown name; the message lists the nearest valid names."""
 
     def __init__(self, source: object, field: str, name: str, valid: Iterable[str], what: str = "") -> None:
-        """Take the name and those that are valid; `what` the name stands for elsewhere, if it is not unknown."""
+        """Take the name and the valid ones; `what` describes a name that is known, but not valid here."""
         self.name, self.valid, self.what = name, tuple(valid), what
         found = f"'{name}', {what}" if what else f"unknown name '{name}'"
-        super().__init__(source, field, found, nearest_names(name, self.valid))
+        super().__init__(source, field, found, _nearest_names(name, self.valid))
 
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self.source, self.field, self.name, self.valid, self.what)
@@ -80,7 +80,7 @@ class UnknownNameError(InputError, KeyError):
 
 
 class BaseLostError(TorchidError):
-    """The floating base cannot be seen through the projection: rank(S_b V_x) < 6 in some contact state."""
+    """The base is lost in the projection: rank(S_b V_x) < 6 in some contact state."""
 
 
 class TorchidWarning(UserWarning):
@@ -96,11 +96,11 @@ class UnphysicalInertiaWarning(TorchidWarning):
 
 
 class BaseLostWarning(TorchidWarning):
-    """As BaseLostError, for those who asked to go on."""
+    """As BaseLostError, where the fit goes on (`sensors.on_base_lost: warn`)."""
 
 
 class ConfoundedWarning(TorchidWarning):
-    """Parameters that the data cannot tell from a sensor's offset or scale."""
+    """Parameters that are confounded with a sensor's offset or scale."""
 
 
 class NumericalWarning(TorchidWarning):
@@ -165,7 +165,7 @@ def activity_of(error: BaseException) -> str:
     return str(getattr(error, "_torchid_doing", ""))
 
 
-def nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:
+def _nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:
     """The names in `valid` closest to `name`, or the first few of them, as one readable string."""
     valid = list(valid)
     close = difflib.get_close_matches(name, valid, n=limit, cutoff=0.5)

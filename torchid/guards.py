@@ -1,7 +1,7 @@
-"""What a file may cost: every limit on files of strangers, with its reason, and the checks that several readers share.
+"""Limits on the time and memory that reading a file may take, each with its reason, and checks that readers share.
 
-The bar: no file below 10 MB takes more than 10 s or 1 GB to be read or refused. Limits lie far beyond what robots and
-their logs were seen to need, so that nobody who means well meets them.
+Files may come from anywhere. No file below 10 MB takes more than 10 s or 1 GB to be read or refused. The limits lie far
+beyond what robots and their logs need.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ MEBIBYTE = 2**20
 
 # ------------------------------------------------------------------------------------------------------- all kinds
 
-#: Characters of a name. The longest joint that was seen has 60.
+#: Characters of a name. The longest known name of a joint has 60.
 MAX_LETTERS = 200
 
 # ----------------------------------------------------------------------------------------------------------- logs
 
 #: Bytes that the arrays of a file of any size may come to, and how many times its own size those of a larger one may:
-#: measured motion shrinks to half, values of 12 bits to a fifth, and only constants to less than a tenth. `check` goes
-#: through 12 MB a second in five times their memory. Whoever has more than `LARGE` bytes may have more constants.
+#: measured motion shrinks to half, values of 12 bits to a fifth, and only constants to less than a tenth. `check` reads
+#: 12 MB a second and needs five times their memory. Files of more than `LARGE` bytes may hold more constants.
 MAX_SMALL, MAX_GROWTH = 64 * MEBIBYTE, 12
 LARGE, MAX_GROWTH_LARGE = 10_000_000, 100
 #: Bytes that the arrays of a file of any size may declare where they are read whole: 16 GiB are 2e7 samples of a
@@ -70,7 +70,7 @@ MAX_STATE = 10_000
 MAX_URDF, MAX_LINKS = 8 * MEBIBYTE, 300
 #: kg, m or any other unit: products of several stay far from what float64 can hold.
 MAX_NUMBER = 1e9
-#: Bytes of a mesh file, the largest that was seen has 29 MB; and of the shapes in a COLLADA file, each counted as often
+#: Bytes of a mesh file, the largest known one has 29 MB; and of the shapes in a COLLADA file, each counted as often
 #: as it is used.
 MAX_MESH, MAX_UNFOLDED = 32 * MEBIBYTE, 64 * MEBIBYTE
 #: Parts of a text mesh, for each of which trimesh takes a millisecond, and bytes of a line, for it splits long ones
@@ -145,14 +145,14 @@ def check_names(shape: Sequence[int], longest: int = 0) -> None:
 
 
 def require_plain_name(text: str) -> str:
-    """A name, ValueError where no name is like that and no message can show it."""
+    """The name itself; ValueError if it is longer than any name, or holds characters that no message can show."""
     if len(text) > MAX_LETTERS or not is_plain(text):
         raise ValueError(f"a name of {len(text)} characters: {excerpt(text)}")
     return text
 
 
 class Budget:
-    """What a log file that is unpacked piece by piece may still come to."""
+    """How many bytes, records and messages may still come out of a log file that is unpacked chunk by chunk."""
 
     def __init__(self, size: int) -> None:
         """For a file of `size` bytes."""
@@ -160,23 +160,23 @@ class Budget:
         self._records = FREE_RECORDS + size // RECORD_BYTES
         self._messages = FREE_MESSAGES + size // MESSAGE_BYTES
 
-    def most(self) -> int:
+    def next_chunk_bytes(self) -> int:
         """Bytes that the next piece may have."""
         return min(self._bytes, MAX_RECORD)
 
-    def expand(self, count: int) -> None:
+    def spend_bytes(self, count: int) -> None:
         """Take a piece of `count` bytes; ValueError where the file comes to more than it may."""
         self._bytes -= count
         if self._bytes < 0:
             raise ValueError("chunks that expand to more bytes than a file of this size may hold")
 
-    def record(self) -> None:
+    def spend_record(self) -> None:
         """Take a record; ValueError where there are more than a file of this size may have."""
         self._records -= 1
         if self._records < 0:
             raise ValueError("more records than a file of this size may have")
 
-    def message(self) -> None:
+    def spend_message(self) -> None:
         """Take a message of a topic in use; ValueError where there are more than a file of this size may have."""
         self._messages -= 1
         if self._messages < 0:

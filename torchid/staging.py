@@ -1,4 +1,4 @@
-"""Results that appear whole or not at all: folders made in hiding, files replaced at once, interruptions held back."""
+"""Atomic writing of results: hidden staging folders, files replaced at once, interrupts deferred meanwhile."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _written: list[str] = []
 
 @contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Let Ctrl-C act when the block is done: what stands in it is short, and must happen as a whole.
+    """Defer Ctrl-C until the block is done, which is short and must happen as a whole.
 
     Raises:
         KeyboardInterrupt: after a block that Ctrl-C fell into, unless it is ignored.
@@ -66,18 +66,18 @@ def _as_interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
 
-def forget_written() -> None:
-    """A command begins: it has written nothing yet."""
+def reset_written() -> None:
+    """Start the list of results that a command has written."""
     _written.clear()
 
 
 def note_written(result: object) -> None:
-    """A command has written a file or folder that stays."""
+    """Add a file or folder that stays to the list of what the command has written."""
     _written.append(str(result))
 
 
 def list_written() -> str:
-    """What a command has written, in words."""
+    """The results that the command has written so far, as text."""
     return ", ".join(_written) or "nothing"
 
 
@@ -123,7 +123,7 @@ def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be written.
     """
-    clear_leftovers(path)
+    _clear_leftovers(path)
     with staging_folder(path) as folder:
         yield folder / NEW
         with interrupts_deferred():
@@ -133,7 +133,7 @@ def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
 
 
 def leftovers(target: Path) -> Iterator[Path]:
-    """Staging folders beside `target` whose process is gone, each removed when the next is asked for, but for `old`."""
+    """Staging folders beside `target` whose process is gone, each removed before the next, but for `old`."""
     prefix = f".{target.name}-"
     with suppress(OSError):
         for path in sorted(target.parent.iterdir()):
@@ -141,7 +141,7 @@ def leftovers(target: Path) -> Iterator[Path]:
                 yield from _taken_over(path)
 
 
-def clear_leftovers(target: Path) -> None:
+def _clear_leftovers(target: Path) -> None:
     """Remove what killed processes left of results that were to become `target`."""
     for _ in leftovers(target):
         pass
@@ -169,13 +169,13 @@ def _made(target: Path) -> tuple[Path, int]:
             return folder, -1
         with suppress(FileNotFoundError):
             lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            if lock_file(lock, folder / _LOCK) is not False:
+            if try_lock(lock, folder / _LOCK) is not False:
                 return folder, lock
             os.close(lock)
     raise FileNotFoundError(f"{target.parent}: another process removes every folder that is made there")
 
 
-def lock_file(handle: int, path: Path) -> bool | None:
+def try_lock(handle: int, path: Path) -> bool | None:
     """Whether a descriptor of a file now locks what is at its path; None where the file system knows no locks."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -197,7 +197,7 @@ def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
             return
         if _LOCK in names:
             lock = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            if not lock_file(lock, folder / _LOCK):
+            if not try_lock(lock, folder / _LOCK):
                 return
         yield folder
         if not keep:

@@ -1,4 +1,4 @@
-"""Text in messages: lists and counts, and what of a text that someone else wrote may stand in one."""
+"""Text of messages: lists, counts, and excerpts of foreign text without control characters."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-#: Control characters, line breaks, halves of characters, and what is not seen but changes what is: directions, joints.
+#: Unicode categories of control characters, line breaks, surrogates and invisible formatting characters.
 _UNPLAIN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 def is_plain(text: str) -> bool:
-    """Whether a text has neither control characters, seen or not, nor line breaks."""
+    """Whether a text has neither control characters, visible or not, nor line breaks."""
     return text.isprintable() or not any(unicodedata.category(letter) in _UNPLAIN for letter in text)
 
 
 def excerpt(text: str, longest: int = 100) -> str:
-    """The text as a message may repeat it: control characters as escapes, the middle of a long one left out."""
+    """The text for use in a message: control characters escaped, the middle of a long text left out."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 4 :]} ({len(text)} characters)"
     return escape(text)
 
 
 def escape(text: str, kept: str = "") -> str:
-    """The text with what is not plain as escapes, but for some characters that are kept."""
+    """The text with control characters as escapes, except for the characters in `kept`."""
     if is_plain(text):
         return text
     return "".join(letter if letter in kept or is_plain(letter) else ascii(letter)[1:-1] for letter in text)
@@ -35,10 +35,10 @@ def one_line(text: str) -> str:
 
 
 class EscapedStream:
-    """A stream for people, to which nothing is written that moves the cursor or hides: only lines of plain text."""
+    """A stream to a terminal that escapes control characters, which could move the cursor or hide text."""
 
     def __init__(self, stream: Any) -> None:
-        """Write to a stream, which `raw_stream` gives back to who takes care of itself."""
+        """Write to a stream, which `raw_stream` returns to code that escapes by itself."""
         self.plain_stream = stream
 
     def write(self, text: str) -> int:
@@ -65,6 +65,6 @@ def join_names(names: Sequence[str], most: int = 4) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def count_of(count: int, what: str) -> str:
-    """A number of things, as in "1 gap" and "3 gaps"."""
+def format_count(count: int, what: str) -> str:
+    """A number with its noun, as in "1 gap" and "3 gaps"."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"

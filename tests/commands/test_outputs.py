@@ -230,8 +230,7 @@ def test_a_folder_that_may_not_be_changed_is_refused_before_any_work(tmp_path: P
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-import torchid.commands.folder as folder, torchid.staging as staging
-from torchid.commands.manifest import Contents
+import torchid.commands.folder as folder
 stop, output, calls = int(sys.argv[1]), Path(sys.argv[2]), 0
 def counted(function):
     def call(*args, **kwargs):

@@ -42,11 +42,11 @@ def test_a_file_may_come_to_more_the_larger_it_is() -> None:
 
 def test_a_budget_is_spent_once() -> None:
     budget = Budget(100)
-    budget.expand(MAX_SMALL)
-    assert budget.most() == 0
+    budget.spend_bytes(MAX_SMALL)
+    assert budget.next_chunk_bytes() == 0
     with pytest.raises(ValueError, match="more bytes"):
-        budget.expand(1)
+        budget.spend_bytes(1)
     for _ in range(FREE_MESSAGES + 2):
-        budget.message()
+        budget.spend_message()
     with pytest.raises(ValueError, match="more messages"):
-        budget.message()
+        budget.spend_message()

@@ -238,12 +238,12 @@ def test_a_folder_is_claimed_by_one_process_until_that_ends(tmp_path: Path) -> N
     """Even if it is killed; what it leaves has a hidden name and hinders nobody."""
 
     def child(call: str) -> subprocess.Popen[str]:
-        code = f"from pathlib import Path; from torchid.commands.folder import claimed\n{call}"
+        code = f"from pathlib import Path; from torchid.commands.folder import claim_folder\n{call}"
         return subprocess.Popen(
             [sys.executable, "-c", code, str(tmp_path / "x" / "run")], stdin=-1, stdout=-1, stderr=-1, text=True
         )
 
-    hold = "with claimed(Path(__import__('sys').argv[1])): print('mine', flush=True); input()"
+    hold = "with claim_folder(Path(__import__('sys').argv[1])): print('mine', flush=True); input()"
     with child(hold) as first:
         assert first.stdout is not None
         assert first.stdout.readline() == "mine\n"

@@ -41,9 +41,9 @@ def test_a_filtered_contact_is_active_where_it_truly_is_within_the_filters_reach
     timeline = lay_out_timeline(time, CUTOFF, rate, differentiates=True)
     assert timeline.reach == pytest.approx(1.0 / CUTOFF)
     flags = stepping(time)
-    found = timeline.active(flags)
-    np.testing.assert_array_equal(found, any_within(timeline.reach, timeline.native, flags, timeline.at))
-    assert found.shape == (len(timeline.at), 3)
+    found = timeline.widen_flags(flags)
+    np.testing.assert_array_equal(found, any_within(timeline.reach, timeline.native, flags, timeline.output_stamps))
+    assert found.shape == (len(timeline.output_stamps), 3)
     assert not found[:, 2].any()
     assert not found[:, 1].all()
 
@@ -54,16 +54,18 @@ def test_without_a_filter_a_resampled_flag_is_that_of_the_sample_before(time: Fl
     timeline = lay_out_timeline(time, None, rate, differentiates=True)
     assert timeline.reach == 0.0
     flags = stepping(time)
-    np.testing.assert_array_equal(timeline.active(flags), any_within(0.0, timeline.native, flags, timeline.at))
-    before = np.searchsorted(timeline.native, timeline.at + 1e-9, side="right") - 1
-    np.testing.assert_array_equal(timeline.active(flags), flags[before])
+    np.testing.assert_array_equal(
+        timeline.widen_flags(flags), any_within(0.0, timeline.native, flags, timeline.output_stamps)
+    )
+    before = np.searchsorted(timeline.native, timeline.output_stamps + 1e-9, side="right") - 1
+    np.testing.assert_array_equal(timeline.widen_flags(flags), flags[before])
 
 
 @pytest.mark.parametrize("time", [uniform(2.0), jittered(2.0)], ids=["uniform", "jittered"])
 def test_without_a_filter_or_resampling_flags_are_the_logs_own(time: FloatArray) -> None:
     timeline = lay_out_timeline(time, None, None, differentiates=True)
     flags = stepping(time)
-    np.testing.assert_array_equal(timeline.active(flags), flags[timeline.kept])
+    np.testing.assert_array_equal(timeline.widen_flags(flags), flags[timeline.kept])
 
 
 def test_a_shorter_reach_belongs_to_a_higher_cutoff() -> None:
@@ -72,7 +74,7 @@ def test_a_shorter_reach_belongs_to_a_higher_cutoff() -> None:
     flags[500] = True  # 1 s
     for cutoff in (5.0, 10.0, 50.0):
         timeline = lay_out_timeline(time, cutoff, None, differentiates=False)
-        active = timeline.at[timeline.active(flags)[:, 0]]
+        active = timeline.output_stamps[timeline.widen_flags(flags)[:, 0]]
         assert active.min() == pytest.approx(1.0 - 1.0 / cutoff, abs=0.0021)
         assert active.max() == pytest.approx(1.0 + 1.0 / cutoff, abs=0.0021)
 

@@ -49,7 +49,7 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
     again = [name for name in names if names.count(name) > 1]
     if again:
         raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
-    output = folder / RUN.within / names[0]
+    output = folder / RUN.inner_folder / names[0]
     refuse_link(output.parent)
     check_free(output, True, EVALUATION, logs)
     config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])

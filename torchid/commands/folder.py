@@ -1,4 +1,4 @@
-"""A folder of results that one run at a time claims, that appears complete or not at all, and replaces nothing else."""
+"""Folders of results: claimed by one run at a time, created whole or not at all, replacing only what torchid wrote."""
 
 from __future__ import annotations
 
@@ -11,43 +11,8 @@ from pathlib import Path
 
 from torchid.commands.manifest import MANIFEST, FolderContents, FolderKind, inspect_folder, make_manifest, read_manifest
 from torchid.errors import ConfigError
-from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, lock_file, note_written, staging_folder
+from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, note_written, staging_folder, try_lock
 from torchid.text import excerpt, join_names
-
-
-@contextmanager
-def claim_folder(folder: Path) -> Iterator[None]:
-    """Keep other processes that claim it from a folder that need not be there yet, until the block or this one ends.
-
-    Raises:
-        ConfigError: another process is at work there.
-    """
-    if not CAN_LOCK:
-        yield
-        return
-    lock, handle = folder.with_name(f".{folder.name}.lock"), -1
-    with parent_folders(folder):
-        try:
-            with interrupts_deferred():
-                handle = _locked(lock, folder)
-            yield
-        finally:
-            with interrupts_deferred():
-                if handle >= 0:
-                    lock.unlink(missing_ok=True)
-                    os.close(handle)
-
-
-def _locked(lock: Path, folder: Path) -> int:
-    """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
-    for _ in range(_TRIES):
-        with creation_errors_explained(folder):
-            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        if lock_file(handle, lock) is not False:  # None, no locks there: one run at a time is then the user's affair
-            return handle
-        os.close(handle)  # another has it, or has just removed it
-    raise ConfigError(folder, "output", "another run is at work there", "another output, or patience")
-
 
 EVENTS = "events.out.tfevents*"
 EVALUATION = FolderKind("an evaluation")
@@ -144,7 +109,7 @@ def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
 
 
 def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> FolderContents:
-    """What is in a folder that torchid wrote, and nobody else.
+    """Contents of a folder in which torchid wrote every file.
 
     Args:
         folder: to be replaced or removed.
@@ -218,8 +183,8 @@ def new_folder(
         ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
     """
     check_free(output, overwrite, kind)
-    with parent_folders(output), ExitStack() as stack:
-        with creation_errors_explained(output):
+    with _parent_folders(output), ExitStack() as stack:
+        with _creation_errors_explained(output):
             folder = stack.enter_context(staging_folder(output))
             (folder / NEW).mkdir()
         yield folder / NEW
@@ -231,11 +196,11 @@ def new_folder(
 
 
 @contextmanager
-def parent_folders(output: Path) -> Iterator[None]:
+def _parent_folders(output: Path) -> Iterator[None]:
     """The folders above `output`, which go with the block if they came with it and it leaves nothing in them."""
     made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
     try:
-        with interrupts_deferred(), creation_errors_explained(output):
+        with interrupts_deferred(), _creation_errors_explained(output):
             output.parent.mkdir(parents=True, exist_ok=True)
         yield
     finally:
@@ -245,8 +210,8 @@ def parent_folders(output: Path) -> Iterator[None]:
 
 
 @contextmanager
-def creation_errors_explained(output: Path) -> Iterator[None]:
-    """Say in one line that something cannot be made beside `output`."""
+def _creation_errors_explained(output: Path) -> Iterator[None]:
+    """Turn an OSError into a ConfigError: nothing can be created beside `output`."""
     try:
         yield
     except OSError as error:
@@ -267,7 +232,7 @@ def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
         except OSError as error:
             raise ConfigError(output, "output", f"cannot be replaced ({error.strerror})", "a new folder") from error
         try:
-            found = require_replaceable(folder / OLD, kind, output)  # where nobody puts anything any more
+            found = require_replaceable(folder / OLD, kind, output)  # moved aside, it cannot change any more
             done = _renamed(folder / NEW, output)
         except BaseException:
             with suppress(OSError):
@@ -288,3 +253,37 @@ def _renamed(folder: Path, name: Path) -> bool:
             return False
         raise
     return True
+
+
+@contextmanager
+def claim_folder(folder: Path) -> Iterator[None]:
+    """Keep other processes that claim it from a folder that need not be there yet, until the block or this one ends.
+
+    Raises:
+        ConfigError: another process is at work there.
+    """
+    if not CAN_LOCK:
+        yield
+        return
+    lock, handle = folder.with_name(f".{folder.name}.lock"), -1
+    with _parent_folders(folder):
+        try:
+            with interrupts_deferred():
+                handle = _locked(lock, folder)
+            yield
+        finally:
+            with interrupts_deferred():
+                if handle >= 0:
+                    lock.unlink(missing_ok=True)
+                    os.close(handle)
+
+
+def _locked(lock: Path, folder: Path) -> int:
+    """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
+    for _ in range(_TRIES):
+        with _creation_errors_explained(folder):
+            handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        if try_lock(handle, lock) is not False:  # None, no locks there: one run at a time is then the user's affair
+            return handle
+        os.close(handle)  # another has it, or has just removed it
+    raise ConfigError(folder, "output", "another run is at work there", "another output, or patience")

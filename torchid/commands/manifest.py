@@ -1,4 +1,4 @@
-"""What torchid wrote into a folder: a list with checksums, so that replacing it removes these files and no others."""
+"""Manifests of folders: names and checksums of the files that torchid wrote, so that replacing removes no others."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class FolderKind:
 
     Attributes:
         name: with its article, as in "a run".
-        within: name of a folder in it that holds folders of another kind, with manifests of their own.
-        of: their kind.
+        inner_folder: name of a folder in it that holds folders of another kind, with manifests of their own.
+        inner_kind: their kind.
         result: whether it is what a command answers with, not a state on the way there.
     """
 
     name: str
-    within: str = ""
-    of: FolderKind | None = None
+    inner_folder: str = ""
+    inner_kind: FolderKind | None = None
     result: bool = True
 
 
@@ -48,7 +48,7 @@ class Manifest:
         kind: name of the kind of folder.
         folder: its name.
         files: size [bytes] and SHA-256 of each file, by its path in the folder, with slashes.
-        growing: patterns of names of files that were still being written, which no checksum can tell.
+        growing: patterns of names of files that were still being written, which have no checksum.
     """
 
     kind: str
@@ -188,8 +188,8 @@ def _look_into(top: Path, place: str, manifest: Manifest, kind: FolderKind, foun
     path, above = top / place, place.rpartition("/")[0]
     if is_leftover(path):
         found.leftovers.append(path)
-    elif kind.of is not None and above == kind.within:
-        inside = inspect_folder(path, kind.of, path.name)
+    elif kind.inner_kind is not None and above == kind.inner_folder:
+        inside = inspect_folder(path, kind.inner_kind, path.name)
         if inside is None:
             found.foreign.append(excerpt(f"{place}/"))
             return
@@ -198,7 +198,7 @@ def _look_into(top: Path, place: str, manifest: Manifest, kind: FolderKind, foun
         found.leftovers += inside.leftovers
         found.foreign += [f"{place}/{name}" for name in inside.foreign]
         found.changed += [f"{place}/{name}" for name in inside.changed]
-    elif place in manifest.folders or place == kind.within:
+    elif place in manifest.folders or place == kind.inner_folder:
         _look(top, place, manifest, kind, found)
         found.folders.append(path)
     else:

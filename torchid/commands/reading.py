@@ -28,9 +28,9 @@ from torchid.logs.preprocess import (
     find_unloaded,
     gapless_fields,
     lacks_derivatives,
+    make_timeline,
     move_to_timeline,
     preprocess,
-    timeline_of,
     unloaded_readings,
     warn_of_gaps,
 )
@@ -77,9 +77,9 @@ class LargeLog:
         with about_file(self.path), open_log_blocks(self.path, self.folder) as blocks:
             first, settings = blocks.read(slice(0, min(len(blocks), 2))), self.settings
             derived = lacks_derivatives(first)
-            timeline = timeline_of(blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
+            timeline = make_timeline(blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
             coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
-            time = blocks.time if timeline is None else blocks.time[0] + timeline.at
+            time = blocks.time if timeline is None else blocks.time[0] + timeline.output_stamps
             contacts = self._contacts(blocks, first)
             kept = None if contacts is None else self._away_from_changes(contacts, time)
             in_the_air = None if contacts is None else _in_the_air(contacts)
@@ -101,7 +101,7 @@ class LargeLog:
 
     def _coverage(self, blocks: LogBlocks, first: Log, timeline: Timeline) -> dict[str, Coverage]:
         """Which channels were measured throughout, which takes a pass over the log."""
-        found = {name: Coverage.of(getattr(first, name).shape[1:]) for name in gapless_fields(first, timeline)}
+        found = {name: Coverage.empty(getattr(first, name).shape[1:]) for name in gapless_fields(first, timeline)}
         for piece in self._pieces(blocks, len(blocks)) if found else ():
             log = blocks.read(piece, only=(*found, "contact_active"))
             for name, coverage in found.items():

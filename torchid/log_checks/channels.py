@@ -1,4 +1,4 @@
-"""A log as groups of channels that one sensor, or one sort of sensor, gives."""
+"""Channels of a log, grouped by the sensor or the kind of sensor that measures them, with names and units."""
 
 from __future__ import annotations
 

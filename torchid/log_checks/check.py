@@ -101,38 +101,38 @@ def check(
     found += (gaps := list(check_missing_values(log)))
     if (lost := _lost(gaps)) is not None:
         return _concluded(log, log, [*found, _unchecked(lost)])
-    mended = repair_log(log, _findings(found))
-    found += check_repeats(channel_groups(mended))
-    mended = repair_log(log, _findings(found))
-    found += check_jumps(mended, channel_groups(mended))
-    mended = repair_log(log, _findings(found))
-    if units := list(check_angle_unit(mended, robot)):  # what a step of a position is worth is told in radians
+    repaired = repair_log(log, _findings(found))
+    found += check_repeats(channel_groups(repaired))
+    repaired = repair_log(log, _findings(found))
+    found += check_jumps(repaired, channel_groups(repaired))
+    repaired = repair_log(log, _findings(found))
+    if units := list(check_angle_unit(repaired, robot)):  # sizes of steps are meant in radians
         found = [one for one in found if not (isinstance(one, Finding) and one.name == "step" and one.whole)]
-    found += [*units, *check_contact_flags(mended)]
-    mended = repair_log(log, _findings(found))
+    found += [*units, *check_contact_flags(repaired)]
+    repaired = repair_log(log, _findings(found))
     if (lost := _lost(found)) is None or lost.field != "time":
         found += [
-            *check_derivatives(mended),
-            *check_angular_velocity(mended, robot),
-            *check_accelerometer(mended, robot),
+            *check_derivatives(repaired),
+            *check_angular_velocity(repaired, robot),
+            *check_accelerometer(repaired, robot),
         ]
     if _lost(found) is None:
-        found += check_standing_feet(mended, robot, contacts)
+        found += check_standing_feet(repaired, robot, contacts)
     lost = _lost(found)
     if lost is None:
-        found += check_forces_against_urdf(subtract_contact_offsets(mended), robot, contacts, cutoff_hz)
-        found += check_limb_sensors(mended, robot, contacts, cutoff_hz)
+        found += check_forces_against_urdf(subtract_contact_offsets(repaired), robot, contacts, cutoff_hz)
+        found += check_limb_sensors(repaired, robot, contacts, cutoff_hz)
         lost = _lost(found)
     if lost is None or lost.name == "sign":
-        found += check_weight(subtract_contact_offsets(mended), robot)
+        found += check_weight(subtract_contact_offsets(repaired), robot)
     else:
         found.append(_unchecked(lost))
-    return _concluded(log, mended, found)
+    return _concluded(log, repaired, found)
 
 
-def _concluded(log: Log, mended: Log, found: Sequence[Finding | Skipped]) -> Checked:
+def _concluded(log: Log, repaired: Log, found: Sequence[Finding | Skipped]) -> Checked:
     findings = sorted(_merged(_findings(found)), key=lambda finding: SEVERITIES.index(finding.severity))
-    return Checked(log, mended, tuple(findings), tuple(skip for skip in found if isinstance(skip, Skipped)))
+    return Checked(log, repaired, tuple(findings), tuple(skip for skip in found if isinstance(skip, Skipped)))
 
 
 def _unchecked(lost: Finding) -> Skipped:
@@ -160,7 +160,7 @@ def _merged(found: Iterable[Finding]) -> Iterator[Finding]:
 
 
 def _lost(found: Iterable[Finding | Skipped]) -> Finding | None:
-    """A finding that condemns the whole log, after which nothing can be told from what relies on the field."""
+    """A finding that condemns the whole log: checks that rely on its field would be meaningless."""
     return next((one for one in _findings(found) if one.condemns_all), None)
 
 
@@ -176,8 +176,8 @@ def condemned_samples(findings: Iterable[Finding], samples: int) -> BoolArray:
 def repair_log(log: Log, findings: Iterable[Finding]) -> Log:
     """The log with condemned values interpolated, and with jumps taken out that are no motion.
 
-    Only the channels that a finding names are touched: the samples are to be left out, but a filter sees them. A flag
-    that misses a contact is set. Findings that concern the whole log leave nothing to go by and change nothing.
+    Only the channels that a finding names are changed: the samples stay out of the fit, but not out of the filter. A
+    flag that misses a contact is set. Findings that concern the whole log leave nothing to go by and change nothing.
     """
     local = [finding for finding in findings if finding.severity == CONDEMNED and not finding.whole]
     changed: dict[str, Any] = {}

@@ -14,7 +14,7 @@ from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Sk
 from torchid.log_checks.mistakes import Mistake, possible_mistakes
 from torchid.log_checks.model import COMPARED, bind_some_samples, default_cutoff_hz, link_poses, preprocess_pieces
 from torchid.log_checks.statistics import NORMAL
-from torchid.log_checks.weight import GRAVITY, WRONG
+from torchid.log_checks.weight import GRAVITY, WRONG_MASS
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
@@ -22,7 +22,9 @@ from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
-from torchid.text import count_of
+from torchid.text import format_count
+
+# ------------------------------------------------------------------------------------------------- flags against forces
 
 #: Share of the weight that an inactive contact must not carry. Thresholds of flags are 20 to 50 N, for 60 kg 3 to 8 %.
 LOADED = 0.1
@@ -119,7 +121,7 @@ def _contradictions(log: Log, contact: _Contact, size: FloatArray, weight: float
     """Forces without a contact, and contacts without a force."""
     loaded = ~contact.active & (size > LOADED * weight)
     if loaded.any():
-        samples = count_of(int(loaded.sum()), "sample")
+        samples = format_count(int(loaded.sum()), "sample")
         text = f"{contact.name}: inactive with up to {size[loaded].max():.3g} N, in {samples}"
         advice = "set the flag where there is a force: what an inactive contact exerts is not counted"
         spans = tuple(find_spans(loaded, contact.name))
@@ -128,7 +130,7 @@ def _contradictions(log: Log, contact: _Contact, size: FloatArray, weight: float
     light = contact.active & (size < UNLOADED * weight)
     spans = tuple(span for span in find_spans(light, contact.name) if len(span) > patience)
     if spans:
-        samples = count_of(sum(len(span) for span in spans), "sample")
+        samples = format_count(sum(len(span) for span in spans), "sample")
         never = " though the flag never changes" if contact.active.all() else ""
         text = f"{contact.name}: active without a force (below {UNLOADED * weight:.2g} N) in {samples}{never}"
         advice = "costs data, not truth; clear the flag where the foot is in the air"
@@ -162,6 +164,8 @@ def _delay(log: Log, contact: _Contact, size: FloatArray, weight: float) -> Iter
     yield Finding("delay", SUSPICIOUS, "contact_active", text, advice, (contact.name,), spans)
 
 
+# ------------------------------------------------------------------------------------------------------ feet that stand
+
 #: Motion of standing feet, in that of the base above them, from which on mistakes are tried; soft soles and feet that
 #: roll leave 0.05 to 0.2.
 MOVES = 0.3
@@ -169,7 +173,7 @@ MOVES = 0.3
 BETTER = 1.0 / 3.0
 #: Time [s] at either end of a stance that heel and toe take, and the shortest stance that is left to be judged.
 _ENDS, _SHORTEST = 0.05, 0.15
-#: Samples looked at, and how much the base must move above its feet [rad, and 0.3 m] for anything to be told.
+#: Samples used, and how much the base must move above its feet [rad, and 0.3 m] for the check to be meaningful.
 _SAMPLES, _STILL = 1500, 0.01
 _LENGTH = 0.3
 _FIELDS = ("joint_names", "joint_position", "base_quat_xyzw", "contact_names", "contact_active")
@@ -199,7 +203,7 @@ def check_standing_feet(log: Log, robot: Robot | None, contacts: Sequence[Contac
 
 
 def _after(mistake: Mistake, log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
-    return measure_foot_slip(mistake.mended(log), robot, contacts)
+    return measure_foot_slip(mistake.corrected(log), robot, contacts)
 
 
 def _thinned(log: Log) -> Log:
@@ -209,7 +213,7 @@ def _thinned(log: Log) -> Log:
 
 
 def measure_foot_slip(log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
-    """How much standing feet move in the world, in how much they move in the base; None where nothing can be told.
+    """Motion of standing feet in the world as a share of that in the base; None where the base hardly moves.
 
     Feet that are flat must not turn, feet that stand together keep what lies between them, and where the base's
     position is known, each stays where it is.
@@ -254,9 +258,11 @@ def _motion(
     return out
 
 
+# ---------------------------------------------------------------------------------------------- limb sensors in the air
+
 #: Samples in the air that it takes.
 _FEW_IN_AIR = 20
-#: Correlation from which on the weight beyond a sensor is told from its offset: the limb must turn against gravity.
+#: Correlation above which the weight beyond a sensor is not confounded with its offset: the limb must turn in gravity.
 _CLEAR = 0.9
 _LIMB_SENSORS = "limb sensors in the air"
 
@@ -271,7 +277,7 @@ def check_limb_sensors(
         parts = bind_some_samples(
             preprocess_pieces(log, cutoff_hz or default_cutoff_hz(log)), robot, contacts, 4 * COMPARED
         )
-    except InputError:  # said by `check_forces_against_urdf`
+    except InputError:  # reported by `check_forces_against_urdf`
         return
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names)))
     series = [force_series(builder, part, robot.nominal.flatten()[None]) for part in parts]
@@ -313,13 +319,13 @@ def _judged(name: str, read: FloatArray, carried: FloatArray, robot: Robot) -> I
         advice = "reverse it: the wrench that the parent side exerts on the child side"
         yield Finding("sign", CONDEMNED, "ft_wrench", told, advice, (name,))
         return
-    if abs(share - 1.0) > WRONG:
+    if abs(share - 1.0) > WRONG_MASS:
         advice = "look at the sensor's unit and gain, and at what is mounted beyond it"
         yield Finding("weight", SUSPICIOUS, "ft_wrench", told, advice, (name,))
     left = read - share * carried
     offset = np.median(left, axis=0)
     size, spread = float(np.linalg.norm(offset)), NORMAL * float(np.median(np.linalg.norm(left - offset, axis=1)))
-    known = UNLOADED * GRAVITY * float(robot.nominal[:, 0].sum()) + (0.0 if clear else WRONG * weight)
+    known = UNLOADED * GRAVITY * float(robot.nominal[:, 0].sum()) + (0.0 if clear else WRONG_MASS * weight)
     if size > max(known, spread):
         text = f"{name}: reads a steady {size:.3g} N in the air beside the {weight:.3g} N that hang on it by the URDF"
         mixed = "" if clear else "; a load of that weight would look the same"

@@ -1,4 +1,4 @@
-"""What a check says: a finding with the samples it concerns, or why the check could not be made."""
+"""Results of checks: a finding with the samples it concerns, or the reason why a check was skipped."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchid.logs.log import BoolArray
 
 #: These samples must not be fitted.
 CONDEMNED = "condemned"
-#: Somebody should look at it; a fit may still be right.
+#: To be inspected; a fit may still be right.
 SUSPICIOUS = "suspicious"
 #: True of the log and worth knowing.
 NOTE = "note"
@@ -48,10 +48,10 @@ class Finding:
         severity: one of `SEVERITIES`.
         field: of the log.
         channels: names within the field; empty for all of it.
-        spans: the samples; empty for the whole log, unless the finding is to be seen at some places.
+        spans: the samples; empty for the whole log, unless it shows at some samples only.
         found: what was found, with numbers.
         advice: what to do.
-        everywhere: whether it concerns every sample though `spans` say where it is to be seen.
+        everywhere: whether it concerns every sample though it only shows at `spans`.
     """
 
     name: str

@@ -27,92 +27,6 @@ from torchid.robot import Robot
 from torchid.sensing import Contact
 from torchid.text import join_names
 
-#: Factor of time from which on no error of inertias is to blame: its square is 2.25. Blocks must agree on `SAME` of it.
-STRETCHED = 1.5
-#: How much more of the forces recorded time leaves unexplained than the mended one.
-WORSE = 1.5
-#: Units of time, by what turns them to seconds.
-SCALE_UNITS = {60.0: "minutes", 1e-3: "ms", 1e3: "ks", 3600.0: "hours"}
-_SCALE_UNIT_WITHIN = 0.1
-#: Factor of a torque against those of the other joints, and shift of a point [m], from which on they are worth a word:
-#: what gears and calibrations are off by is less.
-GAIN, POINT = 1.15, 0.03
-#: How many standard deviations, errors of the URDF among them, they must be off.
-CERTAIN = 4.0
-#: Share of it that every block of time must find.
-SAME = 0.5
-#: Factors with a standard deviation below this are what others are compared with, if there are so many.
-_KNOWN, _ENOUGH = 0.1, 3
-
-
-def fit_time_scale_of_log(log: Log, robot: Robot, contacts: Sequence[Contact]) -> TimeScale | None:
-    """What time is worth by the forces; None where nothing moves, or the log is too short."""
-    cutoff = motion_cutoff_hz(log)
-    try:
-        return None if cutoff is None else fit_time_scale(log, robot, contacts, cutoff)
-    except InputError:
-        return None
-
-
-def time_scale_finding(found: TimeScale | None) -> Finding | None:
-    """That time is in another unit, if gravity and inertia only make up the forces in that unit.
-
-    Noise in positions makes accelerations that no force answers to, which looks like time that is too short: so inertia
-    must matter at the mended time.
-    """
-    if found is None:
-        return None
-    factor, log_factor = found.factor, np.log(found.factor)
-    agree = np.log(found.blocks) * np.sign(log_factor) > SAME * abs(log_factor)
-    other = min(found.recorded, found.still)
-    if abs(log_factor) < np.log(STRETCHED) or not agree.all() or other < WORSE * found.mended:
-        return None
-    unit = next((name for size, name in SCALE_UNITS.items() if abs(factor / size - 1.0) < _SCALE_UNIT_WITHIN), None)
-    text = f"in {unit}: " if unit else ""
-    text += f"gravity and inertia make up the measured forces if time is multiplied by {factor:.3g}"
-    advice = "give seconds; look at the sample rate that the stamps were made from"
-    return Finding("unit", CONDEMNED, "time", text, advice)
-
-
-def gain_and_point_findings(
-    log: Log, samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]
-) -> Iterator[Finding]:
-    """Findings about torques of another size and wrenches about another point."""
-    found = fit_torque_gains(samples, robot, contacts)
-    if found is None:
-        return
-    yield from _gain_findings(found, robot)
-    m = len(found.joints)
-    off = _sure(found.point, found.spread[m:], found.blocks[:, m:]) & (np.abs(found.point) > POINT)
-    if off.any():
-        field = log.contact_wrench_field
-        where = ", ".join(f"{1e3 * x:.0f}" for x in found.point)
-        text = f"forces and moments fit the URDF about a point that lies {where} mm from the contact frames' origins"
-        advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
-        yield Finding("point", SUSPICIOUS, field, text, advice)
-
-
-def _gain_findings(found: TorqueGains, robot: Robot) -> Iterator[Finding]:
-    m = len(found.joints)
-    spread = found.spread[:m]
-    known = spread < _KNOWN
-    usual = float(np.median(found.gain[known])) if known.sum() >= _ENOUGH else 1.0
-    relative, blocks = found.gain / usual, found.blocks[:, :m] / usual
-    large = (relative > GAIN) | (relative < 1.0 / GAIN)
-    off = large & _sure(relative - 1.0, spread / usual, blocks - 1.0)
-    if off.any():
-        names = [robot.joint_names[joint] for joint in found.joints[off]]
-        factors = join_names([f"{gain:.3g} +- {sd:.2g}" for gain, sd in zip(relative[off], spread[off], strict=True)])
-        text = f"{join_names(names)}: factors that fit the URDF best, against the other joints: {factors}"
-        advice = "look at gear ratios, torque constants and units; at friction and inertias of the URDF there"
-        yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(names))
-
-
-def _sure(value: FloatArray, spread: FloatArray, blocks: FloatArray) -> BoolArray:
-    """Which values (k,) are not 0, by their standard deviations (k,) and by blocks (BLOCKS, k)."""
-    return np.asarray((np.abs(value) > CERTAIN * spread) & (blocks * np.sign(value) > SAME * np.abs(value)).all(axis=0))
-
-
 #: Misfit above which usual mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
 WRONG = 0.4
 #: What no URDF near the given one explains, in `UNMODELLED` of the forces, below which there is nothing to complain of:
@@ -138,7 +52,7 @@ def check_forces_against_urdf(
     try:
         logs = preprocess_pieces(log, cutoff)
     except InputError as error:  # too short, or too fast: by its stamps
-        yield time_scale_finding(fit_time_scale_of_log(log, robot, contacts)) or Skipped(
+        yield _time_scale_finding(_fit_time_scale_of_log(log, robot, contacts)) or Skipped(
             _NAME, f"{error.field}: {error.found}"
         )
         return
@@ -152,8 +66,8 @@ def check_forces_against_urdf(
         return
     fit = fit_nominal_model(samples, robot, contacts)
     wrong = _explained(log, robot, contacts, cutoff, fit) if fit.misfit > WRONG else None
-    timed = fit_time_scale_of_log(log, robot, contacts) if wrong is None else None
-    wrong = wrong or time_scale_finding(timed)
+    timed = _fit_time_scale_of_log(log, robot, contacts) if wrong is None else None
+    wrong = wrong or _time_scale_finding(timed)
     if wrong is None and fit.misfit > WRONG and (timed is None or timed.recorded > NEAR):
         text = f"{_apart(fit)}, and no usual mistake explains it"
         advice = "look at units, frames, the order of joints and contacts, friction, the URDF's base link and masses"
@@ -164,7 +78,7 @@ def check_forces_against_urdf(
     signs = [] if fit.torque is None else list(_signs(log, robot, fit.torque))
     yield from signs
     if not any(isinstance(one, Finding) for one in signs):
-        yield from gain_and_point_findings(log, samples, robot, contacts)
+        yield from _gain_and_point_findings(log, samples, robot, contacts)
 
 
 def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit) -> Finding | None:
@@ -175,9 +89,9 @@ def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: floa
             continue
         try:
             samples = bind_some_samples(
-                preprocess_pieces(mistake.mended(log), cutoff, DIFFERENTIATED_TO_TRY), robot, contacts, TRIED
+                preprocess_pieces(mistake.corrected(log), cutoff, DIFFERENTIATED_TO_TRY), robot, contacts, TRIED
             )
-        except InputError:  # a mended log may be too fast for the filter: then that was not the mistake
+        except InputError:  # a corrected log may be too fast for the filter: then that was not the mistake
             continue
         found = fit_nominal_model(samples, robot, contacts)
         if found.known == fit.known and found.misfit < least:  # a mistake must not win by forces that it makes unknown
@@ -232,3 +146,91 @@ def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
     if not fit.clear.all():
         open_ = join_names([str(name) for name in names[~fit.clear]])
         yield Skipped("sign of torques", f"too little in this motion but friction and noise: {open_}")
+
+
+# ------------------------------------------------------ scales of time and of single torques, and the point of wrenches
+
+#: Factor of time from which on no error of inertias is to blame: its square is 2.25. Blocks must agree on `SAME` of it.
+STRETCHED = 1.5
+#: How much more of the forces stays unexplained with the recorded time than with the corrected one.
+WORSE = 1.5
+#: Units of time, by what turns them to seconds.
+SCALE_UNITS = {60.0: "minutes", 1e-3: "ms", 1e3: "ks", 3600.0: "hours"}
+_SCALE_UNIT_WITHIN = 0.1
+#: Factor of a torque against those of the other joints, and shift of a point [m], from which on they are worth a word:
+#: what gears and calibrations are off by is less.
+GAIN, POINT = 1.15, 0.03
+#: How many standard deviations, errors of the URDF among them, they must be off.
+CERTAIN = 4.0
+#: Share of it that every block of time must find.
+SAME = 0.5
+#: Factors with a standard deviation below this are what others are compared with, if there are so many.
+_KNOWN, _ENOUGH = 0.1, 3
+
+
+def _fit_time_scale_of_log(log: Log, robot: Robot, contacts: Sequence[Contact]) -> TimeScale | None:
+    """What time is worth by the forces; None where nothing moves, or the log is too short."""
+    cutoff = motion_cutoff_hz(log)
+    try:
+        return None if cutoff is None else fit_time_scale(log, robot, contacts, cutoff)
+    except InputError:
+        return None
+
+
+def _time_scale_finding(found: TimeScale | None) -> Finding | None:
+    """That time is in another unit, if gravity and inertia only make up the forces in that unit.
+
+    Noise in positions makes accelerations that no force answers to, which looks like time that is too short: so inertia
+    must matter at the corrected time.
+    """
+    if found is None:
+        return None
+    factor, log_factor = found.factor, np.log(found.factor)
+    agree = np.log(found.blocks) * np.sign(log_factor) > SAME * abs(log_factor)
+    other = min(found.recorded, found.still)
+    if abs(log_factor) < np.log(STRETCHED) or not agree.all() or other < WORSE * found.corrected:
+        return None
+    unit = next((name for size, name in SCALE_UNITS.items() if abs(factor / size - 1.0) < _SCALE_UNIT_WITHIN), None)
+    text = f"in {unit}: " if unit else ""
+    text += f"gravity and inertia make up the measured forces if time is multiplied by {factor:.3g}"
+    advice = "give seconds; look at the sample rate that the stamps were made from"
+    return Finding("unit", CONDEMNED, "time", text, advice)
+
+
+def _gain_and_point_findings(
+    log: Log, samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]
+) -> Iterator[Finding]:
+    """Findings about torques of another size and wrenches about another point."""
+    found = fit_torque_gains(samples, robot, contacts)
+    if found is None:
+        return
+    yield from _gain_findings(found, robot)
+    m = len(found.joints)
+    off = _sure(found.point, found.spread[m:], found.blocks[:, m:]) & (np.abs(found.point) > POINT)
+    if off.any():
+        field = log.contact_wrench_field
+        where = ", ".join(f"{1e3 * x:.0f}" for x in found.point)
+        text = f"forces and moments fit the URDF about a point that lies {where} mm from the contact frames' origins"
+        advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
+        yield Finding("point", SUSPICIOUS, field, text, advice)
+
+
+def _gain_findings(found: TorqueGains, robot: Robot) -> Iterator[Finding]:
+    m = len(found.joints)
+    spread = found.spread[:m]
+    known = spread < _KNOWN
+    usual = float(np.median(found.gain[known])) if known.sum() >= _ENOUGH else 1.0
+    relative, blocks = found.gain / usual, found.blocks[:, :m] / usual
+    large = (relative > GAIN) | (relative < 1.0 / GAIN)
+    off = large & _sure(relative - 1.0, spread / usual, blocks - 1.0)
+    if off.any():
+        names = [robot.joint_names[joint] for joint in found.joints[off]]
+        factors = join_names([f"{gain:.3g} +- {sd:.2g}" for gain, sd in zip(relative[off], spread[off], strict=True)])
+        text = f"{join_names(names)}: factors that fit the URDF best, against the other joints: {factors}"
+        advice = "look at gear ratios, torque constants and units; at friction and inertias of the URDF there"
+        yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(names))
+
+
+def _sure(value: FloatArray, spread: FloatArray, blocks: FloatArray) -> BoolArray:
+    """Which values (k,) are not 0, by their standard deviations (k,) and by blocks (BLOCKS, k)."""
+    return np.asarray((np.abs(value) > CERTAIN * spread) & (blocks * np.sign(value) > SAME * np.abs(value)).all(axis=0))

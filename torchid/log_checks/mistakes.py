@@ -1,4 +1,4 @@
-"""The usual mistakes in a log, each as the log that it would be without."""
+"""Usual mistakes in logs, each with the function that corrects it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from torchid.log_checks.motion import TWO_TURNS
 from torchid.log_checks.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
-from torchid.logs.quaternion import compose, inverse, make_sign_continuous
+from torchid.logs.quaternion import inverse_rotation, make_sign_continuous
 from torchid.text import join_names
 
-#: Parts of names that tell the sides, and the ends, of a robot apart.
+#: Parts of names that distinguish the sides, and the ends, of a robot.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")
 _ENDS = ("front rear", "front hind", "front back", "fore hind", "Front Rear", "FL RL", "FR RR", "LF LH", "RF RH")
 _PARTS = re.compile(r"([A-Za-z0-9]+)")
@@ -40,7 +40,7 @@ def exchanged_names(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]
             yield what, other
 
 
-def exchanged_neighbours(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+def _exchanged_neighbours(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Names with two that follow each other in a short chain exchanged."""
     for i in range(len(names) - 1 if len(names) <= _SHORT else 0):
         yield f"{names[i]} and {names[i + 1]}", (*names[:i], names[i + 1], names[i], *names[i + 2 :])
@@ -65,7 +65,7 @@ def _by_first_letter(names: Sequence[str]) -> tuple[str, ...] | None:
     return found if found != tuple(names) else None
 
 
-#: What follows from positions and orientation, whoever gives it.
+#: Fields that follow from positions and orientation.
 _JOINT_RATES = ("joint_velocity", "joint_acceleration")
 _BASE_RATES = ("base_angular_velocity_base", "base_angular_acceleration_base")
 #: What is given along the world's axes, and what half a turn about x makes of such a vector.
@@ -76,17 +76,19 @@ _WORLD = (
     "contact_wrench_world",
 )
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
+#: Its product with a quaternion xyzw is (w, -z, y, -x): the components in reverse order, with these signs.
+_HALF_TURN_QUAT = np.array([1.0, -1.0, 1.0, -1.0])
 _MOMENTS_IN_MILLI = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3])
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """A usual mistake: the field, what is wrong with it, what to do, and what takes it back."""
+    """A usual mistake: the field, what is wrong with it, what to do, and the function that corrects a log."""
 
     field: str
     found: str
     advice: str
-    mended: Callable[[Log], Log]
+    corrected: Callable[[Log], Log]
 
 
 def possible_mistakes(log: Log) -> Iterator[Mistake]:
@@ -104,11 +106,11 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
     yield from _of_orders(log)
     if log.base_quat_xyzw is not None:
         down, up = "in a world whose z axis points down", "turn positions, orientations and vectors so that z points up"
-        yield Mistake("base_quat_xyzw", down, up, flip_world)
+        yield Mistake("base_quat_xyzw", down, up, _flip_world)
         order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, -1, axis=1)))
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, 1, axis=1)))
-        yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _quaternions(inverse))
+        yield Mistake("base_quat_xyzw", "rotates world to base", "give the inverse", _quaternions(inverse_rotation))
     if log.imu_specific_force is not None:
         reading = "reversed: gravity minus acceleration"
         yield Mistake(
@@ -126,7 +128,7 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
 
 def _of_orders(log: Log) -> Iterator[Mistake]:
     """Names of joints and contacts exchanged, flags that belong to other contacts."""
-    for what, other in (*exchanged_names(log.joint_names), *exchanged_neighbours(log.joint_names)):
+    for what, other in (*exchanged_names(log.joint_names), *_exchanged_neighbours(log.joint_names)):
         text, advice = f"{what} exchanged", "give joint_names in the order of the columns"
         yield Mistake("joint_names", text, advice, _renamed("joint_names", other))
     for what, other in exchanged_names(log.contact_names):
@@ -146,12 +148,11 @@ def _reordered(fields: Sequence[str], order: list[int]) -> Callable[[Log], Log]:
     return _change(lambda log: {field: getattr(log, field)[:, order] for field in fields})
 
 
-def flip_world(log: Log) -> Log:
+def _flip_world(log: Log) -> Log:
     """The log in a world half a turn about x from the one that it has."""
-    half = np.array([1.0, 0.0, 0.0, 0.0])
     fields: dict[str, Any] = {}
     if log.base_quat_xyzw is not None:
-        fields["base_quat_xyzw"] = compose(half, log.base_quat_xyzw)
+        fields["base_quat_xyzw"] = log.base_quat_xyzw[:, ::-1] * _HALF_TURN_QUAT
     for name in _WORLD:
         if (given := getattr(log, name)) is not None:
             fields[name] = given * (_HALF_TURN if given.shape[-1] == 3 else np.tile(_HALF_TURN, 2))

@@ -1,4 +1,4 @@
-"""What a robot's URDF says of the forces that a log holds, on some of its samples."""
+"""Measured forces compared with those of the URDF's parameters, on some samples of a log."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from torchid.sensing import Contact, SensorSet, named_sensors
 
 #: Samples that are differentiated: all of a short log, `PIECES` evenly spread runs of a long one.
 DIFFERENTIATED, PIECES = 40000, 4
-#: Of these, evenly spread ones are compared; fewer to see which of many mistakes explains what does not fit.
+#: Of these, evenly spread ones are compared; fewer to find which of many mistakes explains a misfit.
 COMPARED, TRIED = 800, 150
 #: Of a long log, as many samples are differentiated to try a mistake.
 DIFFERENTIATED_TO_TRY = 10000
-#: Cutoff [Hz] where nobody asked for one: robots move below 5 Hz. At most this share of the sample rate.
+#: Default cutoff [Hz]: robots move below 5 Hz. At most this share of the sample rate.
 CUTOFF, _OF_RATE = 10.0, 0.2
 #: How much larger a torque's own part in the projected forces must be than what the model leaves of these, for its sign
 #: to be judged.
@@ -36,11 +36,11 @@ CLEAR = 1.0
 SCALE = 10.0
 #: As `CLEAR` for each joint's own row, where contact wrenches are known or there are none: a correlation of 0.9.
 CLEAR_ROW = 2.0
-#: Misfit of the base force from which on contact wrenches are not trusted to tell the sign of a torque.
+#: Misfit of the base force from which on contact wrenches are not used to determine the sign of a torque.
 _TRUSTED = 0.3
 #: A torque [N m] that no sensor reads.
 NOTHING = 1e-9
-#: Singular values below this share of the largest count as that large: such combinations of torques tell nothing.
+#: Singular values below this share of the largest count as that large: the data do not determine such combinations.
 _DEPENDENT, _TINY = 1e-12, 1e-100
 
 
@@ -51,21 +51,21 @@ class TorqueFit:
     Attributes:
         joints: numbers of the m joints whose torque was measured.
         gain: (m,) factor that each should be multiplied by.
-        clear: (m,) bool, whether the gain can be told.
+        clear: (m,) bool, whether the data determine the gain.
         misfit: size of what the torques as they are miss of the model's, over the size of the model's.
-        misfit_mended: as `misfit`, with torques multiplied by their gain where that is clear and not plausible.
+        misfit_corrected: as `misfit`, with torques multiplied by their gain where that is clear and not plausible.
     """
 
     joints: np.ndarray
     gain: FloatArray
     clear: BoolArray
     misfit: float
-    misfit_mended: float
+    misfit_corrected: float
 
     @property
     def wrong(self) -> BoolArray:
         """Joints (m,) whose torque is clearly reversed or of another size."""
-        return wrong_gains(self.gain, self.clear)
+        return _wrong_gains(self.gain, self.clear)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class ModelFit:
         fit = self.torque
         if fit is None:
             return None
-        return fit.misfit if fit.wrong.sum() >= fit.clear.sum() else fit.misfit_mended
+        return fit.misfit if fit.wrong.sum() >= fit.clear.sum() else fit.misfit_corrected
 
     @property
     def of_wrenches(self) -> float | None:
@@ -104,13 +104,13 @@ class ModelFit:
         return float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
 
 
-def wrong_gains(gain: FloatArray, clear: BoolArray) -> BoolArray:
+def _wrong_gains(gain: FloatArray, clear: BoolArray) -> BoolArray:
     """Which gains (m,) no error of a model can be, among those that are clear."""
     return clear & ((gain < 0.0) | (np.abs(np.log(np.maximum(np.abs(gain), _TINY))) > np.log(SCALE)))
 
 
 def default_cutoff_hz(log: Log) -> float:
-    """A cutoff [Hz] for a log that nobody has named one for."""
+    """The cutoff [Hz] for a log where none is given."""
     return min(CUTOFF, _OF_RATE / median_step(log))
 
 
@@ -124,7 +124,7 @@ def preprocess_pieces(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) ->
     length = min(len(log), most) // count
     starts = np.linspace(0, len(log) - length, count).astype(int)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchidWarning)  # of what findings say better
+        warnings.simplefilter("ignore", TorchidWarning)  # findings report the same
         return [preprocess(log.select(slice(start, start + length)), cutoff_hz) for start in starts]
 
 
@@ -209,9 +209,9 @@ def _projected_fit(
     gain = inverse @ (U.T @ y) / norms
     own = norms / np.sqrt(np.square(inverse).sum(axis=1))  # what of each torque the others cannot make up for
     clear = own * np.abs(gain) > CLEAR * np.linalg.norm(y - A @ gain)
-    mended = np.where(wrong_gains(gain, clear), gain, 1.0)
+    corrected = np.where(_wrong_gains(gain, clear), gain, 1.0)
     size = max(float(np.linalg.norm(y)), _TINY)
-    missed = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), mended))
+    missed = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), corrected))
     return TorqueFit(joints, gain, clear, *missed)
 
 

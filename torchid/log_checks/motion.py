@@ -15,7 +15,7 @@ from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
 from torchid.logs.quaternion import (
     angular_velocity_base,
-    inverse,
+    inverse_rotation,
     make_sign_continuous,
     rotate_to_base,
     rotate_to_world,
@@ -23,6 +23,8 @@ from torchid.logs.quaternion import (
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.text import join_names
+
+# ---------------------------------------------------------------------------------------------- unit of joint positions
 
 #: Two turns [rad]: a joint with stops goes nowhere near.
 TWO_TURNS = 4.0 * np.pi
@@ -55,7 +57,9 @@ def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
             yield Finding("unit", SUSPICIOUS, "joint_position", text, _ADVICE)
 
 
-#: Across which time values are compared [s]: a tenth of a second sees motion up to 5 Hz without loss.
+# -------------------------------------------------------------------- a derivative against what it is the derivative of
+
+#: Time [s] across which differences are compared: a tenth of a second resolves motion up to 5 Hz.
 LAG = 0.1
 #: Shifts tried on either side [samples].
 MAX_DELAY = 20
@@ -92,7 +96,7 @@ def compare_derivative(time: FloatArray, base: FloatArray, derivative: FloatArra
     if len(time) < order * lag + 6 * MAX_DELAY:
         return None
     for _ in range(order):
-        derivative = integrate(time, derivative)
+        derivative = _integrate(time, derivative)
     wanted, given = (_differences(values, lag, order) for values in (base, derivative))
     at = np.arange(MAX_DELAY, len(wanted) - MAX_DELAY, max(1, len(wanted) // _COMPARED))
     excess = (given[at] - wanted[at]).mean(axis=0) / (lag * step) ** order
@@ -115,7 +119,7 @@ def compare_derivative(time: FloatArray, base: FloatArray, derivative: FloatArra
     return Comparison(ratio, follows, delay, excess, min(misfits))
 
 
-def integrate(time: FloatArray, values: FloatArray) -> FloatArray:
+def _integrate(time: FloatArray, values: FloatArray) -> FloatArray:
     """Integral over time from the first sample on, (N, c), by the trapezoidal rule."""
     areas = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(areas, axis=0)])
@@ -136,6 +140,8 @@ def _refined(correlation: FloatArray, best: np.ndarray) -> FloatArray:
         offset = np.where(bend < 0.0, 0.5 * (left - right) / bend, 0.0)
     return np.where(inside == best, best + np.clip(offset, -0.5, 0.5), best)
 
+
+# ----------------------------------------------------------------------------------------- velocities and accelerations
 
 #: A delay [samples] worth a word: half a sample comes from integrators and central differences.
 DELAYED = 1.5
@@ -167,10 +173,10 @@ def check_derivatives(log: Log) -> Iterator[Finding | Skipped]:
                 yield Skipped(_DERIVATIVES, f"{name}: the log is too short")
             else:
                 wrong = list(_frame(log, name, base, high - low, found))
-                yield from wrong or derivative_findings(found, name, base, channel_names(log, name))
+                yield from wrong or _derivative_findings(found, name, base, channel_names(log, name))
 
 
-def derivative_findings(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -> Iterator[Finding]:
+def _derivative_findings(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -> Iterator[Finding]:
     """Findings about one derivative, given with the names of its channels."""
     follows = np.abs(found.correlation) >= FOLLOWS  # so written, NaN does not follow
     lost = ~follows & np.isfinite(found.correlation)
@@ -200,7 +206,7 @@ def derivative_findings(found: Comparison, name: str, base: str, channels: tuple
 
 
 def _frame(log: Log, name: str, base: str, order: int, found: Comparison) -> Iterator[Finding]:
-    """Whether a vector of the base is given in another frame than its name says, or contains gravity."""
+    """Findings about a vector of the base in another frame than its name states, or that contains gravity."""
     if name == "base_linear_acceleration_world" and abs(abs(found.excess[2] / GRAVITY_WORLD[2]) - 1.0) < _CLOSE:
         text = f"{found.excess[2]:+.2f} m/s^2 along z on average beyond the derivative of {base}: it contains gravity"
         advice = "give d/dt of the velocity, or name it imu_specific_force"
@@ -221,6 +227,8 @@ def _finding(
     return Finding(name, severity, field, f"{join_names(list(chosen))}: {text}", advice, chosen)
 
 
+# ------------------------------------------------------------------------------------- angular velocity and orientation
+
 _TURNING = "angular velocity against orientation"
 
 
@@ -237,13 +245,13 @@ def check_angular_velocity(log: Log, robot: Robot | None) -> Iterator[Finding | 
         nowhere = "an IMU, and no robot that says where it is"
         yield Skipped(_TURNING, nowhere if log.imu_frame else "no angular velocity of the base")
     for field, omega in given.items():
-        found = compare_derivative(log.time, integrate(log.time, _omega(log.time, quat)), omega)
+        found = compare_derivative(log.time, _integrate(log.time, _omega(log.time, quat)), omega)
         if found is None:
             yield Skipped(_TURNING, f"{field}: the log is too short")
             continue
         mistaken = _explaining(log.time, quat, omega, found.misfit) if found.misfit > WRONG else None
         if mistaken is None:
-            yield from derivative_findings(found, field, "base_quat", ("x", "y", "z"))
+            yield from _derivative_findings(found, field, "base_quat", ("x", "y", "z"))
         else:
             yield Finding("frame or order", CONDEMNED, mistaken.field or field, mistaken.found, mistaken.advice)
 
@@ -289,7 +297,7 @@ def _mistakes(quat: FloatArray, omega: FloatArray) -> Iterator[_Mistake]:
             yield _Mistake(order, "rename base_quat_wxyz and base_quat_xyzw", "base_quat_xyzw", other, value)
     yield _Mistake("the sign is reversed", "reverse it", "", quat, -omega)
     name = "rotates world to base, not base to world"
-    yield _Mistake(name, "give the inverse", "base_quat_xyzw", inverse(quat), omega)
+    yield _Mistake(name, "give the inverse", "base_quat_xyzw", inverse_rotation(quat), omega)
 
 
 def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: float) -> _Mistake | None:
@@ -299,7 +307,7 @@ def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: f
     """
     best, least = None, BETTER * misfit
     for mistake in _mistakes(quat, omega):
-        found = compare_derivative(time, integrate(time, _omega(time, mistake.quat)), mistake.omega)
+        found = compare_derivative(time, _integrate(time, _omega(time, mistake.quat)), mistake.omega)
         if found is not None and found.misfit < least:
             best, least = mistake, found.misfit
     return best

@@ -1,4 +1,4 @@
-"""Scales that forces tell against the URDF and any near it: of time, of single torques, and the point of wrenches."""
+"""Scales that forces determine for any URDF near the given one: of time, of torques, and the point of wrenches."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
+# ---------------------------------------------------------------------------------- equations of a URDF and any near it
+
 #: What a URDF may be off by, in units of `parameter_scale`: 0.1 is a mass, and an inertia, 15 to 20 % off.
 URDF_ERROR = 0.1
 #: Friction that a URDF lacks, in the joint's rms torque.
 FRICTION = 0.2
 #: What no parameters explain (flexibility, filters, shape of friction), as a share of the rms of each kind of force.
 UNMODELLED = 0.05
-#: Samples after one another that say the same: of 240 out of ten seconds, what friction and flexibility leave of them.
+#: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.
 CORRELATED_SAMPLES = 10.0
 #: Blocks of time that must agree.
 BLOCKS = 6
@@ -35,7 +37,7 @@ _TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class NormalEquations:
+class _NormalEquations:
     """Whitened equations of some samples, by blocks of time.
 
     Attributes:
@@ -58,7 +60,7 @@ class NormalEquations:
         return np.asarray(G - C.T @ np.linalg.solve(H, C))
 
 
-def measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
+def _measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
     """The forces that are known throughout, with what no parameters explain of each kind as their noise."""
     torque = np.zeros(robot.n_dofs, bool)
     wrench = np.zeros((len(contacts), 6), bool)
@@ -81,7 +83,7 @@ def measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
     return SensorSet(torque, wrench, noise)
 
 
-def missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
+def _missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
     """Coulomb [N m] and viscous [N m s/rad] friction that joints without a word in the URDF have, (n, 2)."""
     out = np.full((robot.n, 2), _TINY)
     if all(part.torque is not None for part in samples):
@@ -93,11 +95,11 @@ def missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArr
     return np.maximum(out, _TINY)
 
 
-def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]) -> FloatArray:
+def _prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]) -> FloatArray:
     """Matrix (columns, P) from deviations of size 1 to the builder's columns."""
     scale = URDF_ERROR * parameter_scale(robot.nominal)
     scale[:, parameters.FRICTION] = 0.0
-    friction = missing_friction_scale(samples, robot)
+    friction = _missing_friction_scale(samples, robot)
     for body, found in enumerate(robot.bodies):
         if found.joint is not None and found.joint.name in robot.joint_names:
             scale[body, parameters.FRICTION] = friction[robot.joint_names.index(found.joint.name)]
@@ -108,7 +110,7 @@ def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples])
 
 
 @torch.no_grad()
-def whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
+def _whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are equations."""
     n_rows = builder.tree.n_rows
     rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
@@ -120,7 +122,7 @@ def whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, Fl
     return rows, W, np.asarray(np.abs(W).any(axis=1))
 
 
-def accumulate_blocks(K: FloatArray, terms: FloatArray, equations: BoolArray) -> NormalEquations:
+def _accumulate_blocks(K: FloatArray, terms: FloatArray, equations: BoolArray) -> _NormalEquations:
     """Products by blocks of samples (N, n_rows, P) and (N, n_rows, k)."""
     inside, across, own = [], [], []
     for part in np.array_split(np.arange(len(K)), BLOCKS):
@@ -128,8 +130,10 @@ def accumulate_blocks(K: FloatArray, terms: FloatArray, equations: BoolArray) ->
         inside.append(A.T @ A)
         across.append(A.T @ Y)
         own.append(Y.T @ Y)
-    return NormalEquations(np.array(inside), np.array(across), np.array(own), int(equations.sum()))
+    return _NormalEquations(np.array(inside), np.array(across), np.array(own), int(equations.sum()))
 
+
+# -------------------------------------------------------------------------------------------------------- scale of time
 
 #: Samples compared.
 SAMPLES = 240
@@ -150,18 +154,18 @@ _GAIN, _POINT = 0.5, 0.3
 class TimeScale:
     """What time should be multiplied by, of all samples and of each block, and what stays unexplained.
 
-    `mended`, `recorded`, `still`: rms of what no URDF near the given one explains, in `UNMODELLED` of the forces, with
-    time so multiplied, as it is, and if nothing moved.
+    `corrected`, `recorded`, `still`: rms of what no URDF near the given one explains, in `UNMODELLED` of the forces:
+    with time so multiplied, as it is, and if nothing moved.
     """
 
     factor: float
     blocks: FloatArray
-    mended: float
+    corrected: float
     recorded: float
     still: float
 
 
-def scale_time(log: Log, factor: float) -> Log:
+def _scale_time(log: Log, factor: float) -> Log:
     """The log with its time multiplied by a factor."""
     return replace(log, time=log.time[0] + factor * (log.time - log.time[0]))
 
@@ -182,23 +186,23 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
     """How time would have to be multiplied for gravity and inertia to make up the forces.
 
     Derived velocities and accelerations scale with the inverse of time and its square, gravity does not: three
-    stretches tell the predicted forces at all.
+    scales determine the predicted forces at all others.
 
     Raises:
         InputError: the log cannot be filtered, or does not fit the robot.
     """
 
     def at(factor: float) -> list[Samples]:
-        logs = preprocess_pieces(scale_time(log, factor), cutoff_hz / factor, DIFFERENTIATED_TO_TRY)
+        logs = preprocess_pieces(_scale_time(log, factor), cutoff_hz / factor, DIFFERENTIATED_TO_TRY)
         return bind_some_samples(logs, robot, contacts, SAMPLES)
 
     now, later, still = at(1.0), at(2.0), at(_STILL)
-    builder = RowBuilder(robot, contacts, measured_sensors(now, robot, contacts))
+    builder = RowBuilder(robot, contacts, _measured_sensors(now, robot, contacts))
     parts = []
-    columns = prior_columns(builder, robot, now)
+    columns = _prior_columns(builder, robot, now)
     phi = robot.nominal.flatten()[None]
     for one, two, rest in zip(now, later, still, strict=True):
-        rows, W, equations = whitened_rows(builder, rest)
+        rows, W, equations = _whitened_rows(builder, rest)
         first, second, none = (force_series(builder, part, phi)[1][0] for part in (one, two, rest))
         quadratic = 2.0 * (first - none) - 4.0 * (second - none)
         terms = [none, first - none - quadratic, quadratic]
@@ -207,7 +211,7 @@ def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_h
         loose = _of_joints(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
         K = np.concatenate([rows[..., :-1] @ columns, *loose], axis=2)
         parts.append((K, np.stack(projected, axis=2), equations))
-    found = accumulate_blocks(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    found = _accumulate_blocks(*(np.concatenate(part) for part in zip(*parts, strict=True)))
     return _best(found)
 
 
@@ -222,7 +226,7 @@ def _of_joints(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> lis
     return out
 
 
-def _best(found: NormalEquations) -> TimeScale:
+def _best(found: _NormalEquations) -> TimeScale:
     u = np.stack([np.ones_like(_STRETCHES), -np.ones_like(_STRETCHES), -1 / _STRETCHES, -1 / _STRETCHES**2])
 
     def cost(block: int | None) -> FloatArray:
@@ -233,6 +237,9 @@ def _best(found: NormalEquations) -> TimeScale:
     best, one = int(np.argmin(every)), int(np.argmin(np.abs(np.log(_STRETCHES))))
     left = np.sqrt(np.maximum(every, 0.0) / max(found.rows, 1))
     return TimeScale(float(_STRETCHES[best]), blocks, *(float(left[i]) for i in (best, one, -1)))
+
+
+# -------------------------------------------------------------------------- gains of torques, and the point of wrenches
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,16 +262,16 @@ class TorqueGains:
 
 def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> TorqueGains | None:
     """Factors of single torques and the point of wrenches; None where neither was measured."""
-    sensors = measured_sensors(samples, robot, contacts)
+    sensors = _measured_sensors(samples, robot, contacts)
     joints = np.flatnonzero(sensors.torque[: robot.n])
     if not len(joints) and not _whole(sensors.wrench):
         return None
     builder = RowBuilder(robot, contacts, sensors)
-    columns = prior_columns(builder, robot, samples)
+    columns = _prior_columns(builder, robot, samples)
     nominal = builder.columns.parameter_map() @ robot.nominal.flatten()
     parts = []
     for part in samples:
-        rows, W, equations = whitened_rows(builder, part)
+        rows, W, equations = _whitened_rows(builder, part)
         torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
         for place, joint in enumerate(joints):
             torque[:, builder.tree.base_rows + joint, place] = builder.recorded_torque(part)[:, joint].numpy()
@@ -276,7 +283,7 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
         loose = _of_joints(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
         K = np.concatenate([rows[..., :-1] @ columns, *loose], axis=2)
         parts.append((K, np.concatenate([target[..., None], through], axis=2), equations))
-    return _solved(accumulate_blocks(*(np.concatenate(part) for part in zip(*parts, strict=True))), joints)
+    return _solved(_accumulate_blocks(*(np.concatenate(part) for part in zip(*parts, strict=True))), joints)
 
 
 def _about(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> FloatArray:
@@ -301,7 +308,7 @@ def _whole(measured: np.ndarray) -> bool:
     return bool(measured.size and measured.all())
 
 
-def _solved(found: NormalEquations, joints: np.ndarray) -> TorqueGains:
+def _solved(found: _NormalEquations, joints: np.ndarray) -> TorqueGains:
     m = len(joints)
     start = np.append(np.ones(m), np.zeros(3))
     prior = np.append(np.full(m, _GAIN), np.full(3, _POINT)) ** -2.0

@@ -1,4 +1,4 @@
-"""Spikes and lasting steps: which jumps of a log are no motion and no force, and what to do about them."""
+"""Spikes and lasting steps: jumps that neither the robot's motion nor a contact explains."""
 
 from __future__ import annotations
 
@@ -15,120 +15,10 @@ from torchid.log_checks.statistics import NORMAL, block_spread, finite_median, n
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
-from torchid.text import count_of, join_names
-
-#: Spreads that a step must exceed. Laplacian noise, whose tails are heavy, does so once in 10^7 samples.
-THRESHOLD = 12.0
-SIDE = 10
-BLOCK = 128
-#: Longest run of samples off the track that counts as a spike.
-LONGEST_SPIKE = 5
-#: Share of a jump that may be left when what jumped has come back, at once or after having moved on.
-_LEFT, _LEFT_LATER = 0.3, 0.5
-#: Share of the threshold that is enough for the way back.
-_PARTNER = 0.5
-#: Share of the channel's range below which differences count as rounding.
-_ROUNDING = 1e-9
-#: Jumps of one channel after which nobody wants to hear of more.
-_MOST = 5000
-
-
-@dataclass(frozen=True)
-class Jump:
-    """An excursion of samples `first` to `last` by about `size`, or a lasting step between these two.
-
-    `spreads`: how many local spreads the size is.
-    """
-
-    first: int
-    last: int
-    size: float
-    spreads: float
-    lasting: bool
-
-
-def find_jumps(
-    values: FloatArray, elapsed: FloatArray, piece: NDArray[np.intp], longest: int = LONGEST_SPIKE
-) -> list[Jump]:
-    """Excursions of at most `longest` samples, and lasting steps.
-
-    Args:
-        values: (M,).
-        elapsed: (M,) time in median steps.
-        piece: (M,) of successive samples that each belongs to; between pieces nothing is compared.
-        longest: samples after which nothing is taken to have come back.
-    """
-    kept = np.flatnonzero(np.append(True, np.diff(values) != 0.0))  # what rests or is held counts as one sample
-    if len(kept) < SIDE:
-        return []
-    values, steps, joined = values[kept], np.diff(elapsed[kept]), np.diff(piece[kept]) == 0
-    d = np.where(joined, np.diff(values), 0.0)
-    second = np.diff(d)
-    spread = block_spread(second, BLOCK)
-    touched, large = np.zeros(len(d), bool), np.abs(second) > THRESHOLD / 2.0 * spread
-    touched[:-1] |= large
-    touched[1:] |= large
-    suspects = np.flatnonzero(touched & joined)
-    around = np.maximum(spread[np.maximum(suspects - 1, 0)], spread[np.minimum(suspects, len(spread) - 1)])
-    excess, least = _excess(d, steps, suspects)
-    least = np.maximum.reduce([least, around / np.sqrt(3.0), np.full(len(suspects), _quantum(d, values))])
-    bad = np.flatnonzero(np.abs(excess) > _PARTNER * THRESHOLD * least)[:_MOST]
-    single = [
-        Jump(int(kept[i + 1]) - 1, int(kept[i + 1]), float(e), float(abs(e) / s), lasting=True)
-        for i, e, s in zip(suspects[bad], excess[bad], least[bad], strict=True)
-    ]
-    near = [jump for jump in _paired(single, LONGEST_SPIKE, _LEFT) if jump.spreads > THRESHOLD]
-    return list(_paired(near, longest, _LEFT_LATER))
-
-
-def _quantum(d: FloatArray, values: FloatArray) -> float:
-    """The smallest step that is no rounding."""
-    sizes = np.abs(d)
-    sizes = sizes[sizes > _ROUNDING * np.ptp(values)]
-    return float(sizes.min()) if len(sizes) else 0.0
-
-
-def _excess(d: FloatArray, steps: FloatArray, at: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-    """How far steps leave what their neighbours span, and the spread of the neighbours, (S,) each."""
-    spanned, spreads = [], []
-    away = np.arange(1.0, SIDE + 1.0)
-    pairs = np.triu_indices(SIDE, 1)
-    for direction in (-1, 1):
-        neighbours = neighbours_of(d, at, direction, SIDE)
-        slope = finite_median((neighbours[:, pairs[1]] - neighbours[:, pairs[0]]) / (away[pairs[1]] - away[pairs[0]]))
-        level = finite_median(neighbours - slope[:, None] * away)
-        spreads.append(NORMAL * finite_median(np.abs(neighbours - level[:, None] - slope[:, None] * away)))
-        spanned += [level, level + slope * away.mean()]
-    hull = np.stack([*spanned, *(one * steps[at] for one in spanned)])
-    return d[at] - np.clip(d[at], hull.min(axis=0), hull.max(axis=0)), np.max(spreads, axis=0)
-
-
-def _paired(found: list[Jump], longest: int, left: float) -> Iterator[Jump]:
-    """Lasting steps that cancel within `longest` samples, but for a share `left`, as one excursion."""
-    start = 0
-    while start < len(found):
-        jump, end, least = found[start], start, left
-        net, largest = jump.size, abs(jump.size)
-        for following in range(start + 1, len(found)) if jump.lasting else ():
-            other = found[following]
-            if other.last - jump.last > longest:
-                break
-            if other.lasting:
-                net, largest = net + other.size, max(largest, abs(other.size))
-                if abs(net) < least * largest:
-                    end, least = following, abs(net) / largest if longest <= LONGEST_SPIKE else 0.0
-        if end == start:
-            yield jump
-        else:
-            inside = [each for each in found[start : end + 1] if each.lasting]
-            size, spreads = (max(abs(getattr(each, name)) for each in inside) for name in ("size", "spreads"))
-            yield Jump(jump.last, found[end].first, size, spreads, lasting=False)
-            yield from (each for each in found[start : end + 1] if not each.lasting)
-        start = end + 1
-
+from torchid.text import format_count, join_names
 
 POSES = ("joint_position", "base_quat_xyzw", "base_position_world")
-#: Fields whose lasting steps are worth a word; velocities and accelerations have theirs from impacts and commands.
+#: Fields whose lasting steps are reported; those of velocities and accelerations come from impacts and commands.
 _STEPPING = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "ft_wrench")
 #: Ends of the names of fields in which impacts show as spikes.
 _RINGING = ("acceleration", "acceleration_world", "acceleration_base", "specific_force")
@@ -137,7 +27,7 @@ _RINGING = ("acceleration", "acceleration_world", "acceleration_base", "specific
 RELEVANT = 0.1
 #: ... and a lasting step is no reset of a sensor.
 RESET = 0.3
-#: Jump of a position [rad, m, or of a quaternion's component] that nobody needs to hear of: 0.03 degrees, 0.5 mm.
+#: Jump of a position [rad, m, or of a quaternion's component] that is not reported: 0.03 degrees, 0.5 mm.
 NEGLIGIBLE = 5e-4
 #: A lasting step of a position that is within the error of its calibration.
 HARMLESS = 0.01
@@ -153,6 +43,21 @@ _LEVELS, _MOVED = (10.0, 50.0, 90.0), 0.5
 _REVERSAL, _SLOW = 5, 0.2
 #: How far a step may be from a whole number of turns, in turns, to count as a wrapped angle.
 _WRAPPED = 0.01
+
+
+@dataclass(frozen=True)
+class Jump:
+    """An excursion of samples `first` to `last` by about `size`, or a lasting step between these two.
+
+    `spreads`: how many local spreads the size is.
+    """
+
+    first: int
+    last: int
+    size: float
+    spreads: float
+    lasting: bool
+
 
 #: Jumps by channel, in numbers of samples of the log.
 _Jumps = list[tuple[str, Jump]]
@@ -200,7 +105,7 @@ def _finding(
     text = f"{channel} by {size:.3g} {unit} {where}, {clearest.spreads:.3g} times the noise around it"
     if len(found) > 1:
         count = len({(jump.first, jump.last) for _, jump in found})
-        text = f"{count_of(count, 'jump')} in {join_names(channels)}; the clearest: {text}"
+        text = f"{format_count(count, 'jump')} in {join_names(channels)}; the clearest: {text}"
     if spans is None:
         spans = tuple(_span(channel, jump) for channel, jump in found)
     return Finding(name, severity, field, text, advice, channels, spans)
@@ -299,7 +204,7 @@ def _position_steps(field: str, unit: str, lasting: _Jumps, samples: int) -> Ite
 
 
 def _kind(field: str, jump: Jump, together: float, samples: int) -> str:
-    """What a step is: `together` is the largest of all channels at the same place."""
+    """The kind of a step; `together` is the size of the largest of all channels at the same samples."""
     turns = jump.size / (2.0 * np.pi)
     if field == "joint_position" and _turns(jump) and abs(turns - _turns(jump)) < _WRAPPED:
         return "wrapped"
@@ -318,3 +223,101 @@ def _shorter_side(jump: Jump, channel: str, samples: int) -> Span:
     if jump.first + 1 < samples - jump.last:
         return Span(0, jump.first, channel)
     return Span(jump.last, samples - 1, channel)
+
+
+# ------------------------------------------------------------------------------------------------- jumps of one channel
+
+#: Spreads that a step must exceed. Laplacian noise, whose tails are heavy, does so once in 10^7 samples.
+THRESHOLD = 12.0
+SIDE = 10
+BLOCK = 128
+#: Longest run of samples off the track that counts as a spike.
+LONGEST_SPIKE = 5
+#: Share of a jump that may be left when what jumped has come back, at once or after having moved on.
+_LEFT, _LEFT_LATER = 0.3, 0.5
+#: Share of the threshold that is enough for the way back.
+_PARTNER = 0.5
+#: Share of the channel's range below which differences count as rounding.
+_ROUNDING = 1e-9
+#: Jumps of one channel that are reported at most.
+_MOST = 5000
+
+
+def find_jumps(
+    values: FloatArray, elapsed: FloatArray, piece: NDArray[np.intp], longest: int = LONGEST_SPIKE
+) -> list[Jump]:
+    """Excursions of at most `longest` samples, and lasting steps.
+
+    Args:
+        values: (M,).
+        elapsed: (M,) time in median steps.
+        piece: (M,) of successive samples that each belongs to; between pieces nothing is compared.
+        longest: samples after which nothing is taken to have come back.
+    """
+    kept = np.flatnonzero(np.append(True, np.diff(values) != 0.0))  # what rests or is held counts as one sample
+    if len(kept) < SIDE:
+        return []
+    values, steps, joined = values[kept], np.diff(elapsed[kept]), np.diff(piece[kept]) == 0
+    d = np.where(joined, np.diff(values), 0.0)
+    second = np.diff(d)
+    spread = block_spread(second, BLOCK)
+    touched, large = np.zeros(len(d), bool), np.abs(second) > THRESHOLD / 2.0 * spread
+    touched[:-1] |= large
+    touched[1:] |= large
+    suspects = np.flatnonzero(touched & joined)
+    around = np.maximum(spread[np.maximum(suspects - 1, 0)], spread[np.minimum(suspects, len(spread) - 1)])
+    excess, least = _excess(d, steps, suspects)
+    least = np.maximum.reduce([least, around / np.sqrt(3.0), np.full(len(suspects), _quantum(d, values))])
+    bad = np.flatnonzero(np.abs(excess) > _PARTNER * THRESHOLD * least)[:_MOST]
+    single = [
+        Jump(int(kept[i + 1]) - 1, int(kept[i + 1]), float(e), float(abs(e) / s), lasting=True)
+        for i, e, s in zip(suspects[bad], excess[bad], least[bad], strict=True)
+    ]
+    near = [jump for jump in _paired(single, LONGEST_SPIKE, _LEFT) if jump.spreads > THRESHOLD]
+    return list(_paired(near, longest, _LEFT_LATER))
+
+
+def _quantum(d: FloatArray, values: FloatArray) -> float:
+    """The smallest step that is no rounding."""
+    sizes = np.abs(d)
+    sizes = sizes[sizes > _ROUNDING * np.ptp(values)]
+    return float(sizes.min()) if len(sizes) else 0.0
+
+
+def _excess(d: FloatArray, steps: FloatArray, at: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    """How far steps leave what their neighbours span, and the spread of the neighbours, (S,) each."""
+    spanned, spreads = [], []
+    away = np.arange(1.0, SIDE + 1.0)
+    pairs = np.triu_indices(SIDE, 1)
+    for direction in (-1, 1):
+        neighbours = neighbours_of(d, at, direction, SIDE)
+        slope = finite_median((neighbours[:, pairs[1]] - neighbours[:, pairs[0]]) / (away[pairs[1]] - away[pairs[0]]))
+        level = finite_median(neighbours - slope[:, None] * away)
+        spreads.append(NORMAL * finite_median(np.abs(neighbours - level[:, None] - slope[:, None] * away)))
+        spanned += [level, level + slope * away.mean()]
+    hull = np.stack([*spanned, *(one * steps[at] for one in spanned)])
+    return d[at] - np.clip(d[at], hull.min(axis=0), hull.max(axis=0)), np.max(spreads, axis=0)
+
+
+def _paired(found: list[Jump], longest: int, left: float) -> Iterator[Jump]:
+    """Lasting steps that cancel within `longest` samples, but for a share `left`, as one excursion."""
+    start = 0
+    while start < len(found):
+        jump, end, least = found[start], start, left
+        net, largest = jump.size, abs(jump.size)
+        for following in range(start + 1, len(found)) if jump.lasting else ():
+            other = found[following]
+            if other.last - jump.last > longest:
+                break
+            if other.lasting:
+                net, largest = net + other.size, max(largest, abs(other.size))
+                if abs(net) < least * largest:
+                    end, least = following, abs(net) / largest if longest <= LONGEST_SPIKE else 0.0
+        if end == start:
+            yield jump
+        else:
+            inside = [each for each in found[start : end + 1] if each.lasting]
+            size, spreads = (max(abs(getattr(each, name)) for each in inside) for name in ("size", "spreads"))
+            yield Jump(jump.last, found[end].first, size, spreads, lasting=False)
+            yield from (each for each in found[start : end + 1] if not each.lasting)
+        start = end + 1

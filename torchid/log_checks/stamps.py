@@ -12,16 +12,18 @@ from torchid.logs import Log
 from torchid.logs.log import NAN_ALLOWED, WRENCHES, BoolArray, FloatArray
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_STEP
-from torchid.text import count_of, join_names
+from torchid.text import format_count, join_names
+
+# --------------------------------------------------------------------------------------------------------------- values
 
 #: Share of NaN above which a channel counts as one that was not recorded, and not as one with holes.
 MOSTLY_THERE = 0.2
-#: Size in any unit that nothing on a robot has: what is larger is no number but rubbish.
+#: Size in any unit that no quantity of a robot has: uninitialised memory, or an overflow.
 ABSURD = 1e12
 
 
 def check_magnitudes(log: Log) -> Iterator[Finding]:
-    """Findings about values that nothing can have."""
+    """Findings about values larger than any quantity of a robot."""
     for field in log.arrays():
         if field in NO_SIGNALS:
             continue
@@ -34,7 +36,7 @@ def check_magnitudes(log: Log) -> Iterator[Finding]:
         names = channel_names(log, field)
         columns = np.flatnonzero(bad.any(axis=0))
         channels = tuple(names[column] for column in columns)
-        text = f"{join_names(channels)}: beyond {ABSURD:g}, in {count_of(int(bad.any(axis=1).sum()), 'sample')}"
+        text = f"{join_names(channels)}: beyond {ABSURD:g}, in {format_count(int(bad.any(axis=1).sum()), 'sample')}"
         rare = bad.any(axis=1).mean() <= MOSTLY_THERE
         spans = tuple(span for column in columns for span in find_spans(bad[:, column], names[column])) if rare else ()
         yield Finding("absurd", CONDEMNED, field, text, "look for uninitialised memory or an overflow", channels, spans)
@@ -68,7 +70,7 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
             span for name, (column, _) in holes.items() for span in find_spans(nan[:, column], name)
         )
         shares = ", ".join(f"{name} {100 * share:.2g} %" for name, (_, share) in list(holes.items())[:4])
-        text = f"NaN in {count_of(len(holes), 'channel')}, {count_of(len(spans), 'time')}: {shares}"
+        text = f"NaN in {format_count(len(holes), 'channel')}, {format_count(len(spans), 'time')}: {shares}"
         if field in NAN_ALLOWED:
             advice = "leave these samples out; a filter would lose the channels throughout"
         else:
@@ -86,11 +88,13 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
         yield Finding("not measured", severity, field, f"{join_names(list(gone))}: NaN {how}", advice, tuple(gone))
 
 
-#: A median step [s] above which no acceleration can be seen: robots move at 0.5 to 5 Hz.
+# ---------------------------------------------------------------------------------------------------------- time stamps
+
+#: A median step [s] above which accelerations cannot be derived: robots move at 0.5 to 5 Hz.
 SLOWEST_STEP = 0.5
 #: Units that stamps are mistaken in, by how many there are in a second.
 _TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-#: Jitter, in median steps, below which nobody needs to hear of it: 1e-3 of a step at 1 rad/s and 1 kHz is 1e-6 rad.
+#: Jitter, in median steps, that is not reported: 1e-3 of a step at 1 rad/s and 1 kHz is 1e-6 rad.
 WORTH_A_NOTE = 1e-3
 #: Deviations of a step, in rms deviations, by which samples are chosen to ask whether the motion follows the stamps.
 _STRONG = 3.0
@@ -101,7 +105,7 @@ _BETTER = 0.5
 def check_time_stamps(log: Log) -> Iterator[Finding]:
     """Findings about `time`."""
     if len(log) < FEWEST_DIFFERENTIATED and lacks_derivatives(log):
-        text = f"{count_of(len(log), 'sample')}: velocities and accelerations cannot be derived"
+        text = f"{format_count(len(log), 'sample')}: velocities and accelerations cannot be derived"
         advice = f"record {FEWEST_DIFFERENTIATED} samples or more, or give every velocity and acceleration"
         yield Finding("too short", CONDEMNED, "time", text, advice)
     if len(log) < 3:
@@ -120,7 +124,7 @@ def check_time_stamps(log: Log) -> Iterator[Finding]:
     if short.any():
         where = np.flatnonzero(short)
         first = int(where[0])
-        below = f"{count_of(len(where), 'step')} below {SHORTEST_STEP:g} of the median"
+        below = f"{format_count(len(where), 'step')} below {SHORTEST_STEP:g} of the median"
         text = f"{below}, the first of {steps[first]:.3g} s after sample {first}: noise is multiplied there"
         spans = tuple(Span(int(i) + 1, int(i) + 1) for i in where)
         yield Finding("coincident stamps", CONDEMNED, "time", text, "drop one sample of each pair", spans=spans)
@@ -145,7 +149,7 @@ def _motion_ignores(log: Log, steps: FloatArray, strong: float, long: BoolArray)
     """Whether joint positions are smoother in the sample number than in the time stamps, where stamps are off most."""
     before, after = steps[:-1], steps[1:]
     where = 1 + np.flatnonzero((np.abs(before - after) > strong) & ~long[:-1] & ~long[1:])
-    if len(where) < 10:  # too few to tell
+    if len(where) < 10:  # too few to judge
         return False
     ahead, behind = (log.joint_position[where + k] - log.joint_position[where] for k in (1, -1))
     left, right = steps[where - 1, None], steps[where, None]
@@ -157,7 +161,7 @@ def _motion_ignores(log: Log, steps: FloatArray, strong: float, long: BoolArray)
 def _gaps(steps: FloatArray, median: float, long: BoolArray) -> Finding:
     where, longest = np.flatnonzero(long), int(np.argmax(steps))
     lost = int(np.round(steps[where] / median - 1.0).sum())
-    missing = f"{count_of(len(where), 'gap')}, {count_of(lost, 'sample')} missing"
+    missing = f"{format_count(len(where), 'gap')}, {format_count(lost, 'sample')} missing"
     found = f"{missing}; longest {steps[longest]:.4g} s after sample {longest}"
     if steps[longest] > LONGEST_STEP * median:
         advice = f"split the log after sample {longest}: no spline is drawn across more than {LONGEST_STEP:g} steps"

@@ -12,9 +12,10 @@ NORMAL = 1.4826
 
 
 def neighbours_of(series: FloatArray, at: NDArray[np.intp], direction: int, count: int) -> FloatArray:
-    """The `count` items before (-1) or after (1) some places of a series (M, ...), nearest first, (P, count, ...).
+    """The `count` items before (-1) or after (1) some indices `at` (P,) of a series (M, ...), nearest first.
 
-    NaN beyond the ends.
+    Returns:
+        (P, count, ...), NaN beyond the ends.
     """
     index = at[:, None] + direction * np.arange(1, count + 1)
     inside = (index >= 0) & (index < len(series))

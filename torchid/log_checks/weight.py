@@ -16,40 +16,9 @@ from torchid.logs.quaternion import rotate_to_world
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 
-#: Time [s] over which nothing may have moved by more than `MOVED` [rad, m, or of a quaternion's component].
-WINDOW = 0.5
-#: 0.01 within half a second, and within either half of it: accelerations well below 0.2 m/s^2, 2 % of gravity.
-MOVED = 0.01
-
-
-def find_rest(log: Log) -> BoolArray:
-    """Which samples (N,) are inside a window in which neither base nor joints move."""
-    still = np.zeros(len(log), bool)
-    if len(log) < 3:
-        return still
-    half = max(1, round(0.5 * WINDOW / median_step(log)))
-    if len(log) <= 2 * half:
-        return still
-    middle = np.ones(len(log) - 2 * half, bool)
-    for values in _poses(log):
-        start, centre, end = values[: -2 * half], values[half:-half], values[2 * half :]
-        for one, other in ((start, centre), (centre, end), (start, end)):
-            middle &= (np.abs(one - other) < MOVED).all(axis=1)
-    if log.imu_angular_velocity is not None:
-        turned = np.linalg.norm(log.imu_angular_velocity, axis=1)[half:-half] * WINDOW
-        middle &= turned < 10.0 * MOVED  # a gyroscope has a bias
-    still[half:-half] = middle
-    return widen_mask(still, half)
-
-
-def _poses(log: Log) -> list[FloatArray]:
-    found = (log.joint_position, log.base_quat_xyzw, log.base_position_world)
-    return [values for values in found if values is not None and values.shape[1]]
-
-
 GRAVITY = -GRAVITY_WORLD[2]
 #: How far the carried mass may be from the URDF's without a word, and from where on no CAD model is that wrong.
-KNOWN, WRONG = 0.02, 0.2
+NEGLIGIBLE_MASS, WRONG_MASS = 0.02, 0.2
 #: What a force sensor's unit makes of 1 N, and how far the URDF's mass may then be off.
 UNITS = {"kN": 1e-3, "kg": 1.0 / GRAVITY, "lbf": 0.22481, "g": 1e3 / GRAVITY, "mN": 1e3}
 _UNIT_WITHIN = 0.15
@@ -60,7 +29,7 @@ _REST, _LONG = 0.5, 5.0
 _POSES = 4000
 #: How far the accelerometer's reading at rest may be from gravity: a good one is within 0.5 %.
 _ACCELEROMETER = 0.02
-#: Angle [deg] between gravity as an accelerometer sees it and as the orientation says.
+#: Angle [deg] between gravity by the accelerometer and by the base's orientation.
 _TILT = 5.0
 _NAME, _IMU = "weight at rest", "accelerometer at rest"
 
@@ -69,7 +38,7 @@ def check_weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about the sum of the contact forces."""
     if robot is not None and robot.fixed_base and not log.contact_names:
         return  # what it is bolted to carries it
-    still = find_rest(log)
+    still = _find_rest(log)
     step = median_step(log)
     rests = still.sum() * step >= _REST
     if not rests and log.time[-1] - log.time[0] < _LONG:
@@ -104,10 +73,10 @@ def _judged(carried: float, when: str, field: str, robot: Robot | None) -> Itera
             text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {unit}?"
             yield Finding("unit", CONDEMNED, field, text, "convert forces to N and moments to N m")
             return
-    if abs(ratio - 1.0) > WRONG:
+    if abs(ratio - 1.0) > WRONG_MASS:
         advice = "look for a contact that is not measured, a payload, a sensor's offset or gain"
         yield Finding("weight", SUSPICIOUS, field, text, advice)
-    elif abs(ratio - 1.0) > KNOWN:
+    elif abs(ratio - 1.0) > NEGLIGIBLE_MASS:
         yield Finding(
             "weight", NOTE, field, text, "none if the URDF may be that far off; a sensor's offset looks the same"
         )
@@ -142,11 +111,14 @@ def _in_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
     return np.stack(turned, axis=1)
 
 
+# -------------------------------------------------------------------------------------------------------- accelerometer
+
+
 def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about the IMU's specific force, at rest; its direction also on average over a long log."""
     if log.imu_specific_force is None:
         return
-    still = find_rest(log)
+    still = _find_rest(log)
     rests = still.sum() >= 10
     if not rests:
         yield Skipped(_IMU, f"the robot never rests for {_REST:g} s")
@@ -169,7 +141,7 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
 
 
 def _tilt(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterator[Finding | Skipped]:
-    """Whether gravity points where the base's orientation says."""
+    """Findings about gravity measured along another direction than by the base's orientation."""
     if log.base_quat_xyzw is None or log.imu_specific_force is None:
         return
     if robot is None or robot.links.get(log.imu_frame, (1, None))[0] != 0:
@@ -208,3 +180,36 @@ def _above_feet(log: Log, robot: Robot, upward: FloatArray) -> float | None:
     heights = [-(poses[log.contact_names[k]][:, :3, 3].numpy() @ mean)[active[:, k]] for k in known]
     found = np.concatenate(heights) if heights else np.zeros(0)
     return float(found.mean() / np.linalg.norm(mean)) if len(found) else None
+
+
+# ----------------------------------------------------------------------------------------------------------------- rest
+
+#: Time [s] over which nothing may have moved by more than `MOVED` [rad, m, or of a quaternion's component].
+WINDOW = 0.5
+#: 0.01 within half a second, and within either half of it: accelerations well below 0.2 m/s^2, 2 % of gravity.
+MOVED = 0.01
+
+
+def _find_rest(log: Log) -> BoolArray:
+    """Which samples (N,) are inside a window in which neither base nor joints move."""
+    still = np.zeros(len(log), bool)
+    if len(log) < 3:
+        return still
+    half = max(1, round(0.5 * WINDOW / median_step(log)))
+    if len(log) <= 2 * half:
+        return still
+    middle = np.ones(len(log) - 2 * half, bool)
+    for values in _poses(log):
+        start, centre, end = values[: -2 * half], values[half:-half], values[2 * half :]
+        for one, other in ((start, centre), (centre, end), (start, end)):
+            middle &= (np.abs(one - other) < MOVED).all(axis=1)
+    if log.imu_angular_velocity is not None:
+        turned = np.linalg.norm(log.imu_angular_velocity, axis=1)[half:-half] * WINDOW
+        middle &= turned < 10.0 * MOVED  # a gyroscope has a bias
+    still[half:-half] = middle
+    return widen_mask(still, half)
+
+
+def _poses(log: Log) -> list[FloatArray]:
+    found = (log.joint_position, log.base_quat_xyzw, log.base_position_world)
+    return [values for values in found if values is not None and values.shape[1]]

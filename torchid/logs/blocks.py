@@ -1,4 +1,4 @@
-"""Logs that are read a block of samples at a time, for those that no memory holds."""
+"""Logs larger than memory, read a block of samples at a time."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def log_bytes(path: Path, limit: float) -> int:
             most = _SMALL * path.stat().st_size
             return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
         with open_container(path, whole=False) as container:
-            return sum(container.sizes().values())
+            return sum(container.declared_bytes().values())
 
 
 def count_samples_from(start: int, error: LogError) -> LogError:
@@ -91,7 +91,7 @@ class LogBlocks:
         Signs of quaternions go on from those of the samples that were read before, if these reach up to them.
 
         Raises:
-            LogError: a value that is none; the message counts samples from the beginning.
+            LogError: an invalid value; the message counts samples from the beginning.
         """
         with about_file(self.source):
             raw = self._raw(samples, only)
@@ -145,7 +145,7 @@ def open_log_blocks(path: Path, folder: Path) -> Iterator[LogBlocks]:
 
 def _of_container(container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a container."""
-    given = list(container.sizes())
+    given = list(container.declared_bytes())
     check_fields_given(given)
     names: dict[str, NDArray[Any]] = {}
     fields: dict[str, LazyArray] = {}
@@ -154,7 +154,7 @@ def _of_container(container: Container, folder: Path) -> tuple[dict[str, NDArray
             if _is_text(name):
                 names[name] = container.load(name)
             else:
-                fields[name] = container.sliced(name, folder)
+                fields[name] = container.lazy(name, folder)
     return names, fields
 
 
@@ -182,7 +182,7 @@ def _is_text(name: str) -> bool:
 
 
 def _checked(source: str, names: dict[str, NDArray[Any]], fields: dict[str, LazyArray]) -> LogBlocks:
-    """The blocks, after checks of all that can be said before values are read."""
+    """The log, after all checks that need no values but the stamps."""
     time = fields.pop("time")
     check_shape("time", _empty(time), SHAPES["time"], {})
     with reader_errors_explained("time", _ACCEPTED):

@@ -19,7 +19,7 @@ from torchid.text import excerpt, is_plain
 
 #: The one column of text: the same in every row.
 TEXT_COLUMN = "imu_frame"
-COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
+_COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 #: Characters in the name of a column, which holds that of a joint.
 MAX_LETTERS = 2 * MAX_NAME
 
@@ -28,7 +28,7 @@ _KIND = {"joint_names": "joint", "contact_names": "contact", "ft_names": "sensor
 
 
 @dataclass(frozen=True)
-class Column:
+class _Column:
     """One scalar: its field and, where the field has them, the name and the component."""
 
     field: str
@@ -77,18 +77,18 @@ def parse_header(texts: Sequence[str]) -> TableLayout:
     """
     if len(texts) > MAX_COLUMNS:
         raise FieldError("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
-    given: dict[str, dict[str, Column]] = {}
+    given: dict[str, dict[str, _Column]] = {}
     for text in texts:
         if len(text) > MAX_LETTERS or not is_plain(text):
             found = f"a name of {len(text)} characters: {excerpt(text)}"
             raise FieldError("header", found, f"names of one line and at most {MAX_LETTERS} characters")
-        column = parse_column(text)
+        column = _parse_column(text)
         of_field = given.setdefault(column.field, {})
         if text in of_field:
             raise FieldError(f"column '{text}'", "given twice", "every column once")
         of_field[text] = column
     names: dict[str, tuple[str, ...]] = {}
-    for field in COLUMN_FIELDS:
+    for field in _COLUMN_FIELDS:
         of = _names_of(field)
         if of and of not in names and field in given:
             names[of] = tuple(dict.fromkeys(column.name for column in given[field].values()))
@@ -98,10 +98,10 @@ def parse_header(texts: Sequence[str]) -> TableLayout:
     return TableLayout({"joint_names": (), **names}, columns)
 
 
-def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, Column]) -> None:
+def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, _Column]) -> None:
     missing = [text for text in expected if text not in given]
     if missing:
-        accepted = f"every column of {column_pattern(field)}; a cell may be empty where nothing was measured"
+        accepted = f"every column of {_column_pattern(field)}; a cell may be empty where nothing was measured"
         raise FieldError(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
     stray = list(given.keys() - set(expected))
     if stray:
@@ -109,8 +109,8 @@ def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, Col
         raise FieldError(f"column '{stray[0]}'", found, "the same names in all fields")
 
 
-def parse_column(text: str) -> Column:
-    """What the name of a column says: the field up to its first dot, a component after its last.
+def _parse_column(text: str) -> _Column:
+    """The parts of a column's name: the field up to its first dot, a component after its last.
 
     Raises:
         LogError: no column has such a name.
@@ -118,16 +118,16 @@ def parse_column(text: str) -> Column:
     field, _, rest = text.partition(".")
     if _UNIT.search(text):
         raise FieldError(f"column '{text}'", "a unit in its name", "names without units, values in SI units")
-    if field not in COLUMN_FIELDS:
-        raise UnknownFieldError(current_file(), f"column '{text}'", field, COLUMN_FIELDS)
-    components, of = component_names(field), _names_of(field)
+    if field not in _COLUMN_FIELDS:
+        raise UnknownFieldError(current_file(), f"column '{text}'", field, _COLUMN_FIELDS)
+    components, of = _component_names(field), _names_of(field)
     if of and components:
         name, _, component = rest.rpartition(".")
     else:
         name, component = (rest, "") if of else ("", rest)
-    column = Column(field, name, component)
+    column = _Column(field, name, component)
     if str(column) != text or bool(name) != bool(of) or (component not in components if components else component):
-        raise FieldError(f"column '{text}'", "no such part of this field", column_pattern(field))
+        raise FieldError(f"column '{text}'", "no such part of this field", _column_pattern(field))
     return column
 
 
@@ -135,14 +135,14 @@ def column_names(field: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str,
     """The columns of a field in the order of its elements; `names` by field."""
     of = _names_of(field)
     return tuple(
-        str(Column(field, name, component))
+        str(_Column(field, name, component))
         for name in (names[of] if of else ("",))
-        for component in component_names(field) or ("",)
+        for component in _component_names(field) or ("",)
     )
 
 
-def component_names(field: str) -> tuple[str, ...]:
-    """What the last part of a column's name may be, nothing for fields without components."""
+def _component_names(field: str) -> tuple[str, ...]:
+    """The values that the last part of a column's name may have; none for fields without components."""
     size = field_shape(field)[-1] if len(field_shape(field)) > 1 else None
     if size == 6:
         return WRENCH_COMPONENTS
@@ -151,13 +151,13 @@ def component_names(field: str) -> tuple[str, ...]:
     return ("x", "y", "z") if size == 3 else ()
 
 
-def column_pattern(field: str) -> str:
+def _column_pattern(field: str) -> str:
     """The names of a field's columns in general, such as `ft_wrench.<sensor>.{fx, fy, fz, mx, my, mz}`."""
-    of, components = _names_of(field), component_names(field)
-    return str(Column(field, f"<{_KIND[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))
+    of, components = _names_of(field), _component_names(field)
+    return str(_Column(field, f"<{_KIND[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))
 
 
 def _names_of(field: str) -> str:
-    """The field that names what a field has one of each for, or nothing."""
+    """The field with the names of a field's columns (`joint_names`, ...), or nothing."""
     letter = next((x for x in field_shape(field)[1:2] if isinstance(x, str)), None)
     return next((name for name, of in NAME_FIELDS.items() if of == letter), "")

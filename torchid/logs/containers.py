@@ -1,4 +1,4 @@
-"""Kinds of log files, and the two containers of arrays, .npz and HDF5, as names and one array for each."""
+"""Kinds of log files; containers of named arrays (.npz and HDF5), opened within limits and written whole."""
 
 from __future__ import annotations
 
@@ -22,185 +22,10 @@ from torchid.logs.spill import LazyArray, Spill
 from torchid.staging import atomic_file
 from torchid.text import excerpt
 
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+# --------------------------------------------------------------------------------------------------- kinds of log files
 
-_PIECE = 2**22  # bytes that are unpacked at a time
-_ENTRY, _DIRECTORY = b"PK\x01\x02", 2**20  # how entries begin; bytes at the end of a file, that hold those of a log
-
-
-def open_archive(path: Path) -> zipfile.ZipFile:
-    """Open a zip archive; ValueError if it has far too many entries, which `zipfile` takes seconds to list."""
-    with path.open("rb") as stream:
-        stream.seek(max(0, path.stat().st_size - _DIRECTORY))
-        check_fields((), stream.read().count(_ENTRY))
-    return zipfile.ZipFile(path)
-
-
-class Npz:
-    """The arrays of a zip archive."""
-
-    def __init__(self, archive: zipfile.ZipFile) -> None:
-        self._archive = archive
-
-    def sizes(self) -> dict[str, int]:
-        """Declared bytes of each array, by name."""
-        entries = self._archive.infolist()
-        check_fields((entry.filename for entry in entries), len(entries))
-        sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in entries}
-        if len(sizes) != len(entries):
-            raise ValueError("a name occurs twice")
-        return sizes
-
-    def load(self, name: str) -> NDArray[Any]:
-        """The array `name`."""
-        entry = self._entry(name)
-        with self._archive.open(entry) as stream:
-            array: NDArray[Any]
-            with _of_python_2():
-                array = np.lib.format.read_array(stream, allow_pickle=False)
-        return array
-
-    def sliced(self, name: str, folder: Path) -> LazyArray:
-        """The array `name`, unpacked to a file in `folder`."""
-        entry = self._entry(name)
-        with self._archive.open(entry) as stream:
-            shape, fortran_order, dtype = _read_header(stream)
-            if dtype.hasobject or not shape:
-                return self.load(name)
-            unpacked = Spill(self._archive.filename, folder)
-            while data := stream.read(_PIECE):
-                unpacked.write(data)
-        return unpacked.mapped(shape, dtype, fortran_order)
-
-    def _entry(self, name: str) -> zipfile.ZipInfo:
-        """Where the array `name` is; ValueError where it is not what it says."""
-        entry = self._archive.getinfo(f"{name}.npy")
-        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError("compressed in a way that NumPy does not use")
-        with self._archive.open(entry) as stream:
-            _check_header(stream, entry.file_size)
-        return entry
-
-
-@contextlib.contextmanager
-def _of_python_2() -> Iterator[None]:
-    """Without a warning of headers that Python 2 wrote."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield
-
-
-def _read_header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether in Fortran's order, and type of an array."""
-    version = np.lib.format.read_magic(stream)
-    if version not in _HEADERS:
-        raise ValueError(f"version {version} of the format, which numbers and names do not need")
-    with _of_python_2():
-        return _HEADERS[version](stream)
-
-
-def _check_header(stream: Any, size: int) -> None:
-    """Refuse an array that is not as large as its entry: NumPy makes room for whatever the header says."""
-    shape, _, dtype = _read_header(stream)
-    left = size - stream.tell()
-    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != left:
-        raise ValueError(f"{left} bytes for an array of shape {shape}, {dtype.itemsize} bytes each")
-    if dtype.kind in "US":
-        check_names(shape)
-
-
+#: Containers of named arrays.
 ARRAYS = (".npz", ".h5", ".hdf5")
-
-#: Characters of another package's message that a message of ours repeats.
-_LONGEST_TEXT = 200
-
-
-class Container(Protocol):
-    """An open file: what it declares, and its arrays one at a time."""
-
-    def sizes(self) -> dict[str, int]:
-        """Declared bytes of each array, by name."""
-
-    def load(self, name: str) -> NDArray[Any]:
-        """The array `name`; text is an array of str or of UTF-8 bytes."""
-
-    def sliced(self, name: str, folder: Path) -> LazyArray:
-        """The array `name`, not read before it is sliced; what has to be unpacked goes to a file in `folder`."""
-
-
-@contextlib.contextmanager
-def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
-    """Turn whatever the readers raise on a damaged file, of which no list is ever complete, into one LogError."""
-    try:
-        yield
-    except (TorchidError, Warning):
-        raise
-    except Exception as error:
-        text = excerpt(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
-        raise FieldError(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
-
-
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in ARRAYS:
-        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(ARRAYS))
-    return suffix
-
-
-@contextlib.contextmanager
-def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
-    """Open a .npz, .h5 or .hdf5 file; LogError where it is absent, of another kind, damaged or declares too much.
-
-    Args:
-        path: the file.
-        whole: whether its arrays are to be read whole, and are refused if no memory holds them.
-    """
-    suffix = _suffix(path)
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise LogError(path, "file", found, f"an existing log ({', '.join(ARRAYS)})")
-    kind = "a complete .npz (zip) archive" if suffix == ".npz" else "a complete HDF5 file"
-    with contextlib.ExitStack() as stack:
-        with reader_errors_explained("file", kind):
-            container: Container
-            if suffix == ".npz":
-                container = Npz(stack.enter_context(open_archive(path)))
-            else:
-                h5py = import_h5py(path)
-                container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
-            total = sum(container.sizes().values())
-        if whole and total > MAX_ARRAYS:
-            raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
-        check_unpacked_size(path, total)
-        yield container
-
-
-@contextlib.contextmanager
-def atomic_output(path: Path) -> Iterator[Path]:
-    """A temporary name that becomes `path` when the block ends without an error: no half-written file is left.
-
-    Raises:
-        LogError: the file cannot be written.
-    """
-    try:
-        with atomic_file(path) as temporary, during("writing", path):
-            yield temporary
-    except OSError as error:
-        raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error
-
-
-def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays to a .npz, .h5 or .hdf5 file, which appears complete or not at all."""
-    suffix = _suffix(path)
-    with atomic_output(path) as temporary:
-        if suffix == ".npz":
-            with temporary.open("xb") as stream:
-                named: dict[str, Any] = dict(arrays)
-                np.savez(stream, **named)
-        else:
-            save_hdf5(import_h5py(path), temporary, arrays)
-
-
 TABLES = (".csv", ".parquet")
 #: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
 BAGS = (".bag", ".mcap", ".db3")
@@ -254,3 +79,184 @@ def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:
     if suffix not in accepted:
         raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(accepted))
     return LogKind.ARRAYS if suffix in ARRAYS else LogKind.TABLE if suffix in TABLES else LogKind.BAG
+
+
+# ------------------------------------------------------------------------------------------------- containers of arrays
+
+#: Characters of another package's message that a message of ours repeats.
+_LONGEST_TEXT = 200
+
+
+class Container(Protocol):
+    """An open file: what it declares, and its arrays one at a time."""
+
+    def declared_bytes(self) -> dict[str, int]:
+        """Declared bytes of each array, by name."""
+
+    def load(self, name: str) -> NDArray[Any]:
+        """The array `name`; text is an array of str or of UTF-8 bytes."""
+
+    def lazy(self, name: str, folder: Path) -> LazyArray:
+        """The array `name`, not read before it is sliced; what has to be unpacked goes to a file in `folder`."""
+
+
+@contextlib.contextmanager
+def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
+    """Turn whatever the readers raise on a damaged file, which no list covers, into a FieldError."""
+    try:
+        yield
+    except (TorchidError, Warning):
+        raise
+    except Exception as error:
+        text = excerpt(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
+        raise FieldError(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in ARRAYS:
+        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(ARRAYS))
+    return suffix
+
+
+@contextlib.contextmanager
+def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
+    """Open a .npz, .h5 or .hdf5 file; LogError where it is absent, of another kind, damaged or declares too much.
+
+    Args:
+        path: the file.
+        whole: whether its arrays are to be read whole, and are refused if no memory holds them.
+    """
+    suffix = _suffix(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "no such file"
+        raise LogError(path, "file", found, f"an existing log ({', '.join(ARRAYS)})")
+    kind = "a complete .npz (zip) archive" if suffix == ".npz" else "a complete HDF5 file"
+    with contextlib.ExitStack() as stack:
+        with reader_errors_explained("file", kind):
+            container: Container
+            if suffix == ".npz":
+                container = _Npz(stack.enter_context(_open_archive(path)))
+            else:
+                h5py = import_h5py(path)
+                container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
+            total = sum(container.declared_bytes().values())
+        if whole and total > MAX_ARRAYS:
+            raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
+        check_unpacked_size(path, total)
+        yield container
+
+
+@contextlib.contextmanager
+def atomic_output(path: Path) -> Iterator[Path]:
+    """A temporary name that becomes `path` when the block ends without an error: no half-written file is left.
+
+    Raises:
+        LogError: the file cannot be written.
+    """
+    try:
+        with atomic_file(path) as temporary, during("writing", path):
+            yield temporary
+    except OSError as error:
+        raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error
+
+
+def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays to a .npz, .h5 or .hdf5 file, which appears complete or not at all."""
+    suffix = _suffix(path)
+    with atomic_output(path) as temporary:
+        if suffix == ".npz":
+            with temporary.open("xb") as stream:
+                named: dict[str, Any] = dict(arrays)
+                np.savez(stream, **named)
+        else:
+            save_hdf5(import_h5py(path), temporary, arrays)
+
+
+# --------------------------------------------------------------------------------------------------- the container .npz
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+_PIECE = 2**22  # bytes that are unpacked at a time
+_ENTRY, _DIRECTORY = b"PK\x01\x02", 2**20  # how entries begin; bytes at the end of a file, that hold those of a log
+
+
+def _open_archive(path: Path) -> zipfile.ZipFile:
+    """Open a zip archive; ValueError if it has far too many entries, which `zipfile` takes seconds to list."""
+    with path.open("rb") as stream:
+        stream.seek(max(0, path.stat().st_size - _DIRECTORY))
+        check_fields((), stream.read().count(_ENTRY))
+    return zipfile.ZipFile(path)
+
+
+class _Npz:
+    """The arrays of a zip archive."""
+
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self._archive = archive
+
+    def declared_bytes(self) -> dict[str, int]:
+        """Declared bytes of each array, by name."""
+        entries = self._archive.infolist()
+        check_fields((entry.filename for entry in entries), len(entries))
+        sizes = {entry.filename.removesuffix(".npy"): entry.file_size for entry in entries}
+        if len(sizes) != len(entries):
+            raise ValueError("a name occurs twice")
+        return sizes
+
+    def load(self, name: str) -> NDArray[Any]:
+        """The array `name`."""
+        entry = self._entry(name)
+        with self._archive.open(entry) as stream:
+            array: NDArray[Any]
+            with _of_python_2():
+                array = np.lib.format.read_array(stream, allow_pickle=False)
+        return array
+
+    def lazy(self, name: str, folder: Path) -> LazyArray:
+        """The array `name`, unpacked to a file in `folder`."""
+        entry = self._entry(name)
+        with self._archive.open(entry) as stream:
+            shape, fortran_order, dtype = _read_header(stream)
+            if dtype.hasobject or not shape:
+                return self.load(name)
+            unpacked = Spill(self._archive.filename, folder)
+            while data := stream.read(_PIECE):
+                unpacked.write(data)
+        return unpacked.mapped(shape, dtype, fortran_order)
+
+    def _entry(self, name: str) -> zipfile.ZipInfo:
+        """The entry of the array `name`; ValueError if it does not match its header."""
+        entry = self._archive.getinfo(f"{name}.npy")
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ValueError("compressed in a way that NumPy does not use")
+        with self._archive.open(entry) as stream:
+            _check_header(stream, entry.file_size)
+        return entry
+
+
+@contextlib.contextmanager
+def _of_python_2() -> Iterator[None]:
+    """Without a warning of headers that Python 2 wrote."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+def _read_header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether in Fortran's order, and type of an array."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"version {version} of the format, which numbers and names do not need")
+    with _of_python_2():
+        return _HEADERS[version](stream)
+
+
+def _check_header(stream: Any, size: int) -> None:
+    """Refuse an array that is not as large as its entry: NumPy allocates what the header declares."""
+    shape, _, dtype = _read_header(stream)
+    left = size - stream.tell()
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != left:
+        raise ValueError(f"{left} bytes for an array of shape {shape}, {dtype.itemsize} bytes each")
+    if dtype.kind in "US":
+        check_names(shape)

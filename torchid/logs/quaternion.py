@@ -1,4 +1,4 @@
-"""Unit quaternions in the order xyzw that rotate the base frame to the world frame."""
+"""Quaternions in the order xyzw that rotate the base frame to the world frame, and the angular rates of their paths."""
 
 from __future__ import annotations
 
@@ -33,21 +33,14 @@ def rotate_to_world(quat_xyzw: FloatArray, vector_base: FloatArray) -> FloatArra
     return vector_base + w * turn + np.cross(axis, turn)
 
 
-def inverse(quat_xyzw: FloatArray) -> FloatArray:
+def inverse_rotation(quat_xyzw: FloatArray) -> FloatArray:
     """The rotations back, (N, 4), of unit quaternions (N, 4)."""
     return quat_xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
-def compose(first: FloatArray, second: FloatArray) -> FloatArray:
-    """The rotations (N, 4) by `second` and then by `first`, unit quaternions (N, 4) or (4,)."""
-    v, w, v2, w2 = first[..., :3], first[..., 3:], second[..., :3], second[..., 3:]
-    scalar = w * w2 - np.sum(v * v2, axis=-1, keepdims=True)
-    return np.concatenate([w * v2 + w2 * v + np.cross(v, v2), scalar], axis=-1)
-
-
 def rotate_to_base(quat_xyzw: FloatArray, vector_world: FloatArray) -> FloatArray:
     """Components (N, 3) in the base frame of vectors (N, 3) given in the world, for unit quaternions (N, 4)."""
-    return rotate_to_world(inverse(quat_xyzw), vector_world)
+    return rotate_to_world(inverse_rotation(quat_xyzw), vector_world)
 
 
 def _divide(quat: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:

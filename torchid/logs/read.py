@@ -96,7 +96,7 @@ def check_fields_given(names: Collection[str]) -> None:
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz or HDF5 file, none of them before all names are known to be right."""
     with open_container(path) as container:
-        names = list(container.sizes())
+        names = list(container.declared_bytes())
         check_fields_given(names)
         raw: dict[str, NDArray[Any]] = {}
         for name in names:
@@ -117,7 +117,7 @@ def _check_names(names: Collection[str]) -> None:
 
 
 def _check_combination(names: Collection[str]) -> None:
-    """Raise LogError on fields that say the same thing twice or that need a field that is missing."""
+    """Raise LogError on fields that exclude each other, or that need a field that is missing."""
     for one, other in EXCLUSIVE:
         if one in names and other in names:
             raise FieldError(one, f"given together with {other}", "one of the two")

@@ -35,8 +35,8 @@ class SpillError(InputError):
 class Spill:
     """An array that grows by rows on a disk.
 
-    Its file has no name: no other process sees it, and it is gone when nothing holds the array any longer, be it by
-    success, an error, an interrupt or a kill.
+    Its file has no name, so that it is gone when nothing refers to the array any longer, whether by success, an error,
+    an interrupt or a kill.
     """
 
     def __init__(self, source: object, folder: Path) -> None:

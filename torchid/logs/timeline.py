@@ -1,4 +1,4 @@
-"""How samples move from a log's time stamps to those of the preprocessed log: layout, filter, quintic splines."""
+"""Time stamps of a log and of the preprocessed log, with the filter and the quintic splines between the two."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from scipy.interpolate import make_interp_spline
 from torchid.errors import FieldError, InputError, current_file, warn
 from torchid.logs.log import BoolArray, FloatArray, check_time
 
+# -------------------------------------------------------------------------------------------------------------- splines
+
 #: Samples per spline. One spline through a long log needs 22 numbers a sample for its banded matrix alone; through
 #: blocks the temporaries stay small.
 SPLINE_BLOCK = 4096
-#: Samples added on both sides of a block: on a uniform grid a sample's influence fades by 0.43 per step, so nothing
-#: is left of the cut after 128.
+#: Samples added on both sides of a block: on a uniform grid a sample's influence fades by 0.43 per step, so the cut
+#: has no effect beyond 128.
 SPLINE_OVERLAP = 128
 
 
-def spline_degree(samples: int) -> int:
+def _spline_degree(samples: int) -> int:
     """The spline's degree: 5, or 3 or 1 where fewer than 6 or 4 samples leave no choice."""
     return 5 if samples >= 6 else 3 if samples >= 4 else 1
 
@@ -41,7 +43,7 @@ def spline_derivatives(
     """
     flat = values.reshape(len(time), -1)
     out = [np.zeros((len(at), flat.shape[1])) for _ in orders]
-    degree = spline_degree(len(time))
+    degree = _spline_degree(len(time))
     for start in range(0, len(time) if flat.size else 0, block):
         stop = start + block
         first = int(np.searchsorted(at, time[start])) if start else 0
@@ -54,11 +56,13 @@ def spline_derivatives(
     return [derivative.reshape(len(at), *values.shape[1:]) for derivative in out]
 
 
+# ------------------------------------------------------------------------- stamps of a log, and the filter between them
+
 #: Steps that differ by less than this share of the median step count as uniform.
 JITTER = 1e-6
 _FREQUENCIES = 2**16
-#: What is left of a value that a block of a log does not hold: a hundredth of rounding, for modes of a filter that runs
-#: twice decay like a polynomial times an exponential.
+#: Remaining effect of a sample outside of a block: a hundredth of rounding, since modes of a filter that runs twice
+#: decay like a polynomial times an exponential.
 _SETTLED = 1e-18
 
 
@@ -79,7 +83,7 @@ class LowPass:
 
     @property
     def settling(self) -> int:
-        """Samples after which nothing is left of what lies before: the slowest mode has decayed to rounding."""
+        """Samples after which earlier ones have no effect: the slowest mode has decayed to rounding."""
         slowest = max(float(np.max(np.abs(np.roots(section[3:])))) for section in self.sections)
         return math.ceil(math.log(_SETTLED) / math.log(slowest))
 
@@ -115,7 +119,7 @@ class Timeline:
     bandwidth_hz: float | None = None
 
     @property
-    def at(self) -> FloatArray:
+    def output_stamps(self) -> FloatArray:
         """Stamps (K,) of the preprocessed log, counted from the log's first sample."""
         return self.grid[self.kept] if self.output is None else self.output
 
@@ -130,7 +134,7 @@ class Timeline:
         The same numbers come out as from the whole, but for a remainder of `_SETTLED` and rounding: filter and spline
         reach into the neighbourhood, and the spline is drawn through the same blocks of samples.
         """
-        at = self.at[first:last]
+        at = self.output_stamps[first:last]
         beyond = SPLINE_OVERLAP + (0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding)
         grid = _around(self.grid, at, beyond)
         samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], SPLINE_OVERLAP)
@@ -153,19 +157,19 @@ class Timeline:
     def evaluate(self, smoothed: FloatArray, orders: Sequence[int]) -> list[FloatArray]:
         """Derivatives (K, ...) of the given orders of channels on the grid (M, ...), at the output's stamps."""
         if self.output is None and orders[0] == 0:
-            rest = spline_derivatives(self.grid, smoothed, self.at, orders[1:]) if len(orders) > 1 else []
+            rest = spline_derivatives(self.grid, smoothed, self.output_stamps, orders[1:]) if len(orders) > 1 else []
             return [smoothed[self.kept], *rest]
-        return spline_derivatives(self.grid, smoothed, self.at, orders)
+        return spline_derivatives(self.grid, smoothed, self.output_stamps, orders)
 
-    def held(self, values: FloatArray) -> FloatArray:
+    def hold(self, values: FloatArray) -> FloatArray:
         """Values (N, ...) as recorded, at the output's stamps (K, ...): each holds until the next sample."""
         if self.keeps_stamps:
             return values[self.kept]
         slack = JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
-        last = np.searchsorted(self.native, self.at + slack, side="right") - 1
+        last = np.searchsorted(self.native, self.output_stamps + slack, side="right") - 1
         return values[np.maximum(last, 0)]
 
-    def active(self, flags: BoolArray) -> BoolArray:
+    def widen_flags(self, flags: BoolArray) -> BoolArray:
         """Flags (N, ...) at the output's stamps (K, ...): true where they are within `reach` of the stamp.
 
         A flag holds until the next sample.
@@ -174,7 +178,7 @@ class Timeline:
             return flags[self.kept]
         slack = JITTER * float(np.median(np.diff(self.native)))  # a stamp may round to just before its sample
         first, last = (
-            np.searchsorted(self.native, self.at + slack + reach, side="right") - 1
+            np.searchsorted(self.native, self.output_stamps + slack + reach, side="right") - 1
             for reach in (-self.reach, self.reach)
         )
         count = np.concatenate([np.zeros((1, *flags.shape[1:]), dtype=np.intp), np.cumsum(flags, axis=0)])
@@ -190,6 +194,8 @@ def _around(stamps: FloatArray, at: FloatArray, beyond: int) -> slice:
         min(len(stamps), -(-last // SPLINE_BLOCK) * SPLINE_BLOCK + SPLINE_OVERLAP),
     )
 
+
+# --------------------------------------------------------------------------------------------------------------- layout
 
 #: Order of the Butterworth filter, which runs forward and backward: the gain at the cutoff is 1/2.
 FILTER_ORDER = 4

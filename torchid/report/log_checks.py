@@ -1,4 +1,4 @@
-"""What the checks of a log found: a table, a document, and a picture of all channels."""
+"""Findings of the log checks as a table, a JSON document, and a figure of all channels."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COLORS = {CONDEMNED: "tab:red", SUSPICIOUS: "tab:orange", NOTE: "tab:blue"}
 _ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0  # inches
 _LETTERS, _LONGEST = 130, 600  # of size 9 in a line, and in a title
 _POINTS = 2000
-_NARROW = 1.0 / 600.0  # of the width: a single sample of a long log is to be seen
+_NARROW = 1.0 / 600.0  # of the width: a single sample of a long log stays visible
 _RANGE = (0.5, 99.5)  # percentiles that fill a row
 
 

@@ -102,7 +102,7 @@ class McapFile:
             if isinstance(record, McapChannel) and record.topic in topics:
                 wanted[record.id] = record.topic
             elif isinstance(record, Message) and record.channel_id in wanted:
-                budget.message()
+                budget.spend_message()
                 share = self._stream.tell() / self._size
                 yield Record(wanted[record.channel_id], record.log_time, record.data, share)
 
@@ -113,7 +113,7 @@ class McapFile:
             raise ValueError("no MCAP file")
         for record in _records(self._stream, True, messages, budget):
             if isinstance(record, Chunk):
-                data = decompress_chunk(record.data, record.compression, budget)
+                data = _decompress_chunk(record.data, record.compression, budget)
                 if record.uncompressed_crc and zlib.crc32(data) != record.uncompressed_crc:
                     raise ValueError("a chunk that does not match its checksum")
                 yield from _records(BytesIO(data), False, messages, budget)
@@ -122,12 +122,12 @@ class McapFile:
 
 
 def _records(stream: BinaryIO, whole: bool, messages: bool, budget: Budget) -> Iterator[Any]:
-    """Schemas, channels, chunks and, if asked for, messages, but not what else there is; of a file, up to the footer.
+    """Schemas, channels, chunks and, with `messages`, messages, but no other records; of a file, up to the footer.
 
     mcap's own loop also reads attachments, and takes minutes for the zeros that a crash may leave in a file.
     """
     while head := stream.read(_HEAD.size):
-        budget.record()
+        budget.spend_record()
         kind, size = _HEAD.unpack(head)
         if not kind:
             raise ValueError("zeros in place of a record")
@@ -157,7 +157,7 @@ _ROS1_MAGIC = b"#ROSBAG V2.0\n"
 
 
 class _Reader(rosbag1.Reader):
-    """The reader of rosbags, which trusts its files, with bounds on what a chunk and the index grow to."""
+    """The reader of rosbags, which has no limits, with limits on the size of an unpacked chunk and of the index."""
 
     _index_bytes = 0
 
@@ -176,7 +176,7 @@ class _Reader(rosbag1.Reader):
         compression = rosbag1.reader.Header.read(stream).get_string("compression")
         stream.seek(end)
         return chunk._replace(
-            decompressor=functools.partial(decompress_chunk, compression=compression, budget=self.budget)
+            decompressor=functools.partial(_decompress_chunk, compression=compression, budget=self.budget)
         )
 
     def read_index_data(self, pos: int, indexes: Any) -> None:
@@ -214,14 +214,14 @@ class Ros1File:
         """The messages of some topics."""
         connections = [x for x in self._reader.connections if x.topic in topics]
         total = max(sum(x.msgcount for x in connections), 1)
-        if connections:  # none would stand for all
+        if connections:  # rosbags takes none for all
             for i, (connection, received, data) in enumerate(self._reader.messages(connections)):
-                self._reader.budget.message()
+                self._reader.budget.spend_message()
                 yield Record(connection.topic, received, data, i / total)
 
 
 class SqliteFile:
-    """A .db3 file: tables of topics and messages, read without trusting what else a database can hold."""
+    """A .db3 file: tables of topics and messages; views and computed columns, which could run forever, are refused."""
 
     def __init__(self, path: Path) -> None:
         """Open the file, which may be on a read-only disk."""
@@ -260,22 +260,22 @@ class SqliteFile:
         (total,) = self._connection.execute("SELECT count(*) FROM messages").fetchone()
         rows = self._connection.execute("SELECT topic_id, timestamp, data FROM messages")
         for i, (topic, received, data) in enumerate(rows):
-            budget.record()
+            budget.spend_record()
             if names.get(topic) not in topics:
                 continue
-            budget.message()
+            budget.spend_message()
             if not (isinstance(received, int) and isinstance(data, bytes) and len(data) <= MAX_RECORD):
                 raise ValueError(f"message {i} has no time or no data")
             yield Record(names[topic], received, data, i / total)
 
 
-def decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
+def _decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
     """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
 
     Raises:
         ValueError: another compression, or more bytes than the budget of the file has left.
     """
-    limit = budget.most()
+    limit = budget.next_chunk_bytes()
     if compression in ("", "none"):
         out = data
     elif compression == "bz2":
@@ -288,6 +288,6 @@ def decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
     else:
         raise ValueError(f"chunks compressed by '{excerpt(compression)}'")
     if len(out) > limit:
-        raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
-    budget.expand(len(out))
+        raise ValueError(f"a chunk of {len(data)} bytes that unpacks to more than {limit}")
+    budget.spend_bytes(len(out))
     return out

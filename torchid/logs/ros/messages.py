@@ -1,4 +1,4 @@
-"""What each type of message holds, as rows of numbers, and the messages of one topic as a time series."""
+"""Decoders of each message type to rows of numbers, and the messages of one topic as a time series."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Decoder(Protocol):
     types: tuple[str, ...]
 
     def row(self, message: Any) -> FloatArray | None:
-        """The numbers (k,) of a message; None where it has nothing to say. LogError where it does not fit."""
+        """The numbers (k,) of a message; None for one to be skipped. LogError for one that does not fit."""
 
     def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
-        """What rows (N, k) mean."""
+        """The fields of a log in rows (N, k)."""
 
 
 def make_deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
-    """What makes messages of the bytes on a channel, by the definitions of ROS itself and never those in the bag.
+    """The function that deserializes the messages of a channel, by the definitions of ROS, never those in the bag.
 
     Raises:
         LogError: they are not serialized as ROS does.
@@ -89,7 +89,7 @@ class JointStates:
         self._orders: dict[tuple[str, ...], list[int] | slice | None] = {}
 
     @property
-    def others(self) -> tuple[str, ...]:
+    def other_joints(self) -> tuple[str, ...]:
         """Joints of messages that were left out."""
         left_out = (names for names, order in self._orders.items() if order is None)
         return tuple(dict.fromkeys(name for names in left_out for name in names))
@@ -186,7 +186,7 @@ class Odometry:
 
 
 class Wrench:
-    """`geometry_msgs/WrenchStamped`, or `Wrench`, which says neither when nor in which frame."""
+    """`geometry_msgs/WrenchStamped`, or `Wrench`, which has neither stamp nor frame."""
 
     types: tuple[str, ...] = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 
@@ -230,7 +230,7 @@ Stamps = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class TopicSeries:
-    """What one topic says: stamps (N,) [ns], strictly increasing, and the fields of a log (N, ...).
+    """The messages of one topic: stamps (N,) [ns], strictly increasing, and the fields of a log (N, ...).
 
     `stamped`: whether the stamps are the messages' own, and not the times of receipt.
     """
@@ -261,19 +261,19 @@ class TopicMessages:
         if 8 * len(self._values) > MAX_ARRAYS:
             raise FieldError(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
 
-    def series(self) -> TopicSeries:
+    def to_series(self) -> TopicSeries:
         """All messages in the order of their stamps, each once.
 
         Raises:
-            LogError: there are none, or some have the same stamp and say different things.
-            UnknownNameError: there are none of the joints asked for.
+            LogError: there are none, or some have the same stamp and different content.
+            UnknownNameError: no message has the joints of `logs.topics.joint_states.joints`.
 
         Warns:
             TorchidWarning: messages come twice.
         """
-        if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.others:
+        if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.other_joints:
             place, (name, *_) = "logs.topics.joint_states.joints", self._decoder.names
-            raise UnknownNameError(current_file(), place, name, self._decoder.others)
+            raise UnknownNameError(current_file(), place, name, self._decoder.other_joints)
         if not self._stamps:
             raise FieldError(self.topic, "no messages", "at least one")
         stamps: Stamps = np.array(self._stamps, dtype=np.int64)

@@ -36,21 +36,21 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class CommonClock:
+class _CommonClock:
     """The stamps (N,) [ns] of a log: those of one topic within the time that all topics cover."""
 
     stamps: Stamps
 
     @property
     def time(self) -> FloatArray:
-        """Stamps (N,) [s], counted from the first: since 1970 a float64 would tell no less than 0.2 us apart."""
+        """Stamps (N,) [s], counted from the first: a float64 since 1970 would resolve no less than 0.2 us."""
         return self.seconds(self.stamps)
 
     def seconds(self, stamps: Stamps) -> FloatArray:
         """Other stamps (K,) [ns] in seconds of this clock."""
         return (stamps - self.stamps[0]) / 1e9
 
-    def aligned(self, series: TopicSeries) -> dict[str, FloatArray]:
+    def align(self, series: TopicSeries) -> dict[str, FloatArray]:
         """The fields of a topic at the log's stamps: as they are where it has these, by a quintic spline elsewhere.
 
         Quaternions are interpolated as in `preprocess`, component by component without sign flips, then normalised.
@@ -68,8 +68,8 @@ class CommonClock:
         run = self._unbroken(series)
         return {name: self._interpolated(series, run, name) for name in series.fields}
 
-    def held(self, series: TopicSeries, values: FloatArray) -> FloatArray:
-        """Values (K, ...) of a topic as they were last said, (N, ...)."""
+    def hold(self, series: TopicSeries, values: FloatArray) -> FloatArray:
+        """The last values (K, ...) of a topic before each stamp, (N, ...)."""
         return np.asarray(values[np.searchsorted(series.stamps, self.stamps, side="right") - 1])
 
     def _unbroken(self, series: TopicSeries) -> slice:
@@ -102,9 +102,9 @@ class CommonClock:
         return out
 
 
-def make_common_clock(
+def _make_common_clock(
     rate: TopicSeries, others: Mapping[str, TopicSeries], events: Mapping[str, TopicSeries]
-) -> CommonClock:
+) -> _CommonClock:
     """The stamps of the topic `rate` within the time that all topics cover.
 
     Args:
@@ -126,7 +126,7 @@ def make_common_clock(
             f"{late.topic} starts at {late.stamps[0] / 1e9:.3f} s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
         )
         raise FieldError("time", f"no stamp of {rate.topic} that all topics cover: {found}", "one common clock")
-    return CommonClock(stamps)
+    return _CommonClock(stamps)
 
 
 #: What bags of any kind are read with.
@@ -177,14 +177,14 @@ def read_bag(
 
     Warns:
         TorchidWarning: messages without stamps, messages that come twice, channels that are NaN in part, a frame that
-            is not the one expected or that nothing says to expect.
+            is not the one expected, or where none is configured.
     """
     files = list_bag_files(path)
     if topics is not None:
         check_topics(path, topics)
     channels: dict[str, Channel] = {}
     for file in files:
-        with open_bag_file(file) as opened:
+        with _open_bag_file(file) as opened:
             for channel in opened.channels():
                 first = channels.setdefault(channel.topic, channel)
                 if first != channel:
@@ -194,14 +194,14 @@ def read_bag(
         raise FieldError("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
     bag = _Bag(topics, channels)
     _read(bag, files, progress or (lambda share: None))
-    series = {role: rows.series() for role, rows in bag.rows.items()}
+    series = {role: rows.to_series() for role, rows in bag.rows.items()}
     unstamped = dict.fromkeys(x.topic for x in series.values() if not x.stamped)
     if unstamped:
         what = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
         warn(f"{current_file()}: {', '.join(unstamped)}: {what}")
     sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
     events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
-    clock = make_common_clock(sampled[topics.rate_topic], sampled, events)
+    clock = _make_common_clock(sampled[topics.rate_topic], sampled, events)
     return {
         "time": clock.time,
         **_motion(bag, clock, series),
@@ -211,7 +211,7 @@ def read_bag(
 
 
 @contextmanager
-def open_bag_file(path: Path) -> Iterator[BagFile]:
+def _open_bag_file(path: Path) -> Iterator[BagFile]:
     """Open a .bag, .mcap or .db3 file.
 
     Raises:
@@ -255,7 +255,7 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
         users.setdefault(rows.topic, []).append(rows)
     make = {topic: make_deserializer(topic, bag.channels[topic]) for topic in users}
     for i, file in enumerate(files):
-        with open_bag_file(file) as opened:
+        with _open_bag_file(file) as opened:
             for n, record in enumerate(opened.records(users.keys())):
                 message = make[record.topic](record.data)
                 for rows in users[record.topic]:
@@ -264,12 +264,12 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
                     progress((i + record.share) / len(files))
 
 
-def _motion(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
+def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Joints, base and IMU."""
     out: dict[str, NDArray[Any]] = {}
     for role in ("joint_states", "odometry", "imu"):
         if role in series:
-            out |= clock.aligned(series[role])
+            out |= clock.align(series[role])
         decoder = bag.decoders.get(role)
         if isinstance(decoder, JointStates):
             out["joint_names"] = np.array(decoder.names, dtype=np.str_)
@@ -284,7 +284,7 @@ def _motion(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) ->
     return out
 
 
-def _contacts(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
+def _contacts(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Contacts in the order of `Topics.contacts`; NaN for the wrench of one without a topic."""
     names = bag.topics.contacts
     if not names:
@@ -300,29 +300,29 @@ def _contacts(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) 
     return out
 
 
-def _active(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
-    """Whether a contact touches, (N,), as was last said or as its force was last."""
+def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
+    """Whether a contact touches, (N,), by its last flag or its last force."""
     if name in bag.topics.contact_active:
         said = series.get(f"contact_active.{name}")
         if said is None:
             return np.ones(len(clock.stamps), dtype=np.bool_)
-        return clock.held(said, said.fields["active"])[:, 0] != 0.0
+        return clock.hold(said, said.fields["active"])[:, 0] != 0.0
     measured, threshold = series[f"contact_wrenches.{name}"], bag.topics.contact_force_threshold
     with np.errstate(over="ignore"):  # infinite is above any threshold
         force = np.linalg.norm(measured.fields["wrench"][:, :3], axis=1)
     if np.isnan(force).any() or threshold is None:
         accepted = "forces to compare with contact_force_threshold, or contact_active"
         raise FieldError(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
-    return clock.held(measured, force) > threshold
+    return clock.hold(measured, force) > threshold
 
 
 def _wrench(
-    bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
+    bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
 ) -> FloatArray:
-    return clock.aligned(series[role])["wrench"] if nothing is None or role in series else nothing
+    return clock.align(series[role])["wrench"] if nothing is None or role in series else nothing
 
 
-def _ft_sensors(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
+def _ft_sensors(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     names = tuple(bag.topics.ft_wrenches)
     if not names:
         return {}
@@ -333,10 +333,10 @@ def _ft_sensors(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]
 
 
 def _check_frame(bag: _Bag, role: str, expected: str | None, otherwise: str = "") -> None:
-    """Warn of a pose or wrench of another frame than it is taken for: nothing here could transform it.
+    """Warn of a pose or wrench in another frame than it is taken for, since nothing here can transform it.
 
-    Which link is the base, and which one a fixed joint carries, the URDF says, and that is not known here: where the
-    map of topics expects nothing, `otherwise` names what the frame is taken for, and the user has to compare.
+    The base link and the child links of fixed joints are in the URDF, which is not known here: where the map of topics
+    expects no frame, `otherwise` names the frame that is assumed, for the user to compare.
     """
     decoder = bag.decoders[role]
     if not isinstance(decoder, (Odometry, Wrench)):

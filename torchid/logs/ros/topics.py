@@ -36,7 +36,7 @@ class OdometryTopic:
     """`nav_msgs/Odometry` of the base link.
 
     `twist` is the frame its twist is expressed in, `none` to derive it from the pose. `frame` is the `child_frame_id`
-    to expect: it says that this is the base link.
+    to expect, that of the base link.
     """
 
     topic: _Name
@@ -80,7 +80,7 @@ _Contacts = dict[str, Annotated[ContactTopic, BeforeValidator(_contact)]]
 
 @dataclass(config=_STRICT, frozen=True, kw_only=True)
 class Topics:
-    """The topics of a bag; a name alone stands for a topic with default settings.
+    """The topics of a bag; a name alone is a topic with default settings.
 
     Attributes:
         joint_states: positions, velocities and efforts.
@@ -104,7 +104,7 @@ class Topics:
 
     @property
     def by_role(self) -> dict[str, JointTopic | ImuTopic | OdometryTopic | WrenchTopic | ContactTopic]:
-        """The topics by their place, such as `imu` or `ft_wrenches.l_ankle_ft`."""
+        """The topics by their role, such as `imu` or `ft_wrenches.l_ankle_ft`."""
         single = {"joint_states": self.joint_states, "imu": self.imu, "odometry": self.odometry}
         several = {
             f"{key}.{name}": topic
@@ -120,11 +120,11 @@ class Topics:
 
 
 def check_topics(source: object, topics: Topics) -> None:
-    """Make sure that a map of topics says what it has to.
+    """Make sure that a map of topics is complete.
 
     Raises:
-        ConfigError: a contact of which nothing says when it touches.
-        UnknownNameError: a rate topic that there is not.
+        ConfigError: a contact without a flag, a threshold or `always`.
+        UnknownNameError: the rate topic is none of the topics.
     """
     for name, contact in topics.contact_active.items():
         if (contact.topic is None) != contact.always:
