@@ -16,7 +16,7 @@ from paper.report import study_tables, write_study
 from paper.settings import Study
 from paper.study import Reproduction
 
-from torchid.boundary import guarded
+from torchid.boundary import run_guarded
 from torchid.commands.folder import STUDY, check_free, new_folder
 from torchid.config import load_simulation
 from torchid.report.tables import print_tables
@@ -34,7 +34,7 @@ def main() -> int:
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier study in that folder")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
     options = parser.parse_args()
-    return guarded("reproduce_paper", lambda: reproduce(options), options.debug)
+    return run_guarded("reproduce_paper", lambda: reproduce(options), options.debug)
 
 
 def reproduce(options: argparse.Namespace) -> None:

@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import Tensor, nn
 
 import torchid
-from torchid.boundary import guarded
+from torchid.boundary import run_guarded
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.errors import ConfigError
@@ -60,7 +60,7 @@ def main() -> int:
     parser.add_argument("--weight", type=float, help="of the networks' force in the loss; chosen if not given")
     parser.add_argument("--curves", type=Path, default=Path("runs/residual"), help="folder for TensorBoard")
     options = parser.parse_args()
-    return guarded("train_residual", lambda: compare(options))
+    return run_guarded("train_residual", lambda: compare(options))
 
 
 def compare(options: argparse.Namespace) -> None:
@@ -91,7 +91,7 @@ def compare(options: argparse.Namespace) -> None:
         with RunEvents(options.curves / name.replace(" ", "_"), robot.body_names, descent=True) as events:
             for _ in track(range(options.epochs), description=name):
                 epoch = trainer.run_epoch()
-                events.epoch(epoch)
+                events.write_epoch(epoch)
         seen, unseen = (trainer.loss.mean_square(MiniBatches(logs, builder)) ** 0.5 for logs in (train, test))
         shares = (f"{100.0 * epoch.shares.get(of, 0.0):.3g} %" for of in ("rigid_body", "residual"))
         table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)

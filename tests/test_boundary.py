@@ -17,7 +17,7 @@ from demo import shortened_demo
 from rich.table import Table
 from rich.text import Text
 
-from torchid.boundary import guarded
+from torchid.boundary import run_guarded
 from torchid.cli import main
 from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError, TorchidWarning, during
@@ -35,7 +35,7 @@ def stopped(error: BaseException, capsys: pytest.CaptureFixture[str]) -> tuple[i
         with during("reading", "outer.yaml"), during("reading", f"{EVIL}.npz"):
             raise error
 
-    status = guarded("torchid", command)
+    status = run_guarded("torchid", command)
     out, said = capsys.readouterr()
     assert out == ""
     assert said.count("\n") == 1
@@ -79,7 +79,7 @@ def test_arguments_that_are_not_understood_are_repeated_in_plain_text(capsys: py
 
 
 def test_a_traceback_is_shown_to_who_asks(capsys: pytest.CaptureFixture[str]) -> None:
-    assert guarded("torchid", lambda: {}["x"], debug=True) == 1
+    assert run_guarded("torchid", lambda: {}["x"], debug=True) == 1
     assert "Traceback" in capsys.readouterr().err
 
 
@@ -94,7 +94,7 @@ def test_whatever_is_printed_has_no_control_characters(capsys: pytest.CaptureFix
         warnings.warn(f"{EVIL}: a gap", TorchidWarning, stacklevel=1)
         return 0
 
-    assert guarded("torchid", command) == 0
+    assert run_guarded("torchid", command) == 0
     for said in capsys.readouterr():
         assert said
         assert all(map(is_plain, said.split("\n")))
@@ -112,7 +112,7 @@ def test_a_terminal_keeps_its_colors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     screen = Terminal()
     monkeypatch.setattr(sys, "stdout", screen)
-    assert guarded("torchid", lambda: terminal_console().print(Text(EVIL, style="red"))) == 0
+    assert run_guarded("torchid", lambda: terminal_console().print(Text(EVIL, style="red"))) == 0
     assert "\x1b[31ma\\x1b[31m" in screen.getvalue()
 
 
@@ -126,7 +126,7 @@ def test_libraries_do_not_speak_to_users(capsys: pytest.CaptureFixture[str]) -> 
         for _ in range(2):
             np.array([1e308]) * np.array([1e308])
 
-    assert guarded("torchid", command) == 0
+    assert run_guarded("torchid", command) == 0
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert said.startswith("torchid: NumericalWarning: a library met a number that it cannot handle (overflow")
@@ -140,7 +140,7 @@ def test_a_reader_who_has_enough_is_not_told(
     os.close(read)
     with open(write, "w", buffering=1) as pipe:
         monkeypatch.setattr(sys, "stdout", pipe)
-        assert guarded("torchid", lambda: sys.stdout.write("x" * 10_000) and 0) == 1
+        assert run_guarded("torchid", lambda: sys.stdout.write("x" * 10_000) and 0) == 1
     assert capsys.readouterr().err == ""
 
 

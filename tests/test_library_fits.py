@@ -83,7 +83,7 @@ def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path
 
     fit = fitter.fit(torchid.compress_parts(logs, fitter.builder))
     compared = torchid.calibrations(fit, robot, fitter.builder)
-    assert compared.identified.logs(logs) == logs, "without offsets, readings are what they are"
+    assert compared.identified.calibrate(logs) == logs, "without offsets, readings are what they are"
     np.testing.assert_array_equal(compared.nominal.phi, robot.nominal.ravel())
     with pytest.raises(LogError, match="too few to leave blocks"):
         torchid.cross_validate([logs[0][:30]], fitter)

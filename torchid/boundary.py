@@ -22,7 +22,7 @@ _NUMERICAL = (RuntimeWarning,)
 _HOW = "--debug shows where"
 
 
-def guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
+def run_guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
     """Run a command so that whatever stops it is reported in one line.
 
     What is written meanwhile, by whomever, has control characters as escapes. Libraries' warnings of numbers become a

@@ -10,7 +10,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torchid import __version__
-from torchid.boundary import guarded, plain_streams
+from torchid.boundary import plain_streams, run_guarded
 from torchid.errors import during
 from torchid.staging import interrupt_held_back as _interrupt_held_back
 
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
     with plain_streams():  # argparse repeats what it does not understand
         options = _options(arguments)
-    return guarded("torchid", lambda: _command(options), options.debug)
+    return run_guarded("torchid", lambda: _command(options), options.debug)
 
 
 def _command(options: argparse.Namespace) -> int | None:
@@ -168,8 +168,10 @@ def _print_fit(run: Identification) -> None:
         print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
     print(f"total mass    {_mass_text(run.mass)} (URDF: {run.mass.nominal:.3f} kg)")
     if run.robust is not None:
-        found = run.robust
-        print(f"robust        {found.loss}, {100 * found.mean_weight:.3g} % of the weight kept, {found.passes} passes")
+        robust = run.robust
+        print(
+            f"robust        {robust.loss}, {100 * robust.mean_weight:.3g} % of the weight kept, {robust.passes} passes"
+        )
     if robot.massless:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
 
@@ -181,11 +183,13 @@ def _print_headline(worse: list[Worse]) -> None:
         print(fill(line, 100, subsequent_indent="  "))
 
 
-def _print_validation(found: CrossValidation) -> None:
+def _print_validation(validation: CrossValidation) -> None:
     from torchid.problem.metrics import JUDGED, described
 
-    texts = (described(group, found.identified.rms.get(group), found.nominal.rms.get(group)) for group in JUDGED)
-    text = f"held out      each of {found.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
+    texts = (
+        described(group, validation.identified.rms.get(group), validation.nominal.rms.get(group)) for group in JUDGED
+    )
+    text = f"held out      each of {validation.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
     print(fill(text, 100, subsequent_indent=" " * 14))
 
 
@@ -199,12 +203,12 @@ def _mass_text(mass: TotalMass) -> str:
     return f"not determined by the data{known}"
 
 
-def _print_noise(found: NoiseSummary) -> None:
+def _print_noise(noise: NoiseSummary) -> None:
     from torchid.report.tables import noise_advice, noise_table, print_tables
 
-    print_tables(noise_table([asdict(one) for one in found.groups]))
-    if found.suggested:
-        print(noise_advice(found.suggested))
+    print_tables(noise_table([asdict(one) for one in noise.groups]))
+    if noise.suggested:
+        print(noise_advice(noise.suggested))
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -212,9 +216,9 @@ def _evaluate(options: argparse.Namespace) -> None:
         from torchid.commands.evaluate import evaluate
         from torchid.report.tables import error_tables, print_tables
 
-    found = evaluate(options.run, options.log, options.device)
-    print_tables(*error_tables(found.metrics))
-    print(f"written to    {found.output}")
+    evaluated = evaluate(options.run, options.log, options.device)
+    print_tables(*error_tables(evaluated.metrics))
+    print(f"written to    {evaluated.output}")
 
 
 def _analyze(options: argparse.Namespace) -> None:
@@ -224,12 +228,12 @@ def _analyze(options: argparse.Namespace) -> None:
         from torchid.report.analysis import accuracy_table
         from torchid.report.tables import print_tables
 
-    found = analyze(load_analysis(options.file, options.overrides), options.file)
-    for scenario in found.scenarios:
+    analysis = analyze(load_analysis(options.file, options.overrides), options.file)
+    for scenario in analysis.scenarios:
         _print_scenario(scenario)
-    if found.accuracies:
-        print_tables(accuracy_table(found.accuracies))
-    print(f"written to    {found.output}")
+    if analysis.accuracies:
+        print_tables(accuracy_table(analysis.accuracies))
+    print(f"written to    {analysis.output}")
 
 
 def _print_scenario(scenario: ScenarioAnalysis) -> None:
@@ -301,6 +305,6 @@ def _simulate(options: argparse.Namespace) -> None:
         from torchid.report.tables import print_tables, stability_table
 
     config = load_simulation(options.file, options.overrides)
-    found = simulate(config, options.file)
-    print_tables(stability_table({name: asdict(stability) for name, stability in found.items()}))
+    stabilities = simulate(config, options.file)
+    print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
     print(f"written to    {config.output}")

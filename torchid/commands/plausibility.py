@@ -43,15 +43,15 @@ def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: R
         robot: the robot.
     """
     gain = force_gain(problem)
-    if mass.determined and beyond_models(mass.value / mass.nominal):
+    if mass.determined and is_implausible_factor(mass.value / mass.nominal):
         known = f"{mass.value:.4g} ± {mass.standard_error:.2g} kg where the URDF weighs {mass.nominal:.4g} kg"
         return f"the fit's total mass is {known}{_sign_note(mass.value / mass.nominal)}"
-    if gain is not None and beyond_models(gain):
+    if gain is not None and is_implausible_factor(gain):
         return f"the measured forces are {gain:.3g} times what the URDF's bodies need{_sign_note(gain)}"
     return next(_beyond_bounds(phi.reshape(-1, PER_BODY), robot), None)
 
 
-def beyond_models(ratio: float) -> bool:
+def is_implausible_factor(ratio: float) -> bool:
     """Whether no model of a robot is off by this factor."""
     return not 1.0 / OFF <= ratio <= OFF
 
@@ -156,7 +156,7 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     return mass
 
 
-def require_not_worse(found: list[Worse], scene: Scene) -> None:
+def require_not_worse(worse: list[Worse], scene: Scene) -> None:
     """Refuse a fit that predicts worse than the URDF if the checks condemn a training log; else warn.
 
     Raises:
@@ -165,9 +165,9 @@ def require_not_worse(found: list[Worse], scene: Scene) -> None:
     Warns:
         NumericalWarning: the URDF's parameters predict better, for whatever reason.
     """
-    if not found:
+    if not worse:
         return
-    message, advice = verdict(found), ADVICE
+    message, advice = verdict(worse), ADVICE
     log, finding = next(_findings(scene), (None, None))
     if finding is not None:
         message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice

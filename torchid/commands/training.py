@@ -176,7 +176,7 @@ def training_folder(output: Path) -> Path:
     return output.with_name(f"{output.name}.training")
 
 
-def check_training(config: ExperimentConfig, resume: bool, source: object) -> None:
+def require_trainable(config: ExperimentConfig, resume: bool, source: object) -> None:
     """Make sure, before any work, that a training may start or go on.
 
     Raises:
@@ -266,7 +266,7 @@ class Training:
             if fnmatchcase(path.name, EVENTS):
                 shutil.copy2(path, folder)
 
-    def forget(self) -> None:
+    def remove_checkpoint(self) -> None:
         """Remove the checkpoint of a run that is done.
 
         Warns:
@@ -283,7 +283,7 @@ class Training:
         saved = time.monotonic()
         while not trainer.finished:
             epoch = trainer.run_epoch()
-            events.epoch(epoch)
+            events.write_epoch(epoch)
             if epoch.number % training.evaluate_every == 0 or trainer.finished:
                 self._evaluate(epoch.number, trainer.phi(), evaluate, events)
             if time.monotonic() - saved >= training.checkpoint_seconds or trainer.finished:
@@ -292,8 +292,8 @@ class Training:
             progress(_described(epoch))
 
     def _evaluate(self, step: int, phi: Array, evaluate: Evaluate, events: RunEvents) -> None:
-        events.errors(step, evaluate(phi))
-        events.eigenvalues(step, body_eigenvalues(self.robot, phi))
+        events.write_errors(step, evaluate(phi))
+        events.write_eigenvalues(step, body_eigenvalues(self.robot, phi))
 
     def _prepare(self, trainer: Trainer, resume: bool) -> None:
         """Start a new folder, or take up what is in it."""

@@ -78,11 +78,11 @@ def estimate_extras(
         _names(assembly.problem.free, body_names),
     )
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
-    shared = next((found for found in assembly.eliminations if not found.log), None)
+    shared = next((elimination for elimination in assembly.eliminations if not elimination.log), None)
     values = zip(assembly.unknowns(estimate.phi), assembly.unknowns(assembly.problem.nominal), strict=True)
     out = []
-    for found, pair in zip(assembly.eliminations, values, strict=True):
-        out += _estimates(found, pair, noise, covariance, names, shared if found.log else None)
+    for elimination, pair in zip(assembly.eliminations, values, strict=True):
+        out += _estimates(elimination, pair, noise, covariance, names, shared if elimination.log else None)
     return out
 
 
@@ -258,7 +258,7 @@ class ParameterCovariance:
 
 
 def _estimates(
-    found: Elimination,
+    elimination: Elimination,
     values: tuple[Array, Array],
     noise: float,
     covariance: ParameterCovariance,
@@ -267,9 +267,9 @@ def _estimates(
 ) -> list[ExtraEstimate]:
     """The extra parameters of one elimination, at identified and nominal parameters; `shared`: those they depend on."""
     P = len(covariance.free)
-    sensitivity, own, hidden = found.inverse @ found.C[:, :P], [found.inverse], [found.hidden]
+    sensitivity, own, hidden = elimination.inverse @ elimination.C[:, :P], [elimination.inverse], [elimination.hidden]
     if shared is not None:
-        through = found.inverse @ found.C[:, P:]
+        through = elimination.inverse @ elimination.C[:, P:]
         sensitivity = sensitivity - through @ shared.inverse @ shared.C[:, :P]
         own.append(through @ shared.inverse)
         hidden.append(through @ shared.hidden)
@@ -278,25 +278,26 @@ def _estimates(
     lost = np.linalg.norm(G @ covariance.null_space, axis=1) > ROUNDING * size
     through_parameters = ((G @ covariance.root) ** 2).sum(1)
     variance = sum((x**2).sum(1) for x in own) + through_parameters
-    undetermined = lost | ~found.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > ROUNDING)
+    undetermined = lost | ~elimination.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > ROUNDING)
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
-    for k, extra in enumerate(found.extras):
-        if not np.isfinite(found.alone[k]):
+    for k, extra in enumerate(elimination.extras):
+        if not np.isfinite(elimination.alone[k]):
             continue
-        inflation = float(deviation[k] / found.alone[k])
+        inflation = float(deviation[k] / elimination.alone[k])
         confounded: tuple[str, ...] = ()
         if inflation > INFLATION_LIMIT:
             by_bodies = lost[k] or 2.0 * through_parameters[k] > variance[k]
             confounded = _largest(covariance.variance_shares(G[k], noise), names) if by_bodies else ()
-            others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.hidden[k]), _labels(found))
+            hidden_others = np.where(np.arange(len(elimination.extras)) == k, 0.0, elimination.hidden[k])
+            others = _largest(hidden_others, _labels(elimination))
             confounded = (*confounded, *others)
         error = noise * float(deviation[k]) if np.isfinite(deviation[k]) else np.inf
         value, nominal = (float(x[k]) for x in values)
         out.append(
             ExtraEstimate(
                 extra=extra,
-                log=found.log,
+                log=elimination.log,
                 value=value,
                 nominal_value=nominal,
                 standard_error=error,
@@ -307,8 +308,8 @@ def _estimates(
     return out
 
 
-def _labels(found: Elimination) -> list[str]:
-    return [extra.label for extra in found.extras]
+def _labels(elimination: Elimination) -> list[str]:
+    return [extra.label for extra in elimination.extras]
 
 
 def _largest(along: Array, names: Sequence[str]) -> tuple[str, ...]:

@@ -130,8 +130,9 @@ class ScaledParts:
         for i in chosen:
             by_source.setdefault(self.parts[i].source if self.nuisance.of_log else "", []).append(self._factors[i])
         nothing = np.empty((0, self._factors[0].shape[1] - len(self.nuisance.of_log)))
-        found = (without(triangular_factor(np.concatenate(same)), self.nuisance.of_log) for same in by_source.values())
-        return triangular_factor(np.concatenate([nothing, *found]))
+        logs = (triangular_factor(np.concatenate(same)) for same in by_source.values())
+        of_sources = (without(X, self.nuisance.of_log) for X in logs)
+        return triangular_factor(np.concatenate([nothing, *of_sources]))
 
     @cached_property
     def everything(self) -> Array:
@@ -212,8 +213,8 @@ def _sensor_information(
         return sensor_information(logs, builder, done=done).map(scaled)
     sources = {samples.source: [other for other in logs if other.source == samples.source] for samples in logs}
     most = max(SAMPLES // len(sources), 1)
-    found = (sensor_information(same, builder, most, done).map(scaled) for same in sources.values())
-    return add_information([information.marginal(nuisance.of_log) for information in found])
+    of_logs = (sensor_information(same, builder, most, done).map(scaled) for same in sources.values())
+    return add_information([information.marginal(nuisance.of_log) for information in of_logs])
 
 
 def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Sequence[str]) -> list[SensorContribution]:
@@ -228,7 +229,7 @@ def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Seq
         for place, H in lost.items():
             gone = everything - _gain(information.total - H)
             out.append(SensorContribution(names[place], gone.bits, gone.determined, kind))
-    return sorted(out, key=lambda found: -found.bits)
+    return sorted(out, key=lambda sensor: -sensor.bits)
 
 
 def _gain(H: Array) -> InformationGain:

@@ -69,8 +69,8 @@ def expected_errors(
             sums.rows.add(_together(errors), weight)
             for inside in projected(builder, samples, state, without_contacts):
                 sums.projected.add(_together(inside).flatten()[:, None], weight)
-    found = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
-    return ExpectedErrors(*({group: figure(rms[group]) for group in GROUPS} for rms in found))
+    errors_rms = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
+    return ExpectedErrors(*({group: figure(rms[group]) for group in GROUPS} for rms in errors_rms))
 
 
 @one_thread()

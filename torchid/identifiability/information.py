@@ -129,21 +129,21 @@ class SensorInformation:
         """Information about the other columns, where some are unknown."""
         size = np.diag(self.total)[list(unknown)]
         total = marginal_information(self.total, unknown, size)
-        found = self.map(lambda H: total - marginal_information(self.total - H, unknown, size))
-        return replace(found, total=total)
+        lost = self.map(lambda H: total - marginal_information(self.total - H, unknown, size))
+        return replace(lost, total=total)
 
 
-def add_information(found: Sequence[SensorInformation]) -> SensorInformation:
+def add_information(parts: Sequence[SensorInformation]) -> SensorInformation:
     """Of logs together that have no unknown in common but the columns."""
 
     def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
         return {place: np.asarray(sum(one[place] for one in matrices)) for place in matrices[0]}
 
     return SensorInformation(
-        np.asarray(sum(one.total for one in found)),
-        added([one.torques for one in found]),
-        added([one.limbs for one in found]),
-        added([one.wrenches for one in found]),
+        np.asarray(sum(one.total for one in parts)),
+        added([one.torques for one in parts]),
+        added([one.limbs for one in parts]),
+        added([one.wrenches for one in parts]),
     )
 
 
@@ -193,12 +193,12 @@ def sensor_information(
                     total[place] += rows_information(_span(C, W) @ K, weight)
         if done is not None:
             done(len(samples))
-    found = total.cpu().numpy()
+    information = total.cpu().numpy()
     return SensorInformation(
-        found[0],
-        dict(zip(joints, found[1:], strict=False)),
-        dict(zip(limbs, found[1 + len(joints) :], strict=False)),
-        dict(zip(contacts, found[first:], strict=True)),
+        information[0],
+        dict(zip(joints, information[1:], strict=False)),
+        dict(zip(limbs, information[1 + len(joints) :], strict=False)),
+        dict(zip(contacts, information[first:], strict=True)),
     )
 
 
