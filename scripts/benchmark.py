@@ -24,12 +24,12 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from torchid.errors import TorchidWarning, install
+from torchid.errors import TorchidWarning, how_to_install
 from torchid.estimators import Consistent, LeastSquares
-from torchid.parameters import FRICTION, Array, perturbed
+from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.rows import ChunkTerms
+from torchid.problem.rows import ChunkDynamics
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
@@ -63,7 +63,7 @@ def robots_folder() -> Path:
         found = folder / "share" / "example-robot-data" / "robots"
         if found.is_dir():
             return found
-    raise SystemExit(f"benchmark: the package example-robot-data is missing; {install('oracle')}")
+    raise SystemExit(f"benchmark: the package example-robot-data is missing; {how_to_install('oracle')}")
 
 
 def random_samples(robot: Robot, contacts: int, count: int) -> Samples:
@@ -94,7 +94,7 @@ class PerSample:
         self.feet = [self.model.getFrameId(foot, pin.FrameType.BODY) for foot in case.feet]
         self.rows = 3 if case.kind == "point" else 6
         noise = SensorNoise()
-        self.variance = np.append(noise.base, np.full(robot.n, noise.joint_torque)) ** 2
+        self.variance = np.append(noise.base_std, np.full(robot.n, noise.joint_torque)) ** 2
 
     def states(self, samples: Samples) -> tuple[Array, Array, Array, Array]:
         """Pinocchio's q, v, a and the torques in its order."""
@@ -175,7 +175,7 @@ def measure_consistent(count: int, repeats: int) -> dict[str, float]:
     contacts = [Contact(foot, case.kind) for foot in case.feet]
     noise = 0.1
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts), SensorNoise(noise)))
-    phi = perturbed(robot.nominal, 0.2, np.random.default_rng(0))
+    phi = perturb_parameters(robot.nominal, 0.2, np.random.default_rng(0))
     phi[1:, FRICTION] = 0.1
     samples = torques_of(robot, case, random_samples(robot, len(contacts), count), phi.flatten(), noise)
     estimators: dict[str, LeastSquares | Consistent] = {
@@ -231,8 +231,8 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
 
         return run
 
-    def reduced(part: Samples) -> ChunkTerms:
-        return builder.terms(part)
+    def reduced(part: Samples) -> ChunkDynamics:
+        return builder.dynamics(part)
 
     contestants: dict[str, tuple[Callable[[], object], int]] = {
         "K, Pinocchio": (lambda: old.regressors(few), len(few)),

@@ -75,7 +75,7 @@ def compare(options: argparse.Namespace) -> None:
     train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))
     problem = torchid.linear_problem(torchid.compress(train, builder), builder, robot, config.estimator.friction)
     settings = Sgd(
-        ridge=config.estimator.pull,
+        ridge=config.estimator.numeric_ridge,
         epochs=options.epochs,
         residual=options.mode,
         residual_lr=0.01,

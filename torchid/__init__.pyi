@@ -10,7 +10,7 @@ from .estimators import (
     LogCholeskyParameters,
     Sgd,
     Trainer,
-    project,
+    nearest_consistent,
     violations,
 )
 from .fitting.calibration import (
@@ -45,7 +45,6 @@ from .identifiability.structure import (
 )
 from .log_checks import (
     Checked,
-    without_condemned,
 )
 from .log_checks.check import (
     check,
@@ -66,13 +65,13 @@ from .problem import (
     RowBuilder,
     TriangularFactor,
     assemble,
-    bind,
+    bind_log,
     compress,
     compress_parts,
     linear_problem,
 )
 from .problem.compression import (
-    in_folds,
+    split_into_folds,
 )
 from .regressor import (
     FrameJacobian,
@@ -129,7 +128,7 @@ __all__ = [
     "TriangularFactor",
     "assemble",
     "base_parameters",
-    "bind",
+    "bind_log",
     "calibrations",
     "check",
     "choose_ridge",
@@ -141,17 +140,16 @@ __all__ = [
     "estimate_noise",
     "fit_robustly",
     "frozen_parameters",
-    "in_folds",
+    "split_into_folds",
     "linear_problem",
     "load_robot",
     "motion_from_state",
     "named_sensors",
     "preprocess",
-    "project",
+    "nearest_consistent",
     "read_log",
     "structural_problem",
     "violations",
     "with_ft_sensors",
-    "without_condemned",
     "write_log",
 ]

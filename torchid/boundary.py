@@ -11,8 +11,8 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from torchid.errors import BaseLostError, InputError, TorchidWarning, doing_of
-from torchid.staging import begin, ending_interrupts, written
+from torchid.errors import BaseLostError, InputError, TorchidWarning, activity_of
+from torchid.staging import forget_written, list_written, termination_as_interrupt
 from torchid.text import EscapedStream, one_line
 
 #: What the machine refuses, and not the user's files nor the program: no room, no memory, no permission.
@@ -42,8 +42,8 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
         warnings.simplefilter("always", TorchidWarning)
         warnings.showwarning = _Warnings(program, debug)
         try:
-            begin()
-            with ending_interrupts():
+            forget_written()
+            with termination_as_interrupt():
                 status = command() or 0
             sys.stdout.flush()
             return status
@@ -51,7 +51,7 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
             _forget(sys.stdout)
             return 1
         except KeyboardInterrupt as interrupt:
-            _say(program, str(interrupt) or f"interrupted; {written()} was written")
+            _say(program, str(interrupt) or f"interrupted; {list_written()} was written")
             return 1
         except Exception as error:  # a full disk, or a bug: still one line, unless --debug is given
             if debug:
@@ -65,7 +65,7 @@ def describe_error(error: Exception) -> tuple[int, str]:
     """Exit status and the one line that says what stopped a command."""
     if isinstance(error, (InputError, BaseLostError)):
         return 2, str(error)
-    doing = doing_of(error)
+    doing = activity_of(error)
     where = f"{doing}: " if doing else ""
     if isinstance(error, MemoryError):
         return 1, f"{where}not enough memory ({str(error) or 'the system gives no more'}); accepted: smaller logs"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from torchid import __version__
 from torchid.boundary import plain_streams, run_guarded
 from torchid.errors import during
-from torchid.staging import interrupt_held_back as _interrupt_held_back
+from torchid.staging import interrupts_deferred as _interrupt_held_back
 
 if TYPE_CHECKING:
     from torchid.commands import Identification
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchid.fitting.cross_validation import CrossValidation
     from torchid.fitting.noise import NoiseSummary
     from torchid.identifiability.confounding import TotalMass
-    from torchid.problem.metrics import Worse
+    from torchid.problem.metrics import WorseThanNominal
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
@@ -148,7 +148,7 @@ def _identify(options: argparse.Namespace) -> None:
 def _print_fit(run: Identification) -> None:
     """Key figures, a line each."""
     from torchid.commands.training import body_eigenvalues
-    from torchid.estimators import BoundEstimate, ConsistentEstimate, SgdEstimate
+    from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, SgdEstimate
 
     estimate, robot = run.estimate, run.experiment.robot
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
@@ -160,8 +160,8 @@ def _print_fit(run: Identification) -> None:
         print(f"ridge         {run.ridge.ridge:g}, chosen by what predicts left-out blocks of the training logs")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
-    if isinstance(estimate, BoundEstimate) and estimate.relative_price is not None:
-        print(f"objective     {100.0 * estimate.relative_price:.3g} % above the least without conditions")
+    if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
+        print(f"objective     {100.0 * estimate.relative_increase:.3g} % above the least without conditions")
     if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
         print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
     if isinstance(estimate, SgdEstimate):
@@ -176,19 +176,21 @@ def _print_fit(run: Identification) -> None:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
 
 
-def _print_headline(worse: list[Worse]) -> None:
-    from torchid.problem.metrics import ADVICE, verdict
+def _print_headline(worse: list[WorseThanNominal]) -> None:
+    from torchid.problem.metrics import ADVICE, describe_worse
 
-    for line in (f"WORSE THAN URDF: {verdict(worse)}", f"{ADVICE}; the results are written all the same, status 0"):
+    for line in (
+        f"WORSE THAN URDF: {describe_worse(worse)}",
+        f"{ADVICE}; the results are written all the same, status 0",
+    ):
         print(fill(line, 100, subsequent_indent="  "))
 
 
 def _print_validation(validation: CrossValidation) -> None:
-    from torchid.problem.metrics import JUDGED, described
+    from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 
-    texts = (
-        described(group, validation.identified.rms.get(group), validation.nominal.rms.get(group)) for group in JUDGED
-    )
+    identified, nominal = validation.identified.rms, validation.nominal.rms
+    texts = (describe_errors(group, identified.get(group), nominal.get(group)) for group in DECISIVE_GROUPS)
     text = f"held out      each of {validation.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
     print(fill(text, 100, subsequent_indent=" " * 14))
 
@@ -271,19 +273,19 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     with _interrupt_held_back():
-        from torchid.commands.check import check_files, check_outputs, write_outputs
-        from torchid.report.log_checks import heading, hygiene_table, not_checked
+        from torchid.commands.check import check_files, check_outputs, write_check_outputs
+        from torchid.report.log_checks import finding_table, log_heading, skipped_checks_text
         from torchid.report.tables import print_tables
 
     check_outputs(options.json, options.figure, options.overwrite, (options.file, options.urdf, options.topics))
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
-    write_outputs(checked, options.json, options.figure)
+    write_check_outputs(checked, options.json, options.figure)
     for one in checked:
-        print(heading(one))
+        print(log_heading(one))
         if one.findings:
-            print_tables(hygiene_table(one.findings))
-        if missing := not_checked(one):
+            print_tables(finding_table(one.findings))
+        if missing := skipped_checks_text(one):
             print(fill(f"not checked   {missing}", 100, subsequent_indent=" " * 14))
         print(fill(f"verdict       {one.verdict}", 100, subsequent_indent=" " * 14))
         print()

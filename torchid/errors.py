@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import inspect
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 from torchid.text import one_line
 
@@ -38,6 +41,17 @@ class LogError(InputError):
     """A log that is malformed, inconsistent, or lacks what the run needs."""
 
 
+class FieldError(LogError):
+    """A field of the log at hand, or a column or topic, is not what it should be; `about_file` says of which file."""
+
+    def __init__(self, field: str, found: str, accepted: str) -> None:
+        super().__init__(current_file(), field, found, accepted)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Another process works on another file."""
+        return LogError, (self.source, self.field, self.found, self.accepted)
+
+
 class ConfigError(InputError):
     """An experiment file or an override with an unknown key or an unusable value."""
 
@@ -57,7 +71,7 @@ class UnknownNameError(InputError, KeyError):
         """Take the name and those that are valid; `what` the name stands for elsewhere, if it is not unknown."""
         self.name, self.valid, self.what = name, tuple(valid), what
         found = f"'{name}', {what}" if what else f"unknown name '{name}'"
-        super().__init__(source, field, found, nearest(name, self.valid))
+        super().__init__(source, field, found, nearest_names(name, self.valid))
 
     def __reduce__(self) -> tuple[object, ...]:
         return type(self), (self.source, self.field, self.name, self.valid, self.what)
@@ -93,33 +107,65 @@ class NumericalWarning(TorchidWarning):
     """A result whose accuracy is limited by the conditioning of the problem."""
 
 
-def install(extra: str) -> str:
+def warn(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
+    """Warn, as of the line outside of torchid that led here: that is the line that a user can change.
+
+    Args:
+        message: one line.
+        category: of the warning.
+    """
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __package__:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
+
+
+def how_to_install(extra: str) -> str:
     """How to install the packages of an extra; the name torchid on PyPI is not ours."""
     return f"pip install '.[{extra}]' in the clone of torchid"
 
 
+_file: ContextVar[str] = ContextVar("_file", default="")
+
+
+@contextmanager
+def about_file(file: object) -> Iterator[None]:
+    """Let errors and warnings within the block that name a field alone be about a field of this file."""
+    token = _file.set(str(file))
+    try:
+        yield
+    finally:
+        _file.reset(token)
+
+
+def current_file() -> str:
+    """The file that the innermost `about_file` names; empty outside of all."""
+    return _file.get()
+
+
 @contextmanager
 def during(doing: str, source: object) -> Iterator[None]:
-    """Let an error that leaves the block say what was being done to which file: the innermost block says it.
+    """As `about_file`; and let an error that leaves the block say what was being done to it: the innermost says it.
 
     Args:
         doing: such as "reading".
         source: the file or folder.
     """
     try:
-        yield
+        with about_file(source):
+            yield
     except Exception as error:
-        if not doing_of(error):
+        if not activity_of(error):
             error._torchid_doing = f"{doing} {source}"  # type: ignore[attr-defined]
         raise
 
 
-def doing_of(error: BaseException) -> str:
+def activity_of(error: BaseException) -> str:
     """What was being done when an error came up, as `during` noted; empty if it did not."""
     return str(getattr(error, "_torchid_doing", ""))
 
 
-def nearest(name: str, valid: Iterable[str], limit: int = 3) -> str:
+def nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:
     """The names in `valid` closest to `name`, or the first few of them, as one readable string."""
     valid = list(valid)
     close = difflib.get_close_matches(name, valid, n=limit, cutoff=0.5)

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from torchid.errors import LogError
-from torchid.text import is_plain, shown
+from torchid.text import excerpt, is_plain
 
 MEBIBYTE = 2**20
 
@@ -105,25 +105,25 @@ def read_bytes(path: Path, most: int) -> bytes:
             content = stream.read(most + 1)
             if len(content) <= most:
                 return content
-    raise ValueError(f"more than {in_mebibytes(most)}")
+    raise ValueError(f"more than {format_bytes(most)}")
 
 
-def in_mebibytes(size: int) -> str:
+def format_bytes(size: int) -> str:
     """A limit in words."""
     return f"{size // MEBIBYTE} MiB" if size >= MEBIBYTE else f"{size} bytes"
 
 
-def most_expanded(size: int) -> int:
+def max_unpacked_bytes(size: int) -> int:
     """Bytes that a log file of `size` bytes may come to when it is unpacked."""
     return max(MAX_SMALL, MAX_GROWTH * size, MAX_GROWTH_LARGE * (size - LARGE))
 
 
-def check_growth(path: Path, total: int) -> None:
+def check_unpacked_size(path: Path, total: int) -> None:
     """Raise LogError where a file declares arrays of `total` bytes that it is far too small for."""
     size = path.stat().st_size
-    if total > most_expanded(size):
+    if total > max_unpacked_bytes(size):
         found = f"arrays of {total} bytes in a file of {size}"
-        accepted = f"at most {most_expanded(size)} bytes in a file of this size"
+        accepted = f"at most {max_unpacked_bytes(size)} bytes in a file of this size"
         raise LogError(path, "file", found, accepted)
 
 
@@ -144,10 +144,10 @@ def check_names(shape: Sequence[int], longest: int = 0) -> None:
         raise ValueError(f"a name of {longest} characters, more than {MAX_LETTERS}")
 
 
-def plain(text: str) -> str:
+def require_plain_name(text: str) -> str:
     """A name, ValueError where no name is like that and no message can show it."""
     if len(text) > MAX_LETTERS or not is_plain(text):
-        raise ValueError(f"a name of {len(text)} characters: {shown(text)}")
+        raise ValueError(f"a name of {len(text)} characters: {excerpt(text)}")
     return text
 
 
@@ -156,7 +156,7 @@ class Budget:
 
     def __init__(self, size: int) -> None:
         """For a file of `size` bytes."""
-        self._bytes = most_expanded(size)
+        self._bytes = max_unpacked_bytes(size)
         self._records = FREE_RECORDS + size // RECORD_BYTES
         self._messages = FREE_MESSAGES + size // MESSAGE_BYTES
 

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 PARAMETERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "fc", "fv")
 UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6, "N m", "N m s/rad")
 PER_BODY = len(PARAMETERS)
@@ -22,6 +21,8 @@ INERTIA_AXES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 PINOCCHIO_ORDER = (0, 1, 2, 3, 4, 5, 7, 6, 8, 9)
 """`phi[list(PINOCCHIO_ORDER)]` are the ten inertial numbers in Pinocchio's order (Ixx, Ixy, Iyy, Ixz, Iyz, Izz)."""
+
+WRENCH_COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
 def inertia_matrix(phi: Array) -> Array:
@@ -111,7 +112,7 @@ def least_eigenvalues(phi: Array, scale: Array) -> Array:
     return eigenvalues
 
 
-def perturbed(phi: Array, error: float, rng: np.random.Generator) -> Array:
+def perturb_parameters(phi: Array, error: float, rng: np.random.Generator) -> Array:
     """Parameters (L, 12) of bodies that differ from `phi` by up to a share `error`, yet could exist as well as those.
 
     Mass, each coordinate of the centre of mass, and the inertia about it are multiplied by factors from 1 - error to
@@ -123,6 +124,3 @@ def perturbed(phi: Array, error: float, rng: np.random.Generator) -> Array:
         factors = 1.0 + error * rng.uniform(-1.0, 1.0, 5)
         out[body, INERTIAL] = inertial_vector(factors[0] * mass, factors[1:4] * com, factors[4] * inertia)
     return out
-
-
-COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")

@@ -18,7 +18,7 @@ _written: list[str] = []
 
 
 @contextmanager
-def interrupt_held_back() -> Iterator[None]:
+def interrupts_deferred() -> Iterator[None]:
     """Let Ctrl-C act when the block is done: what stands in it is short, and must happen as a whole.
 
     Raises:
@@ -38,7 +38,7 @@ def interrupt_held_back() -> Iterator[None]:
 
 
 @contextmanager
-def ending_interrupts() -> Iterator[None]:
+def termination_as_interrupt() -> Iterator[None]:
     """Let SIGTERM, and SIGHUP of a terminal that closes, end a command as Ctrl-C does, which leaves nothing behind.
 
     One that is ignored stays so: SIGHUP after `nohup`.
@@ -66,7 +66,7 @@ def _as_interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
 
-def begin() -> None:
+def forget_written() -> None:
     """A command begins: it has written nothing yet."""
     _written.clear()
 
@@ -76,7 +76,7 @@ def note_written(result: object) -> None:
     _written.append(str(result))
 
 
-def written() -> str:
+def list_written() -> str:
     """What a command has written, in words."""
     return ", ".join(_written) or "nothing"
 
@@ -86,6 +86,8 @@ try:
 except ImportError:  # not on Windows, where what a killed process left stays
     fcntl = None  # type: ignore[assignment]
 
+CAN_LOCK = fcntl is not None
+
 NEW, OLD = "new", "old"  # what is being made, and what it replaces
 _LOCK = "lock"
 _NAME = re.compile(r"\..+-[0-9a-f]{8}\.torchid", re.DOTALL)
@@ -93,7 +95,7 @@ _TRIES = 100
 
 
 @contextmanager
-def staging(target: Path) -> Iterator[Path]:
+def staging_folder(target: Path) -> Iterator[Path]:
     """A hidden folder beside `target`, locked by this process, that goes with the block, but for an `old` in it.
 
     Raises:
@@ -101,17 +103,17 @@ def staging(target: Path) -> Iterator[Path]:
     """
     folder, lock = target, -1
     try:
-        with interrupt_held_back():
+        with interrupts_deferred():
             folder, lock = _made(target)
         yield folder
     finally:
-        with interrupt_held_back():
+        with interrupts_deferred():
             if folder != target:
                 _discard(folder, lock)
 
 
 @contextmanager
-def whole_file(path: Path, result: bool = True) -> Iterator[Path]:
+def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
     """A temporary name that becomes `path` when the block ends without an error; a link at `path` is not followed.
 
     Args:
@@ -122,9 +124,9 @@ def whole_file(path: Path, result: bool = True) -> Iterator[Path]:
         OSError: the file cannot be written.
     """
     clear_leftovers(path)
-    with staging(path) as folder:
+    with staging_folder(path) as folder:
         yield folder / NEW
-        with interrupt_held_back():
+        with interrupts_deferred():
             (folder / NEW).replace(path)
             if result:
                 note_written(path)
@@ -163,21 +165,21 @@ def _made(target: Path) -> tuple[Path, int]:
     for _ in range(_TRIES):
         folder = target.with_name(f".{target.name}-{secrets.token_hex(4)}.torchid")
         folder.mkdir()
-        if fcntl is None:
+        if not CAN_LOCK:
             return folder, -1
         with suppress(FileNotFoundError):
             lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-            if _locked(folder, lock) is not False:
+            if lock_file(lock, folder / _LOCK) is not False:
                 return folder, lock
             os.close(lock)
     raise FileNotFoundError(f"{target.parent}: another process removes every folder that is made there")
 
 
-def _locked(folder: Path, lock: int) -> bool | None:
-    """Whether a descriptor of its lock now holds a folder; None where the file system knows no locks."""
+def lock_file(handle: int, path: Path) -> bool | None:
+    """Whether a descriptor of a file now locks what is at its path; None where the file system knows no locks."""
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(lock), os.lstat(folder / _LOCK))
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(handle), os.lstat(path))
     except (BlockingIOError, FileNotFoundError):
         return False
     except OSError:
@@ -186,7 +188,7 @@ def _locked(folder: Path, lock: int) -> bool | None:
 
 def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
     """The folder if it is of a process that is gone; removed afterwards, unless it is to be kept."""
-    if fcntl is None or folder.is_symlink() or not folder.is_dir():
+    if not CAN_LOCK or folder.is_symlink() or not folder.is_dir():
         return
     lock = -1
     try:
@@ -195,7 +197,7 @@ def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
             return
         if _LOCK in names:
             lock = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            if not _locked(folder, lock):
+            if not lock_file(lock, folder / _LOCK):
                 return
         yield folder
         if not keep:

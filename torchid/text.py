@@ -15,14 +15,14 @@ def is_plain(text: str) -> bool:
     return text.isprintable() or not any(unicodedata.category(letter) in _UNPLAIN for letter in text)
 
 
-def shown(text: str, longest: int = 100) -> str:
+def excerpt(text: str, longest: int = 100) -> str:
     """The text as a message may repeat it: control characters as escapes, the middle of a long one left out."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 4 :]} ({len(text)} characters)"
-    return escaped(text)
+    return escape(text)
 
 
-def escaped(text: str, kept: str = "") -> str:
+def escape(text: str, kept: str = "") -> str:
     """The text with what is not plain as escapes, but for some characters that are kept."""
     if is_plain(text):
         return text
@@ -31,19 +31,19 @@ def escaped(text: str, kept: str = "") -> str:
 
 def one_line(text: str) -> str:
     """The text on one line, of plain characters."""
-    return escaped(" ".join(text.split()))
+    return escape(" ".join(text.split()))
 
 
 class EscapedStream:
     """A stream for people, to which nothing is written that moves the cursor or hides: only lines of plain text."""
 
     def __init__(self, stream: Any) -> None:
-        """Write to a stream, which `unescaped` gives back to who takes care of itself."""
+        """Write to a stream, which `raw_stream` gives back to who takes care of itself."""
         self.plain_stream = stream
 
     def write(self, text: str) -> int:
         """Write a text; its length."""
-        self.plain_stream.write(escaped(text, "\n\t"))
+        self.plain_stream.write(escape(text, "\n\t"))
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
@@ -55,16 +55,16 @@ class EscapedStream:
         return getattr(self.plain_stream, name)
 
 
-def unescaped(stream: Any) -> Any:
+def raw_stream(stream: Any) -> Any:
     """The stream below an `EscapedStream`."""
     return getattr(stream, "plain_stream", stream)
 
 
-def listed(names: Sequence[str], most: int = 4) -> str:
+def join_names(names: Sequence[str], most: int = 4) -> str:
     """Names joined by commas, the first few of many."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def counted(count: int, what: str) -> str:
+def count_of(count: int, what: str) -> str:
     """A number of things, as in "1 gap" and "3 gaps"."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"

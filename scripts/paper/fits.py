@@ -12,11 +12,11 @@ from torchid.fitting.estimator import batch_estimator, conditions_from
 from torchid.fitting.experiment import Experiment
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, TriangularFactor, linear_problem
-from torchid.problem.chunks import by_state
-from torchid.problem.compression import compress_by_state, merged
+from torchid.problem.chunks import chunks_by_state
+from torchid.problem.compression import compress_by_state, merge_factors
 from torchid.problem.contact_state import State, state_name
 from torchid.problem.metrics import BASE_ROWS
-from torchid.problem.predict import force_series, in_null_space
+from torchid.problem.predict import force_series, null_space_part
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class CompressedLogs:
 
     def fit(self, groups: Sequence[str], nominals: Sequence[Array], friction: bool) -> list[Estimate]:
         """Parameters from some groups of logs, near each of some nominal ones (L, 12)."""
-        factor = merged((factor for group in groups for factor in self.factors[group].values()), self.builder)
+        factor = merge_factors((factor for group in groups for factor in self.factors[group].values()), self.builder)
         return [self._solve(factor, nominal, friction) for nominal in nominals]
 
     def ranks(self, groups: Sequence[str], friction: bool) -> list[StateRank]:
@@ -50,7 +50,7 @@ class CompressedLogs:
         for state in {state for group in groups for state in self.factors[group]}:
             factors = (self.factors[group][state] for group in groups if state in self.factors[group])
             samples = sum(self.counts[group].get(state, 0) for group in groups)
-            rank = self._solve(merged(factors, self.builder), nominal, friction).rank
+            rank = self._solve(merge_factors(factors, self.builder), nominal, friction).rank
             out.append(StateRank(state_name(self.builder.contacts, state), samples, rank))
         out.sort(key=lambda found: -found.samples)
         return [*out, StateRank("together", sum(found.samples for found in out), together.rank)]
@@ -70,16 +70,16 @@ def compressed(experiment: Experiment, groups: Mapping[str, Sequence[Samples]]) 
     counts: dict[str, dict[State, int]] = {name: {} for name in groups}
     for name, logs in groups.items():
         for samples in logs:
-            for state, index in by_state(samples):
+            for state, index in chunks_by_state(samples):
                 counts[name][state] = counts[name].get(state, 0) + len(samples[index])
     return CompressedLogs(experiment, builder, factors, counts)
 
 
 @dataclass(frozen=True)
 class Series:
-    """Generalized forces of one log: `true` (N, nv) and what every parameter vector predicts.
+    """Generalized forces of one log: `true` (N, n_rows) and what every parameter vector predicts.
 
-    `projected_true` and `projected` are the same inside the contacts' null space, V_x V_x^T f. `rows`: names of the nv
+    `projected_true` and `projected` are the same inside the contacts' null space, V_x V_x^T f. `rows`: names of the
     rows.
     """
 
@@ -98,7 +98,7 @@ class Series:
 def series_of(evaluation: Evaluation, samples: Samples, phi: Mapping[str, Array]) -> Series:
     """Forces of a log and the predictions of named parameter vectors (12 L,)."""
     true, predicted = force_series(evaluation.builder, samples, np.stack(list(phi.values())))
-    inside = in_null_space(evaluation.builder, samples, np.concatenate([true[None], predicted]))
+    inside = null_space_part(evaluation.builder, samples, np.concatenate([true[None], predicted]))
     return Series(
         samples.time.numpy() - float(samples.time[0]),
         (*BASE_ROWS, *evaluation.robot.joint_names),

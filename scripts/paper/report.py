@@ -17,7 +17,7 @@ from paper.results import TRUE, Results, figures, findings
 from paper.settings import SHOWN
 from torchid.commands.folder import write_json
 from torchid.parameters import Array
-from torchid.problem.metrics import GROUPS, group_name
+from torchid.problem.metrics import ROW_GROUPS, group_name
 from torchid.report.figures import STYLE, save_figure
 from torchid.report.tables import table_text
 from torchid.report.tensorboard import write_comparison
@@ -129,7 +129,7 @@ def summary_table(results: Results, training: str) -> Table:
     for sensors in results.sensors:
         cells = []
         for condition in results.conditions:
-            medians = [results.spread(condition, training, sensors, f"{group}/relative").median for group in GROUPS]
+            medians = [results.spread(condition, training, sensors, f"{group}/relative").median for group in ROW_GROUPS]
             cells.append("\n".join(f"{100 * median:.2g}" for median in medians))
         table.add_row(sensors, *cells, end_section=True)
     return table
@@ -204,7 +204,7 @@ def write_study(folder: Path, results: Results, series: Series) -> None:
             results.spread(condition, training, sensors, f"{group}/relative").median for condition in results.conditions
         ]
         for training in results.trainings
-        for group in GROUPS
+        for group in ROW_GROUPS
         for sensors in results.sensors
     }
     steps = ", ".join(f"{step}: {condition}" for step, condition in enumerate(results.conditions))
@@ -246,7 +246,7 @@ def study_figures(results: Results, series: Series) -> dict[str, Figure]:
         ]
 
     bars = []
-    for group in GROUPS:
+    for group in ROW_GROUPS:
         spreads = {s: results.spread(condition, training, s, f"{group}/relative") for s in results.sensors}
         heights = {name: (spread.median, spread.least, spread.greatest) for name, spread in spreads.items()}
         bars.append(Bars(group_name(group), heights))

@@ -9,7 +9,7 @@ import numpy as np
 
 from paper.fits import StateRank
 from torchid.problem import Metrics
-from torchid.problem.metrics import GROUPS, group_name
+from torchid.problem.metrics import ROW_GROUPS, group_name
 
 NOMINAL, TRUE = "nominal", "true"
 """Rows beside the sensor sets: the parameters that every fit starts from, and those of the simulated robot."""
@@ -91,8 +91,8 @@ class Results:
 
 def figures(metrics: Metrics) -> dict[str, float]:
     """All figures of the table: `GROUP` in units, `GROUP/relative` and `base_force/variation` as shares."""
-    out = {group: metrics.rms[group] for group in GROUPS}
-    out |= {f"{group}/relative": metrics.relative[group] for group in GROUPS}
+    out = {group: metrics.rms[group] for group in ROW_GROUPS}
+    out |= {f"{group}/relative": metrics.relative[group] for group in ROW_GROUPS}
     out["base_force/variation"] = metrics.base_force_of_variation
     return {name: float("nan") if value is None else value for name, value in out.items()}
 
@@ -141,16 +141,16 @@ def findings(results: Results, condition: str, training: str) -> tuple[Finding, 
     def poor(sensors: str, group: str) -> bool:
         return times(sensors, group) >= POOR or share(sensors, group) >= 1.0
 
-    worst = max(GROUPS, key=lambda group: share("full", group))
+    worst = max(ROW_GROUPS, key=lambda group: share("full", group))
     above_floor = error("full", worst) / error(TRUE, worst)
     base = max(_BASE, key=lambda group: share("contacts", group))
     torque = times("contacts", "joint_torque")
     best = min(_SETS, key=lambda sensors: error(sensors, _INSIDE))
-    outside = max((group for group in GROUPS if group != _INSIDE), key=lambda group: times("joints", group))
+    outside = max((group for group in ROW_GROUPS if group != _INSIDE), key=lambda group: times("joints", group))
     return (
         Finding(
             1,
-            all(good("full", group) for group in GROUPS),
+            all(good("full", group) for group in ROW_GROUPS),
             f"worst, {group_name(worst)}: {share('full', worst):.2g} x nominal, {above_floor:.2g} x true",
         ),
         Finding(
@@ -160,7 +160,7 @@ def findings(results: Results, condition: str, training: str) -> tuple[Finding, 
         ),
         Finding(
             3,
-            best == "joints" and any(poor("joints", group) for group in GROUPS if group != _INSIDE),
+            best == "joints" and any(poor("joints", group) for group in ROW_GROUPS if group != _INSIDE),
             f"inside best: {best}; outside, {group_name(outside)} {times('joints', outside):.2g} x full",
         ),
     )

@@ -22,7 +22,7 @@ from torchid.fitting.experiment import Experiment, set_up
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import Array
-from torchid.problem import Evaluation, Samples, bind
+from torchid.problem import Evaluation, Samples, bind_log
 from torchid.report.tables import progress_bars
 from torchid.simulation import sensor_log
 
@@ -109,7 +109,7 @@ class Reproduction:
         def samples(name: str, of: Condition) -> Samples:
             log = sensor_log(exact[name], of.sensors, self.study.simulation.seed + number, name)
             log = preprocess(log, self._filter.cutoff_hz, self._filter.sample_rate_hz)
-            return bind(log, self._robot, self._contacts)
+            return bind_log(log, self._robot, self._contacts)
 
         groups: dict[str, list[Samples]] = {"squats": [], "others": []}
         for name in exact:

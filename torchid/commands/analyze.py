@@ -19,9 +19,9 @@ from torchid.config import AnalyzeConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, SensorError, UnknownNameError, during
 from torchid.fitting.experiment import Scene, set_up_scene, with_noise
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import Samples
-from torchid.problem.chunks import by_state
+from torchid.problem.chunks import chunks_by_state
 from torchid.problem.compression import free_parameters
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
@@ -174,7 +174,7 @@ def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[State, 
     if wanted is None:
         recorded: Counter[State] = Counter()
         for samples in train:
-            for state, index in by_state(samples):
+            for state, index in chunks_by_state(samples):
                 recorded[state] += len(samples[index])
         most_first = tuple(state for state, _ in recorded.most_common())
         return {"logs": most_first} if recorded else {"all_contacts": ((True,) * len(frames),)}
@@ -237,7 +237,7 @@ def _sets_to_compare(
 ) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
     scene, sets = request.scene, dict(request.compared)
-    recorded = {state for samples in train for state, _ in by_state(samples)}
+    recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
     for scenario in results:
         planned = sensor_set(scene.robot, scene.contacts, scenario.plan.chosen, scene.noise)
         if recorded & set(scenario.states) and not any(
@@ -284,7 +284,7 @@ def _picture(scene: Scene, scenario: ScenarioAnalysis) -> Figure:
     sensors = sensor_set(robot, scene.contacts, plan.chosen)
     used = [c for c, *active in zip(scene.contacts, *scenario.states, strict=True) if any(active)]
     wrenches = {
-        contact.frame: [COMPONENTS[k] for k in np.flatnonzero(row)]
+        contact.frame: [WRENCH_COMPONENTS[k] for k in np.flatnonzero(row)]
         for contact, row in zip(scene.contacts, sensors.wrench, strict=True)
     }
     measured = [name for name, taken in zip(robot.dof_names, sensors.torque, strict=True) if taken]

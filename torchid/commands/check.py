@@ -1,4 +1,4 @@
-"""`torchid check`: hygiene of logs before they are fitted."""
+"""`torchid check`: checks of logs before they are fitted."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from torchid.fitting.experiment import set_up_scene
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
 from torchid.logs import Log, Topics, read_log
-from torchid.logs.containers import appearing_whole
+from torchid.logs.containers import atomic_output
 from torchid.report.figures import save_figure
-from torchid.report.log_checks import hygiene_document, hygiene_figure
+from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
 from torchid.robot import load_robot
 from torchid.sensing import Contact
@@ -70,7 +70,7 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     found = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
-            log = log_to_check(file, config.logs.topics, config.preprocessing)
+            log = read_log_to_check(file, config.logs.topics, config.preprocessing)
             found.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
     return found
 
@@ -94,7 +94,7 @@ def check_log(
     Raises:
         InputError: the log or the URDF cannot be read, or the log is larger than an experiment's may be by default.
     """
-    log = log_to_check(Path(path), None if topics is None else load_topics(topics), PreprocessingConfig())
+    log = read_log_to_check(Path(path), None if topics is None else load_topics(topics), PreprocessingConfig())
     if urdf is None:
         return check(log)
     robot = load_robot(urdf, base_link, fixed_base, log.ft_names)
@@ -103,7 +103,7 @@ def check_log(
     return check(log, robot, [_contact(log, index) for index in range(len(log.contact_names))])
 
 
-def log_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Log:
+def read_log_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Log:
     """A log as it was read.
 
     Raises:
@@ -118,7 +118,7 @@ def log_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfi
 
 def _contact(log: Log, index: int) -> Contact:
     """A contact of a log without an experiment file: a point if forces without any moment were measured."""
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     force, moment = (False, True) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
     return Contact(log.contact_names[index], "point" if force and not moment else "flat")
 
@@ -146,11 +146,11 @@ def check_outputs(
         check_free_file(path, option, overwrite, [x for x in inputs if x is not None])
 
 
-def write_outputs(checked: Sequence[Checked], document: str | None, figure: str | None) -> None:
+def write_check_outputs(checked: Sequence[Checked], document: str | None, figure: str | None) -> None:
     """Write all findings as JSON and an overview as a figure, each complete or not at all."""
     if document is not None:
-        with appearing_whole(Path(document)) as new:
-            new.write_text(json.dumps(hygiene_document(checked), indent=1, allow_nan=False) + "\n")
+        with atomic_output(Path(document)) as new:
+            new.write_text(json.dumps(log_check_document(checked), indent=1, allow_nan=False) + "\n")
     if figure is not None:
-        with appearing_whole(Path(figure)) as new:
-            save_figure(hygiene_figure(checked), new, Path(figure).suffix[1:].lower())
+        with atomic_output(Path(figure)) as new:
+            save_figure(log_check_figure(checked), new, Path(figure).suffix[1:].lower())

@@ -7,7 +7,7 @@ from pathlib import Path
 from torchid.commands.folder import check_free_file
 from torchid.config.experiment import load_topics
 from torchid.logs import Log, read_log, write_log
-from torchid.logs.containers import kind_to_write
+from torchid.logs.containers import new_log_kind
 from torchid.report.tables import progress_bars
 
 
@@ -27,7 +27,7 @@ def convert(source: str | Path, target: str | Path, topics: str | Path | None = 
         InputError: whatever does not fit; nothing has been written then.
     """
     path = Path(target)
-    kind_to_write(path)
+    new_log_kind(path)
     check_free_file(path, "OUT", overwrite, (source, *([] if topics is None else [topics])))
     mapped = None if topics is None else load_topics(topics)
     with progress_bars() as bars:

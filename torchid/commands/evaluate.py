@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, ref
 from torchid.commands.reading import LogReader
 from torchid.commands.results import draw_forces
 from torchid.config import load_config
-from torchid.errors import ConfigError, TorchidWarning, during
+from torchid.errors import ConfigError, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, set_up
@@ -70,7 +69,7 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
             metrics[Path(log.source).stem] = pair
             if not any(x is not None for x in pair.identified.rms.values()):
                 message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
-                warnings.warn(message, TorchidWarning, stacklevel=2)
+                warn(message)
         document: dict[str, dict[str, object]] = {
             name: {"identified": pair.identified.as_dict(), "nominal": pair.nominal.as_dict()}
             for name, pair in metrics.items()

@@ -9,35 +9,30 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from torchid.commands.manifest import MANIFEST, Contents, FolderKind, inspect, manifest_of, read_manifest
+from torchid.commands.manifest import MANIFEST, FolderContents, FolderKind, inspect_folder, make_manifest, read_manifest
 from torchid.errors import ConfigError
-from torchid.staging import NEW, OLD, interrupt_held_back, leftovers, note_written, staging
-from torchid.text import listed, shown
-
-try:
-    import fcntl
-except ImportError:  # not on Windows
-    fcntl = None  # type: ignore[assignment]
+from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, lock_file, note_written, staging_folder
+from torchid.text import excerpt, join_names
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def claim_folder(folder: Path) -> Iterator[None]:
     """Keep other processes that claim it from a folder that need not be there yet, until the block or this one ends.
 
     Raises:
         ConfigError: another process is at work there.
     """
-    if fcntl is None:
+    if not CAN_LOCK:
         yield
         return
     lock, handle = folder.with_name(f".{folder.name}.lock"), -1
-    with parents_of(folder):
+    with parent_folders(folder):
         try:
-            with interrupt_held_back():
+            with interrupts_deferred():
                 handle = _locked(lock, folder)
             yield
         finally:
-            with interrupt_held_back():
+            with interrupts_deferred():
                 if handle >= 0:
                     lock.unlink(missing_ok=True)
                     os.close(handle)
@@ -45,21 +40,13 @@ def claimed(folder: Path) -> Iterator[None]:
 
 def _locked(lock: Path, folder: Path) -> int:
     """Descriptor of a file that no other process has locked; the system unlocks it when this one ends or is killed."""
-    while True:
-        with creating(folder):
+    for _ in range(_TRIES):
+        with creation_errors_explained(folder):
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(handle)
-            found, accepted = "another run is at work there", "another output, or patience"
-            raise ConfigError(folder, "output", found, accepted) from error
-        except OSError:  # a file system without locks: one run at a time is then the user's affair
+        if lock_file(handle, lock) is not False:  # None, no locks there: one run at a time is then the user's affair
             return handle
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(handle), lock.stat()):
-                return handle
-        os.close(handle)  # who had it has just removed it
+        os.close(handle)  # another has it, or has just removed it
+    raise ConfigError(folder, "output", "another run is at work there", "another output, or patience")
 
 
 EVENTS = "events.out.tfevents*"
@@ -89,7 +76,7 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: It
         ConfigError: `output` exists and may not be replaced, or is no place for a folder.
     """
     try:
-        clear_leftovers(output, kind)
+        recover_leftovers(output, kind)
         names = os.listdir(output) if output.is_dir() else []
         above = next(path for path in output.absolute().parents if path.exists())
         taken = output.is_symlink() or (output.exists() and not output.is_dir())
@@ -106,7 +93,7 @@ def check_free(output: Path, overwrite: bool, kind: FolderKind = RUN, inputs: It
         raise ConfigError(output, "output", "not empty", "a new folder, or overwrite=true")
     if names:
         refuse_inputs(output, inputs)
-        replaceable(output, kind)
+        require_replaceable(output, kind)
 
 
 def check_free_file(path: Path, field: str, overwrite: bool, inputs: Iterable[object]) -> None:
@@ -152,11 +139,11 @@ def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
     for path in inputs:
         place = os.path.realpath(str(path))
         if os.path.lexists(str(path)) and place.startswith(top + os.sep):
-            found = f"holds {shown(os.path.relpath(place, top))}, which is an input"
+            found = f"holds {excerpt(os.path.relpath(place, top))}, which is an input"
             raise ConfigError(output, "output", found, "another output, or inputs that lie elsewhere")
 
 
-def replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> Contents:
+def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> FolderContents:
     """What is in a folder that torchid wrote, and nobody else.
 
     Args:
@@ -169,27 +156,27 @@ def replaceable(folder: Path, kind: FolderKind, output: Path | None = None) -> C
     """
     output = output or folder
     try:
-        found, names = inspect(folder, kind), [shown(name) for name in sorted(os.listdir(folder))]
+        found, names = inspect_folder(folder, kind), [excerpt(name) for name in sorted(os.listdir(folder))]
     except OSError as error:
         raise ConfigError(output, "output", f"cannot be read ({error})", "a new folder") from error
     if found is None and (other := read_manifest(folder)):
         accepted = f"a new folder, or {kind.name} to overwrite"
-        raise ConfigError(output, "output", f"holds {shown(other.kind)}", accepted)
+        raise ConfigError(output, "output", f"holds {excerpt(other.kind)}", accepted)
     if found is None:
-        what = f"holds {listed(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
+        what = f"holds {join_names(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
         accepted = f"a new folder, or {kind.name} to overwrite; one that an older version wrote is for you to remove"
         raise ConfigError(output, "output", what, accepted)
-    complaints = [f"{listed(found.foreign, _MOST_NAMES)}, which torchid did not write"] if found.foreign else []
-    complaints += [f"{listed(found.changed, _MOST_NAMES)}, changed since torchid wrote it"] if found.changed else []
+    complaints = [f"{join_names(found.foreign, _MOST_NAMES)}, which torchid did not write"] if found.foreign else []
+    complaints += [f"{join_names(found.changed, _MOST_NAMES)}, changed since torchid wrote it"] if found.changed else []
     closed = [str(path) for path in found.folders if not os.access(path, os.W_OK | os.X_OK)]
-    complaints += [f"{listed(closed)}, where nothing can be removed"] if closed and not complaints else []
+    complaints += [f"{join_names(closed)}, where nothing can be removed"] if closed and not complaints else []
     if complaints:
         accepted = f"a new folder, or {kind.name} to overwrite; move elsewhere what is yours"
         raise ConfigError(output, "output", f"holds {' and '.join(complaints)}", accepted)
     return found
 
 
-def clear_leftovers(output: Path, kind: FolderKind) -> None:
+def recover_leftovers(output: Path, kind: FolderKind) -> None:
     """Remove what killed processes left of folders that were to become `output`; what one had moved aside comes back.
 
     Raises:
@@ -201,7 +188,7 @@ def clear_leftovers(output: Path, kind: FolderKind) -> None:
         if not os.path.lexists(output):
             (folder / OLD).rename(output)
             continue
-        if found := inspect(folder / OLD, kind):
+        if found := inspect_folder(folder / OLD, kind):
             found.remove()
         for place, _, _ in os.walk(folder / OLD, topdown=False):  # the process was killed after their manifests went
             with suppress(OSError):
@@ -231,34 +218,34 @@ def new_folder(
         ConfigError: `output` exists and may not be replaced, from the start or when the block has ended.
     """
     check_free(output, overwrite, kind)
-    with parents_of(output), ExitStack() as stack:
-        with creating(output):
-            folder = stack.enter_context(staging(output))
+    with parent_folders(output), ExitStack() as stack:
+        with creation_errors_explained(output):
+            folder = stack.enter_context(staging_folder(output))
             (folder / NEW).mkdir()
         yield folder / NEW
-        manifest_of(folder / NEW, kind, output.name, growing).write(folder / NEW)
-        with interrupt_held_back():
+        make_manifest(folder / NEW, kind, output.name, growing).write(folder / NEW)
+        with interrupts_deferred():
             _put(folder, output, overwrite, kind)
             if kind.result:
                 note_written(output)
 
 
 @contextmanager
-def parents_of(output: Path) -> Iterator[None]:
+def parent_folders(output: Path) -> Iterator[None]:
     """The folders above `output`, which go with the block if they came with it and it leaves nothing in them."""
     made = [folder for folder in (output.parent, *output.parent.parents) if not folder.exists()]
     try:
-        with interrupt_held_back(), creating(output):
+        with interrupts_deferred(), creation_errors_explained(output):
             output.parent.mkdir(parents=True, exist_ok=True)
         yield
     finally:
-        with interrupt_held_back(), suppress(OSError):  # a run is in it, this one or another
+        with interrupts_deferred(), suppress(OSError):  # a run is in it, this one or another
             for folder in made:
                 folder.rmdir()
 
 
 @contextmanager
-def creating(output: Path) -> Iterator[None]:
+def creation_errors_explained(output: Path) -> Iterator[None]:
     """Say in one line that something cannot be made beside `output`."""
     try:
         yield
@@ -280,7 +267,7 @@ def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
         except OSError as error:
             raise ConfigError(output, "output", f"cannot be replaced ({error.strerror})", "a new folder") from error
         try:
-            found = replaceable(folder / OLD, kind, output)  # where nobody puts anything any more
+            found = require_replaceable(folder / OLD, kind, output)  # where nobody puts anything any more
             done = _renamed(folder / NEW, output)
         except BaseException:
             with suppress(OSError):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -12,13 +11,13 @@ from functools import partial
 
 from rich.progress import Progress
 
-from torchid.commands.folder import RUN, check_free, claimed
+from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning
+from torchid.errors import NumericalWarning, warn
 from torchid.estimators import Conditions, Estimate, LeastSquares, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
@@ -30,7 +29,7 @@ from torchid.identifiability.base_rank import StateReport, require_base, state_r
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts
-from torchid.problem.compression import Part, folds_together, in_folds, states_together
+from torchid.problem.compression import Part, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import State, state_name
 from torchid.problem.metrics import SETS
 from torchid.report.tables import progress_bars
@@ -61,7 +60,7 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
     trains = config.estimator.name == "sgd"
-    with claimed(training_folder(config.output)) if trains else nullcontext():
+    with claim_folder(training_folder(config.output)) if trains else nullcontext():
         require_trainable(config, resume, source)
         check_free(config.output, config.overwrite, RUN, (source, *inputs_of(config)))
         return _identify(config, source, resume)
@@ -98,7 +97,7 @@ def _prepare(config: ExperimentConfig, source: object, clock: _Clock, bars: Prog
         experiment = with_noise(experiment, noise)
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
-        blocks = in_folds(logs["train"], builder)
+        blocks = split_into_folds(logs["train"], builder)
         parts = _compressed(builder, blocks, bars)
     with clock("ridge"):
         experiment, ridge = _with_ridge(experiment, parts, blocks, builder, conditions, bars)
@@ -137,13 +136,13 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             warn_of_confounded(fit.extras, source)
             warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
-            whole = folds_together(fit.parts, builder)
+            whole = merge_folds(fit.parts, builder)
             alone = _by_state(fitter, whole)
             added = _contributions(experiment, builder, whole, logs["train"], problem, bars)
         with clock("evaluate"):
             fits = (fit, *fitter.fit_without_folds(fit.parts))
             compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
-            scorer, of_blocks = Scorer(evaluation, builder), states_together(fit.parts, builder)
+            scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
             metrics, validation = _metrics(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
         run = Identification(
@@ -222,7 +221,7 @@ def _robust(
     bars.update(bar, total=1, completed=1)
     if not robust.summary.converged:
         settled = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"
-        warnings.warn(f"{experiment.source}: {settled}", NumericalWarning, stacklevel=3)
+        warn(f"{experiment.source}: {settled}", NumericalWarning)
     return robust.fit, robust.summary
 
 
@@ -231,7 +230,7 @@ def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
     samples = Counter[State]()
     for part in parts:
         samples[part.state] += part.samples
-    estimator, out = LeastSquares(fitter.estimator.ridge, fitter.estimator.rank_tolerance), {}
+    estimator, out = LeastSquares(fitter.estimator.ridge, rank_tolerance=fitter.estimator.rank_tolerance), {}
     for state, _ in samples.most_common():
         problem = fitter.assemble([part for part in parts if part.state == state]).problem
         out[state_name(fitter.builder.contacts, state)] = estimator.solve(problem)

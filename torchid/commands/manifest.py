@@ -14,8 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from torchid.staging import is_leftover, remove_leftover, whole_file
-from torchid.text import shown
+from torchid.staging import atomic_file, is_leftover, remove_leftover
+from torchid.text import excerpt
 
 MANIFEST = "manifest.json"
 
@@ -69,12 +69,12 @@ class Manifest:
         """
         files = {name: {"size": size, "sha256": checksum} for name, (size, checksum) in self.files.items()}
         document = {"torchid": self.kind, "folder": self.folder, "files": files, "growing": self.growing}
-        with whole_file(folder / MANIFEST, result=False) as new:
+        with atomic_file(folder / MANIFEST, result=False) as new:
             new.write_text(json.dumps(document, indent=1) + "\n")
 
 
 @dataclass
-class Contents:
+class FolderContents:
     """What is in a folder.
 
     Attributes:
@@ -103,7 +103,7 @@ class Contents:
                 path.rmdir()
 
 
-def manifest_of(folder: Path, kind: FolderKind, name: str, growing: Sequence[str] = ()) -> Manifest:
+def make_manifest(folder: Path, kind: FolderKind, name: str, growing: Sequence[str] = ()) -> Manifest:
     """The manifest of a folder that holds nothing but torchid's files.
 
     Args:
@@ -146,7 +146,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
 
 
-def inspect(folder: Path, kind: FolderKind, name: str | None = None) -> Contents | None:
+def inspect_folder(folder: Path, kind: FolderKind, name: str | None = None) -> FolderContents | None:
     """What in a folder torchid wrote and what it did not; no link is followed.
 
     Args:
@@ -160,14 +160,14 @@ def inspect(folder: Path, kind: FolderKind, name: str | None = None) -> Contents
     manifest = read_manifest(folder)
     if manifest is None or manifest.kind != kind.name or name not in (None, manifest.folder):
         return None
-    found = Contents()
+    found = FolderContents()
     _look(folder, "", manifest, kind, found)
     found.own.append(folder / MANIFEST)
     found.folders.append(folder)
     return found
 
 
-def _look(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: Contents) -> None:
+def _look(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: FolderContents) -> None:
     """Add what is in the folder at a place below the top."""
     for name, path in _entries(top / place):
         inner = f"{place}/{name}" if place else name
@@ -176,22 +176,22 @@ def _look(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: Co
             _look_into(top, inner, manifest, kind, found)
         elif inner in manifest.files and stat.S_ISREG(mode):
             same = _is(path, *manifest.files[inner])
-            found.own.append(path) if same else found.changed.append(shown(inner))
+            found.own.append(path) if same else found.changed.append(excerpt(inner))
         elif stat.S_ISREG(mode) and not place and any(fnmatchcase(name, x) for x in manifest.growing):
             found.own.append(path)
         elif inner != MANIFEST:
-            found.foreign.append(shown(inner))
+            found.foreign.append(excerpt(inner))
 
 
-def _look_into(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: Contents) -> None:
+def _look_into(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: FolderContents) -> None:
     """Add a folder."""
     path, above = top / place, place.rpartition("/")[0]
     if is_leftover(path):
         found.leftovers.append(path)
     elif kind.of is not None and above == kind.within:
-        inside = inspect(path, kind.of, path.name)
+        inside = inspect_folder(path, kind.of, path.name)
         if inside is None:
-            found.foreign.append(shown(f"{place}/"))
+            found.foreign.append(excerpt(f"{place}/"))
             return
         found.own += inside.own
         found.folders += inside.folders
@@ -202,7 +202,7 @@ def _look_into(top: Path, place: str, manifest: Manifest, kind: FolderKind, foun
         _look(top, place, manifest, kind, found)
         found.folders.append(path)
     else:
-        found.foreign.append(shown(f"{place}/"))
+        found.foreign.append(excerpt(f"{place}/"))
 
 
 def _entries(folder: Path) -> Iterator[tuple[str, Path]]:

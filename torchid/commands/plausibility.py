@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
 from torchid import parameters
-from torchid.commands.check import log_to_check
-from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError
+from torchid.commands.check import read_log_to_check
+from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.identifiability.confounding import TotalMass, total_mass
@@ -19,8 +18,9 @@ from torchid.log_checks.findings import SEVERITIES
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
-from torchid.problem.metrics import ADVICE, Worse, verdict
+from torchid.problem.metrics import ADVICE, WorseThanNominal, describe_worse
 from torchid.robot import Robot
+from torchid.rounding import is_significant
 
 OFF = 10.0
 """Factor that no model of a robot is off by: units are by a thousand, a gear by 50 to 160."""
@@ -73,11 +73,11 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
         )
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
-    warnings.warn(f"{scene.source}: {unexplained}{named}; {advice}", NumericalWarning, stacklevel=3)
+    warn(f"{scene.source}: {unexplained}{named}; {advice}", NumericalWarning)
     return mass
 
 
-def require_not_worse(worse: list[Worse], scene: Scene) -> None:
+def require_not_worse(worse: list[WorseThanNominal], scene: Scene) -> None:
     """Refuse a fit that predicts worse than the URDF if the checks condemn a training log; else warn.
 
     Raises:
@@ -88,13 +88,13 @@ def require_not_worse(worse: list[Worse], scene: Scene) -> None:
     """
     if not worse:
         return
-    message, advice = verdict(worse), ADVICE
+    message, advice = describe_worse(worse), ADVICE
     log, finding = next(_findings(scene), (None, None))
     if finding is not None:
         message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
         if finding.condemns_all:
             raise ImplausibleFitError(scene.source, "logs", message, advice)
-    warnings.warn(f"{scene.source}: {message}; {advice}", NumericalWarning, stacklevel=3)
+    warn(f"{scene.source}: {message}; {advice}", NumericalWarning)
 
 
 def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:
@@ -135,7 +135,7 @@ def force_gain(problem: LinearProblem) -> float | None:
     free, fixed = ~chosen & problem.free, ~chosen & ~problem.free
     measured = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
     U, values, _ = np.linalg.svd(problem.A[:, free] * problem.scale[free], full_matrices=False)
-    friction = U[:, values > 1e-10 * values.max(initial=0.0)]
+    friction = U[:, is_significant(values)]
     needed, measured = (x - friction @ (friction.T @ x) for x in (needed, measured))
     size = np.linalg.norm(needed) * np.sqrt(measured @ measured + problem.residual)
     if not size > 0.0 or abs(needed @ measured) < _CLEAR * size:
@@ -192,7 +192,7 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     found = []
     for path in files.train:
         try:
-            log = log_to_check(path, files.topics, scene.config.preprocessing)
+            log = read_log_to_check(path, files.topics, scene.config.preprocessing)
             checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
         except InputError:  # larger than memory: it is not checked
             continue

@@ -14,31 +14,31 @@ import torch
 from torch import Tensor
 
 from torchid.config.experiment import PreprocessingConfig
-from torchid.errors import LogError
+from torchid.errors import LogError, about_file
 from torchid.fitting.experiment import Scene
-from torchid.log_checks import Checked, without_condemned
+from torchid.log_checks import Checked, drop_condemned
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
-from torchid.logs.blocks import GIGABYTE, Blocks, counted_from, open_blocks, size_of
-from torchid.logs.containers import Kind, kind_to_read
+from torchid.logs.blocks import GIGABYTE, LogBlocks, count_samples_from, log_bytes, open_log_blocks
+from torchid.logs.containers import LogKind, existing_log_kind
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.logs.preprocess import (
     Coverage,
     away_from_changes,
-    check_coverage,
-    differentiates,
+    find_unloaded,
     gapless_fields,
-    on_timeline,
+    lacks_derivatives,
+    move_to_timeline,
     preprocess,
     timeline_of,
-    unloaded,
     unloaded_readings,
+    warn_of_gaps,
 )
 from torchid.logs.spill import Spill
-from torchid.logs.timeline import BLOCK, Timeline
-from torchid.problem import Samples, bind
+from torchid.logs.timeline import SPLINE_BLOCK, Timeline
+from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.samples import check_forces, oversampling
+from torchid.problem.samples import oversampling, require_forces
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -79,7 +79,7 @@ class LogReader:
         limit, logs = self.scene.config.preprocessing.memory_gb, []
         for path in paths:
             together = memory_needed(path, limit, self._held)
-            if kind_to_read(path) is Kind.BAG:
+            if existing_log_kind(path) is LogKind.BAG:
                 logs.append(self._small(path, required))
                 self._held += logs[-1].nbytes / GIGABYTE
             elif together <= limit:
@@ -99,10 +99,10 @@ class LogReader:
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
-        samples = bind(log, self.scene.robot, self.scene.contacts, required)
+        samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
         if checked is not None:
             count = len(samples)
-            samples = without_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
+            samples = drop_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
             self.excluded[str(path)] = count - len(samples)
         if settings.contact_margin_s is None:
             return samples
@@ -134,7 +134,7 @@ def memory_needed(path: Path, memory_gb: float, held: float = 0.0) -> float:
     Raises:
         LogError: the file cannot be read.
     """
-    return held + size_of(path, GIGABYTE * (memory_gb - held)) / GIGABYTE
+    return held + log_bytes(path, GIGABYTE * (memory_gb - held)) / GIGABYTE
 
 
 def _folder_beside(output: Path) -> Path:
@@ -166,15 +166,15 @@ class LargeLog:
         """What reading, preprocessing and binding the log as a whole would give, on the disk.
 
         Raises:
-            InputError: as `read_log`, `preprocess` and `bind` would, or the disk is full.
+            InputError: as `read_log`, `preprocess` and `bind_log` would, or the disk is full.
 
         Warns:
             TorchidWarning: as `preprocess` would.
         """
-        with open_blocks(self.path, self.folder) as blocks:
+        with about_file(self.path), open_log_blocks(self.path, self.folder) as blocks:
             first, settings = blocks.read(slice(0, min(len(blocks), 2))), self.settings
-            derived = differentiates(first)
-            timeline = timeline_of(blocks.source, blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
+            derived = lacks_derivatives(first)
+            timeline = timeline_of(blocks.time, derived, settings.cutoff_hz, settings.sample_rate_hz)
             coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
             time = blocks.time if timeline is None else blocks.time[0] + timeline.at
             contacts = self._contacts(blocks, first)
@@ -189,14 +189,14 @@ class LargeLog:
             bandwidth = None if timeline is None else timeline.bandwidth_hz
             return stored.samples(samples, oversampling(time, bandwidth))
 
-    def _pieces(self, blocks: Blocks, count: int) -> Iterator[slice]:
+    def _pieces(self, blocks: LogBlocks, count: int) -> Iterator[slice]:
         """The samples of a log, or of what becomes of them, in parts that fit into memory."""
         rows = self.settings.memory_gb * GIGABYTE / (_COPIES * blocks.row_bytes) * count / len(blocks)
-        step = max(BLOCK, int(rows))
+        step = max(SPLINE_BLOCK, int(rows))
         for start in range(0, count, step):
             yield slice(start, min(start + step, count))
 
-    def _coverage(self, blocks: Blocks, first: Log, timeline: Timeline) -> dict[str, Coverage]:
+    def _coverage(self, blocks: LogBlocks, first: Log, timeline: Timeline) -> dict[str, Coverage]:
         """Which channels were measured throughout, which takes a pass over the log."""
         found = {name: Coverage.of(getattr(first, name).shape[1:]) for name in gapless_fields(first, timeline)}
         for piece in self._pieces(blocks, len(blocks)) if found else ():
@@ -204,10 +204,10 @@ class LargeLog:
             for name, coverage in found.items():
                 coverage.add(getattr(log, name), log.contact_active if name in WRENCHES else None)
         for name, coverage in found.items():
-            check_coverage(first, name, coverage)
+            warn_of_gaps(first, name, coverage)
         return found
 
-    def _contacts(self, blocks: Blocks, first: Log) -> Log | None:
+    def _contacts(self, blocks: LogBlocks, first: Log) -> Log | None:
         """The log with nothing but the contacts' flags, which takes a pass over it; None if there are none."""
         if first.contact_active is None:
             return None
@@ -225,12 +225,12 @@ class LargeLog:
 
     def _bound(self, log: Log, piece: slice) -> Samples:
         """The samples of a part; errors count from the beginning."""
-        samples = bind(log, self.robot, self.contacts)
+        samples = bind_log(log, self.robot, self.contacts)
         if self.required is not None:
             try:
-                check_forces(samples, self.robot, self.contacts, self.required)
+                require_forces(samples, self.robot, self.contacts, self.required)
             except LogError as error:
-                raise counted_from(piece.start, error) from error
+                raise count_samples_from(piece.start, error) from error
         return samples
 
 
@@ -238,12 +238,12 @@ def _in_the_air(contacts: Log) -> BoolArray | None:
     """Which contacts are in the air for sure in which samples of the log, None if none ever is."""
     if contacts.contact_active is None:
         return None
-    found = unloaded(contacts.time, contacts.contact_active)
+    found = find_unloaded(contacts.time, contacts.contact_active)
     return found if found.any() else None
 
 
 def _preprocessed(
-    blocks: Blocks,
+    blocks: LogBlocks,
     piece: slice,
     timeline: Timeline | None,
     coverage: Mapping[str, Coverage],
@@ -254,7 +254,7 @@ def _preprocessed(
     log = blocks.read(samples)
     if in_the_air is not None:
         log = replace(log, contact_unloaded=unloaded_readings(log, in_the_air[samples]))
-    return log if part is None else on_timeline(log, part, coverage)
+    return log if part is None else move_to_timeline(log, part, coverage)
 
 
 class _Stored:

@@ -14,7 +14,7 @@ from torchid.commands.folder import new_folder, write_json
 from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import ExperimentConfig, dump_config
 from torchid.errors import during
-from torchid.estimators import BoundEstimate, Estimate, SgdEstimate, Violation
+from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate, Violation
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
@@ -25,7 +25,7 @@ from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, Metrics, Samples
-from torchid.problem.metrics import SETS, WHITENED, Worse, verdict, worse_than_nominal
+from torchid.problem.metrics import SETS, WHITENED, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.predict import force_series
 from torchid.report import identified_urdf, parameters_document
 from torchid.report.figures import (
@@ -95,7 +95,7 @@ class Identification:
         return [asdict(x) | {"body": None if x.body is None else names[x.body]} for x in self.violations]
 
     @cached_property
-    def worse(self) -> list[Worse]:
+    def worse(self) -> list[WorseThanNominal]:
         """Groups of rows where the URDF predicts better, on blocks left out of the fit or on the test logs."""
         sets = {} if self.validation is None else {HELD_OUT: (self.validation.nominal, self.validation.identified)}
         return worse_than_nominal(sets | ({"test logs": self.metrics["test"]} if "test" in self.metrics else {}))
@@ -200,7 +200,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "cross_validation": _validation_document(run),
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
         "worse_than_nominal": [asdict(one) for one in run.worse],
-        "verdict": verdict(run.worse),
+        "verdict": describe_worse(run.worse),
         "contact_states": run.state_entries(),
         "identifiability": _identifiability_document(run),
         "seconds": run.seconds,
@@ -241,7 +241,7 @@ def _bits(contributions: Contributions) -> dict[str, list[tuple[str, float]]]:
 
 def _solution_document(estimate: Estimate) -> dict[str, object] | None:
     """What is known of the optimum, or of the descent."""
-    if not isinstance(estimate, BoundEstimate):
+    if not isinstance(estimate, ConstrainedEstimate):
         return None
     names = ("objective", "unconstrained", "distance", "gap", "certified_gap", "steps", "epochs", "best_epoch")
     return {name: getattr(estimate, name) for name in names if hasattr(estimate, name)}
@@ -263,7 +263,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
         if run.validation is not None:
             events.write_errors(0, {"left_out": run.validation.nominal})
             events.write_errors(last, {"left_out": run.validation.identified})
-        events.write_verdict(last, verdict(run.worse) or "nowhere worse than the URDF's parameters")
+        events.write_verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
         events.write_fit(last, estimate)
         events.write_identifiability(
             last, estimate, run.contributions.total, table_text(verdict_counts_table(run.by_state, estimate))
@@ -275,7 +275,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
             for group, value in run.metrics[name].identified.relative.items()
             if value is not None
         }
-        price = estimate.relative_price if isinstance(estimate, BoundEstimate) else 0.0
+        price = estimate.relative_increase if isinstance(estimate, ConstrainedEstimate) else 0.0
         final |= {"rank": float(estimate.rank)} | ({} if price is None else {"objective_above_least": price})
         events.write_summary(dump_config(config), _hyperparameters(config), final, figures, last)
 
@@ -287,7 +287,7 @@ def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
     return {
         "sensors": config.sensors.set or "by name",
         "estimator": estimator.name,
-        "ridge": estimator.pull,
+        "ridge": estimator.numeric_ridge,
         "friction": estimator.friction,
         "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
         "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rich.progress import Progress
 
 from torchid.commands.plausibility import require_plausible
-from torchid.errors import ImplausibleFitError, LogError, TorchidWarning
+from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.estimator import batch_estimator
 from torchid.fitting.experiment import Scene
 from torchid.identifiability.expected_error import error_directions, expected_errors
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts
-from torchid.problem.compression import in_folds
+from torchid.problem.compression import split_into_folds
 from torchid.problem.elimination import Assembly
 from torchid.problem.extras import measured_components
-from torchid.problem.samples import check_forces
+from torchid.problem.samples import require_forces
 from torchid.report.analysis import SetAccuracy
 from torchid.sensing import SensorSet, named_sensors, with_ft_sensors
 
@@ -45,13 +44,13 @@ def accuracies(
     for name, sensors in sets.items():
         try:
             for samples in train:
-                check_forces(samples, scene.robot, scene.contacts, sensors)
+                require_forces(samples, scene.robot, scene.contacts, sensors)
             out[name] = _accuracy(scene, sensors, train, test, evaluation, reference)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; no accuracy of the sensors '{name}'"
-            warnings.warn(message, TorchidWarning, stacklevel=2)
+            warn(message)
         except ImplausibleFitError as error:
-            warnings.warn(f"{error}; no accuracy of the sensors '{name}'", TorchidWarning, stacklevel=2)
+            warn(f"{error}; no accuracy of the sensors '{name}'")
         bars.advance(bar)
     return out
 
@@ -69,7 +68,7 @@ class _Reference:
         assembly = self.assembly
         values = {
             (elimination.log, extra.label): float(value)
-            for elimination, own in zip(assembly.eliminations, assembly.unknowns(phi), strict=True)
+            for elimination, own in zip(assembly.eliminations, assembly.extras_at(phi), strict=True)
             for extra, value in zip(elimination.extras, own, strict=True)
         }
         robot, loss = self.scene.robot, self.scene.loss
@@ -86,7 +85,7 @@ def _reference(scene: Scene, train: Sequence[Samples]) -> _Reference | None:
         return None
     try:
         for samples in train:
-            check_forces(samples, robot, scene.contacts, sensors)
+            require_forces(samples, robot, scene.contacts, sensors)
     except LogError:
         return None
     return _Reference(scene, builder, assemble(compress_parts(train, builder), builder, robot))
@@ -105,7 +104,7 @@ def _accuracy(
     fitter = scene.fitter(builder, conditions)
     if settings.name == "sgd":
         settings = replace(settings, name="least_squares")
-    blocks = in_folds(train, builder)
+    blocks = split_into_folds(train, builder)
     parts = compress_parts(blocks, builder)
     if settings.chooses_ridge:
         settings = replace(settings, ridge=scene.choose_ridge(parts, blocks, fitter, conditions).ridge)
@@ -115,8 +114,8 @@ def _accuracy(
     noise = estimate.residual_std
     variance = noise**2 * problem.oversampling
     prior_error = scene.config.analysis.prior_error
-    directions = error_directions(problem, settings.pull, variance, prior_error, settings.rank_tolerance)
-    scaled_noise = scene.noise.times(noise)
+    directions = error_directions(problem, settings.numeric_ridge, variance, prior_error, settings.rank_tolerance)
+    scaled_noise = scene.noise.scaled(noise)
     bodies = Evaluation(robot, scene.contacts, scene.config.device, ExtraTerms(sign_width=scene.terms.sign_width))
     expected = expected_errors(bodies.builder, test or train, directions, scaled_noise)
     calibration = (reference or _Reference(scene, builder, fit.assembly)).calibration(estimate.phi)

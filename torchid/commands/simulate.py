@@ -45,7 +45,7 @@ def simulate(config: SimulationConfig, source: object = "simulation") -> dict[st
     robot = load_robot(config.robot.urdf)
     simulation = set_up_simulation(config, source)
     for motion in config.motions:
-        simulation.motion(motion)
+        simulation.reference(motion)
     with new_folder(config.output, config.overwrite, SIMULATION) as folder, progress_bars() as bars:
         (folder / "logs").mkdir()
         (folder / "exact").mkdir()
@@ -59,7 +59,7 @@ def simulate(config: SimulationConfig, source: object = "simulation") -> dict[st
 
 def nominal_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -> Array:
     """Parameters (L, 12) that an identification starts from, off from those of the simulated robot."""
-    return parameters.perturbed(robot.nominal, settings.error, np.random.default_rng([settings.seed, draw]))
+    return parameters.perturb_parameters(robot.nominal, settings.error, np.random.default_rng([settings.seed, draw]))
 
 
 def _in_processes(

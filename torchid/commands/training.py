@@ -27,16 +27,16 @@ from torchid.commands.folder import (
     EVENTS,
     TRAINING,
     check_free,
-    clear_leftovers,
     new_folder,
+    recover_leftovers,
     refuse_inputs,
     refuse_link,
 )
-from torchid.commands.manifest import Manifest, inspect, read_manifest
+from torchid.commands.manifest import Manifest, inspect_folder, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
-from torchid.errors import ConfigError, InputError, SensorError, TorchidWarning
-from torchid.estimators import Epoch, PenaltyWeights, Sgd, SgdEstimate, Trainer
+from torchid.errors import ConfigError, InputError, SensorError, warn
+from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
 from torchid.fitting.experiment import Experiment
 from torchid.guards import MAX_STATE, check_regular
 from torchid.parameters import Array
@@ -44,7 +44,7 @@ from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Sam
 from torchid.problem.linear import parameter_scale
 from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
-from torchid.text import shown
+from torchid.text import excerpt
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -73,13 +73,13 @@ def require_trainable(config: ExperimentConfig, resume: bool, source: object) ->
             raise ConfigError(source, "--resume", found, "estimator.name: sgd, or no --resume")
         return
     refuse_link(folder)
-    clear_leftovers(folder, TRAINING)
+    recover_leftovers(folder, TRAINING)
     waiting = (folder / CHECKPOINT).is_file()
     if resume and not waiting:
         if output.exists() and not config.overwrite:
             raise ConfigError(output, "--resume", "a finished run", "an unfinished one, or overwrite=true")
         message = f"{folder}: no checkpoint to go on from; training starts at the beginning"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
     elif waiting and not resume and not config.overwrite:
         raise ConfigError(folder, "output", "an unfinished training", "--resume, overwrite=true, or another output")
     if not waiting or not resume:
@@ -145,7 +145,7 @@ class Training:
 
     def copy_curves(self, folder: Path) -> None:
         """Copy the training's event files into the finished run's folder."""
-        found = inspect(self.folder, TRAINING)
+        found = inspect_folder(self.folder, TRAINING)
         for path in found.own if found else ():
             if fnmatchcase(path.name, EVENTS):
                 shutil.copy2(path, folder)
@@ -156,11 +156,11 @@ class Training:
         Warns:
             TorchidWarning: there is more in its folder than torchid wrote.
         """
-        if found := inspect(self.folder, TRAINING):
+        if found := inspect_folder(self.folder, TRAINING):
             found.remove()
         if self.folder.exists():
             message = f"{self.folder}: stays: it holds what torchid did not write"
-            warnings.warn(message, TorchidWarning, stacklevel=3)
+            warn(message)
 
     def _train(self, trainer: Trainer, evaluate: Evaluate, events: RunEvents, progress: Callable[[str], None]) -> None:
         training = self.config.estimator.training
@@ -229,26 +229,12 @@ def descent_settings(config: ExperimentConfig, source: object = "experiment") ->
     Raises:
         InputError: an optimizer or schedule that torch does not have or that does not take its options.
     """
-    estimator, training = config.estimator, config.estimator.training
-    optimizer, schedule = dict(training.optimizer), dict(training.schedule or {})
+    settings = config.estimator.sgd
     try:
-        return Sgd(
-            ridge=estimator.pull,
-            rank_tolerance=estimator.rank_tolerance,
-            consistency=estimator.consistency,
-            margin=estimator.margin,
-            penalties=PenaltyWeights(**vars(estimator.penalties)),
-            optimizer=optimizer.pop("name"),
-            optimizer_options=optimizer,
-            schedule=schedule.pop("name", None),
-            schedule_options=schedule,
-            epochs=training.epochs,
-            patience=training.patience,
-            clip=training.clip,
-            damping=training.damping,
-        )
+        settings.try_out()
     except InputError as error:
         raise ConfigError(source, f"estimator.training.{error.field}", error.found, error.accepted) from error
+    return settings
 
 
 def body_eigenvalues(robot: Robot, phi: Array) -> dict[str, float]:
@@ -331,7 +317,7 @@ def refusing_damage(folder: Path) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # noqa: B902 - an unpickler, torch and its optimizers raise what they like
-        found = f"not readable ({shown(str(error) or type(error).__name__, 200)})"
+        found = f"not readable ({excerpt(str(error) or type(error).__name__, 200)})"
         raise InputError(folder / CHECKPOINT, "file", found, _ACCEPTED) from error
 
 

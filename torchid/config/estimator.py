@@ -1,35 +1,29 @@
-"""The settings of the estimators in an experiment file."""
+"""The block `estimator` of an experiment file: the estimators' own settings, and those that need the experiment."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    ValidationError,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-)
+from pydantic import BeforeValidator, Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
 from pydantic.dataclasses import dataclass
 
-from torchid.config.sensors import STRICT, NotNegative, Number, Positive, Seed, no_flag
+from torchid.config.sensors import STRICT
 from torchid.errors import ConfigError
+from torchid.estimators import Conditions, Consistent, LeastSquares, PenaltyWeights, Sgd, TrainingSettings
+from torchid.estimators.conditions import EnclosureKind
+from torchid.estimators.conic_formulation import Prior
+from torchid.estimators.consistent import Method
+from torchid.estimators.sgd import Consistency
+from torchid.settings import BelowOne, Count, NotNegative, Number, Positive, Seed, Tolerance
 
-
-def _with_name(value: dict[str, Any]) -> dict[str, Any]:
-    if not isinstance(value.get("name"), str):
-        raise ValueError("a mapping with the name of a class, and its options")
-    return value
-
-
-Count = Annotated[int, BeforeValidator(no_flag), Field(ge=1)]
-Named = Annotated[dict[str, Any], AfterValidator(_with_name)]
-"""A class of `torch.optim` and what it takes: `{name: Adam, lr: 0.05}`."""
-
+ESTIMATORS: dict[str, type[LeastSquares | Consistent | Sgd]] = {
+    "least_squares": LeastSquares,
+    "consistent": Consistent,
+    "sgd": Sgd,
+}
+"""By their names in an experiment file."""
 
 Interval = Annotated[list[Number | None], Field(min_length=2, max_length=2)]
 """[lower, upper], None where it is open."""
@@ -45,31 +39,14 @@ class SymmetryConfig:
 
 
 @dataclass(config=STRICT, frozen=True)
-class PenaltiesConfig:
-    """Weights of what pulls a descent towards bodies that can exist."""
+class TrainingConfig(TrainingSettings):
+    """How to train, with what belongs to a run of it: the mini-batches, and when something is written.
 
-    eigenvalue: NotNegative = 10.0
-    log_det: NotNegative = 0.0
-    mass: NotNegative = 10.0
-    friction: NotNegative = 10.0
-
-
-@dataclass(config=STRICT, frozen=True)
-class TrainingConfig:
-    """How to descend: passes over the logs, samples per batch, optimizer and schedule of torch, when to stop.
-
-    `patience`: epochs without a better loss on `logs.validation` after which to stop. `clip`: largest norm of a
-    gradient. `damping`: of the preconditioner. Errors are worked out `evaluate_every` so many epochs, a checkpoint is
-    written after `checkpoint_seconds` and the end of the epoch.
+    `batch_size`: samples per mini-batch, `seed` of their order. Errors are evaluated every `evaluate_every` epochs, a
+    checkpoint is written after `checkpoint_seconds` and the end of the epoch.
     """
 
-    epochs: Count = 200
     batch_size: Count = 256
-    optimizer: Named = dataclasses.field(default_factory=lambda: {"name": "Adam"})
-    schedule: Named | None = dataclasses.field(default_factory=lambda: {"name": "CosineAnnealingLR"})
-    patience: Count | None = None
-    clip: Positive = 1.0
-    damping: Positive = 1.0
     seed: Seed = 0
     evaluate_every: Count = 10
     checkpoint_seconds: NotNegative = 5.0
@@ -97,13 +74,13 @@ def _by_loss(value: object) -> object:
 
 
 ROBUST_ACCEPTED = f"{', '.join(get_args(Loss))}, or a mapping with loss, tuning and passes"
-"""What a message says of a robust fit."""
+"""Accepted for a robust fit, in messages."""
 
 Robust = Annotated[RobustConfig, BeforeValidator(_by_loss)]
 
 
 AUTO = "auto"
-"""What stands for a ridge that the data choose."""
+"""The ridge that the data choose."""
 
 
 def _number_or_auto(value: object, check: ValidatorFunctionWrapHandler) -> object:
@@ -118,39 +95,54 @@ if TYPE_CHECKING:
 else:
     Ridge = Annotated[NotNegative, WrapValidator(_number_or_auto)]
 
+Settings = TypeVar("Settings", LeastSquares, Consistent, Sgd)
+
 
 @dataclass(config=STRICT, frozen=True)
-class EstimatorConfig:
-    """How parameters are found.
+class _FitConfig:
+    """What is fitted and how, whatever the estimator.
 
-    `ridge` pulls to the URDF, auto: as far as predicts left-out blocks of the training logs best, `friction: false`
-    leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` takes outliers out of a batch
-    fit; `margin` of the scaled pseudo-inertias.
-
-    For `consistent`: `prior` that the ridge is in, `total_mass` [kg] if known, `method` and whether to `certify` with
-    the other; `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry` makes left
-    and right mirror images, `bounds` are [lower, upper] by body and parameter, null for none.
-
-    For `sgd`: `consistency` kept by log-Cholesky parameters or sought by `penalties`, and `training`.
+    `ridge`: auto, the largest that predicts left-out blocks of the training logs as well as the best; `friction: false`
+    leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` weighs outliers down in a batch
+    fit.
     """
 
     name: Literal["least_squares", "consistent", "sgd"] = "least_squares"
-    ridge: Ridge = 0.0
-    rank_tolerance: Annotated[Number, Field(gt=0.0, lt=1.0)] = 1e-10
+    ridge: Ridge = LeastSquares.ridge
+    rank_tolerance: Tolerance = LeastSquares.rank_tolerance
     friction: bool = True
     frozen: list[str] = dataclasses.field(default_factory=list)
     robust: Robust | None = None
-    margin: Annotated[Number, Field(ge=0.0, lt=1.0)] = 1e-4
-    prior: Literal["euclidean", "pullback", "entropic"] = "euclidean"
-    method: Literal["barrier", "certified"] = "barrier"
-    certify: bool = False
-    total_mass: Positive | None = None
-    com_inside: Literal["box", "ellipsoid"] | None = None
+
+
+@dataclass(config=STRICT, frozen=True)
+class _ConditionsConfig:
+    """What makes `Conditions`, together with a robot.
+
+    `total_mass` [kg] if known; `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry`
+    makes left and right mirror images, `bounds` are [lower, upper] by body and parameter, null for none.
+    """
+
+    margin: BelowOne = Conditions.margin
+    total_mass: Positive | None = Conditions.total_mass
+    com_inside: EnclosureKind | None = None
     com_shapes: Literal["visual", "collision"] = "visual"
     symmetry: SymmetryConfig | None = None
     bounds: dict[str, dict[str, Interval]] | None = None
-    consistency: Literal["log_cholesky", "penalties"] = "log_cholesky"
-    penalties: PenaltiesConfig = dataclasses.field(default_factory=PenaltiesConfig)
+
+
+@dataclass(config=STRICT, frozen=True)
+class EstimatorConfig(_ConditionsConfig, _FitConfig):
+    """An estimator by its name, with the keys of all: what a key means and accepts is said where its default is from.
+
+    A file may set only the keys of the estimator it names, see `validate_keys`.
+    """
+
+    prior: Prior = Consistent.prior
+    method: Method = Consistent.method
+    certify: bool = Consistent.certify
+    consistency: Consistency = Sgd.consistency
+    penalties: PenaltyWeights = dataclasses.field(default_factory=PenaltyWeights)
     training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
 
     @property
@@ -159,22 +151,35 @@ class EstimatorConfig:
         return self.ridge == AUTO
 
     @property
-    def pull(self) -> float:
+    def numeric_ridge(self) -> float:
         """The ridge as a number, 0 while it has not been chosen."""
         return 0.0 if isinstance(self.ridge, str) else self.ridge
 
+    @property
+    def least_squares(self) -> LeastSquares:
+        """Least squares with these settings."""
+        return self._settings(LeastSquares)
 
-_ALL = ("name", "ridge", "rank_tolerance", "friction", "frozen")
-_BATCH = (*_ALL, "robust")
-_PHYSICAL = ("prior", "method", "certify", "total_mass", "com_inside", "com_shapes", "symmetry", "bounds")
-_KEYS = {
-    "least_squares": _BATCH,
-    "consistent": (*_BATCH, "margin", *_PHYSICAL),
-    "sgd": (*_ALL, "margin", "consistency", "penalties", "training"),
-}
+    @property
+    def sgd(self) -> Sgd:
+        """A descent with these settings."""
+        return self._settings(Sgd)
+
+    def consistent(self, conditions: Conditions) -> Consistent:
+        """A consistent fit with these settings.
+
+        Raises:
+            InputError: the certified method without CVXPY and Clarabel.
+        """
+        return self._settings(Consistent, conditions=conditions)
+
+    def _settings(self, estimator: type[Settings], **given: Any) -> Settings:
+        """An estimator with its fields taken from here, from `training`, or as given."""
+        found = vars(self) | vars(self.training) | {"ridge": self.numeric_ridge} | given
+        return estimator(**{key: found[key] for key in _fields(estimator) if key in found})
 
 
-def check_keys(estimator: EstimatorConfig, path: Path) -> None:
+def validate_keys(estimator: EstimatorConfig, path: Path) -> None:
     """Refuse a setting that the estimator has not: it would be ignored in silence.
 
     Raises:
@@ -182,10 +187,30 @@ def check_keys(estimator: EstimatorConfig, path: Path) -> None:
     """
     defaults = EstimatorConfig()
     for key, value in vars(estimator).items():
-        if key not in _KEYS[estimator.name] and value != getattr(defaults, key):
-            having = [name for name, keys in _KEYS.items() if key in keys]
+        having = _estimators_with(key)
+        if estimator.name not in having and value != getattr(defaults, key):
             found = f"set, which {estimator.name} has not"
             raise ConfigError(path, f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
     if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
         found = f"set, which consistency: {estimator.consistency} has not"
         raise ConfigError(path, "estimator.penalties", found, "consistency: penalties, or no such key")
+
+
+def _estimators_with(key: str) -> list[str]:
+    """Names of the estimators that a key of the block is for."""
+    if key in _fields(_FitConfig) and key != "robust":
+        return list(ESTIMATORS)
+    return [name for name, estimator in ESTIMATORS.items() if key in _keys_of(estimator)]
+
+
+def _keys_of(estimator: type) -> set[str]:
+    """Keys of the block that are for an estimator alone or with some others."""
+    keys = set(_fields(estimator))
+    if "conditions" in keys:
+        keys |= set(_fields(_ConditionsConfig))
+    keys.add("training" if issubclass(estimator, TrainingSettings) else "robust")
+    return keys
+
+
+def _fields(of: type) -> list[str]:
+    return [field.name for field in dataclasses.fields(of)]

@@ -1,9 +1,8 @@
-"""The experiment file of `torchid identify` and `torchid analyze`."""
+"""The experiment file of `torchid identify` and `torchid analyze`, and the part of it that reading a bag needs."""
 
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, check_keys
+from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, validate_keys
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
@@ -20,60 +19,19 @@ from torchid.config.sensors import (
     Choice,
     Device,
     FileName,
-    NotNegative,
-    Positive,
-    Seed,
     Sensors,
     SensorsConfig,
-    check_choice,
     spelled_out,
+    validate_choice,
 )
-from torchid.errors import ConfigError, TorchidWarning
+from torchid.errors import ConfigError, warn
 from torchid.logs import Topics
-from torchid.logs.containers import bag_files
+from torchid.logs.containers import list_bag_files
 from torchid.logs.ros.topics import check_topics
-
-
-@dataclass(config=STRICT, frozen=True)
-class _Logs:
-    topics: Topics
-
-
-@dataclass(config=STRICT, frozen=True)
-class _TopicsFile:
-    logs: _Logs
-
-
-def _topics_alone(settings: Settings, _: Settings) -> Settings:
-    """The settings without all that is not `logs.topics`."""
-    logs = settings.get("logs")
-    return {"logs": {key: x for key, x in logs.items() if key == "topics"} if isinstance(logs, dict) else {}}
-
+from torchid.settings import NotNegative, Positive, Seed
 
 JOINTS_ACCEPTED = "the name of a topic, or a mapping with topic and joints"
-"""What a message says of the one topic that every bag needs."""
-
-_KIND = FileKind(
-    settings=_TopicsFile,
-    name="experiment",
-    keys="logs.topics",
-    list_example="logs.topics.joint_states.joints=[l_knee]",
-    prepare=_topics_alone,
-    accepted={"logs.topics.joint_states": JOINTS_ACCEPTED},
-)
-
-
-def load_topics(path: str | Path) -> Topics:
-    """Read what the topics of a bag hold from an experiment file, whatever else it says or leaves out.
-
-    Raises:
-        ConfigError: unreadable file, no `logs.topics`, a value of the wrong kind.
-        UnknownNameError: a key that does not exist; the message names the nearest that do.
-    """
-    topics = load(_KIND, Path(path)).logs.topics
-    check_topics(path, topics)
-    return topics
-
+"""Accepted for the one topic that every bag needs, in messages."""
 
 Name = Annotated[str, Field(min_length=1)]
 Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
@@ -81,9 +39,9 @@ Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
 
 @dataclass(config=STRICT, frozen=True)
 class CandidatesConfig:
-    """Sensors that could be mounted: torques of these joints (None: all), and at the contacts whole devices or axes.
+    """Sensors that could be mounted: torques of `joint_torques` (None: all), and at the contacts devices or axes.
 
-    `ft_sensors`: fixed joints that could carry a force/torque sensor, whole devices unless `contacts` are axes.
+    `ft_sensors`: fixed joints that could carry a force/torque sensor, a device unless `contacts` are axes.
     """
 
     joint_torques: list[str] | None = None
@@ -93,14 +51,15 @@ class CandidatesConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class AnalysisConfig:
-    """What is asked of the sensors.
+    """Which sensors to plan for, and which sensor sets to compare.
 
-    `scenarios`: contact states by scenario, each the frames in contact; None: the states of the training logs, or,
-    without logs, all contacts at once. `keep`: candidates that are mounted anyway, `exclude`: that cannot be; `costs`
-    by candidate or by kind (joint_torque, contact, ft_sensor), a channel. `criterion`: the base survives the projection
-    of every sample (None, for a floating base), or many samples together determine all that full sensing would (None,
-    for a bolted one). `compare`: sensor sets whose accuracy is predicted from the training logs and measured on the
-    test logs; `prior_error`: how far off the URDF may be, against the size of each body.
+    `scenarios`: contact states by scenario, each a list of the frames in contact; None: the states of the training
+    logs, or, without logs, all contacts at once. `keep`: candidates that every plan has, `exclude`: that none has;
+    `costs` per channel, by candidate or by kind (joint_torque, contact, ft_sensor). `criterion`: per_sample, the base
+    survives the projection of every sample (None, for a floating base); stack, many samples together determine all that
+    full sensing would (None, for a fixed one). `compare`: sensor sets whose accuracy is predicted from the training
+    logs and measured on the test logs; `prior_error`: standard deviation of the URDF's parameters, as a share of the
+    size of each body.
     """
 
     scenarios: Annotated[Scenarios, Field(min_length=1)] | None = None
@@ -116,7 +75,7 @@ class AnalysisConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class RobotConfig:
-    """Which robot: `base_link` defaults to the URDF's root."""
+    """The robot; `base_link` defaults to the URDF's root."""
 
     urdf: Path
     base_link: str | None = None
@@ -134,10 +93,10 @@ class ContactConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class ActuatorsConfig:
-    """What actuators add, of every joint whose torque is measured.
+    """Unknown terms of the actuators, of every joint whose torque is measured.
 
-    `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs forwards
-    and backwards; `sign_width` [rad/s or m/s]: Coulomb friction goes with tanh(velocity / width) instead of the sign.
+    `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs by
+    direction; `sign_width` [rad/s or m/s]: Coulomb friction goes with tanh(velocity / width) instead of the sign.
     """
 
     armature: bool = False
@@ -148,9 +107,9 @@ class ActuatorsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class LogsConfig:
-    """Logs to fit on, logs that tell a descent when to stop, and logs the fit never sees.
+    """Logs to fit on, held-out logs for the early stopping of a descent, and logs for tests alone.
 
-    `*` and `?` in a name stand for all files that match. `topics` says what the topics of bags hold.
+    A name with `*` or `?` is a pattern for all files that match. `topics` describes the topics of bags.
     """
 
     train: Annotated[list[Path], Field(min_length=1)]
@@ -177,7 +136,7 @@ class PreprocessingConfig:
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class _Common:
-    """What identification and analysis of a robot share."""
+    """The keys of identification and analysis alike."""
 
     robot: RobotConfig
     sensors: Sensors = dataclasses.field(default_factory=SensorsConfig)
@@ -201,7 +160,7 @@ class ExperimentConfig(_Common):
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class AnalyzeConfig(_Common):
-    """The same file, for questions that need neither logs nor sensors; without sensors by name, `noise` alone."""
+    """The same file for an analysis, which needs neither logs nor sensors; `sensors` may be `noise` alone."""
 
     logs: LogsConfig | None = None
 
@@ -252,8 +211,8 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     """
     path = Path(path)
     config = load(_EXPERIMENT, path, overrides)
-    check_choice(path, "sensors", config.sensors)
-    check_keys(config.estimator, path)
+    validate_choice(path, "sensors", config.sensors)
+    validate_keys(config.estimator, path)
     _check_extras(path, config)
     return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
 
@@ -262,46 +221,16 @@ def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeCon
     """Read an experiment file for `torchid analyze`: as `load_config`, but logs and sensors may be left out."""
     path = Path(path)
     config = load(_ANALYSIS, path, overrides)
-    check_choice(path, "sensors", config.sensors, may_be_empty=True)
-    check_keys(config.estimator, path)
+    validate_choice(path, "sensors", config.sensors, may_be_empty=True)
+    validate_keys(config.estimator, path)
     _check_extras(path, config)
     for name, choice in config.analysis.compare.items():
-        check_choice(path, f"analysis.compare.{name}", choice)
+        validate_choice(path, f"analysis.compare.{name}", choice)
     if config.logs is None:
         if config.analysis.compare:
             raise ConfigError(path, "analysis.compare", "set, without logs to predict accuracy from", "logs.train too")
         return config
     return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
-
-
-def _check_extras(path: Path, config: _Common) -> None:
-    """Refuse one unknown under two names, and unknowns that a descent does not know."""
-    actuators, sensors = config.actuators, config.sensors
-    if actuators.torque_offset and "joint_torque" in sensors.offsets:
-        found = "set together with sensors.offsets.joint_torque, which is the same"
-        raise ConfigError(path, "actuators.torque_offset", found, "one of the two")
-    unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items()}
-    unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
-    for field, wanted in unknowns.items():
-        if wanted and config.estimator.name == "sgd":
-            raise ConfigError(path, field, "set, which sgd has not", "estimator.name: least_squares or consistent")
-
-
-def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
-    """The logs with patterns resolved, after checks of what they are used for."""
-    _check_held_out(path, config.estimator, logs)
-    found = {key: _matching(path, f"logs.{key}", getattr(logs, key)) for key in ("train", "test", "validation")}
-    for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
-        both = sorted({*found[key]} & {*found["test"]})
-        if both:
-            message = f"{path}: logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion"
-            warnings.warn(message, TorchidWarning, stacklevel=3)
-    both = sorted({*found["train"]} & {*found["validation"]})
-    if both:
-        raise ConfigError(path, "logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
-    if logs.topics is not None:
-        check_topics(path, logs.topics)
-    return LogsConfig(**found, topics=logs.topics)
 
 
 def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
@@ -315,6 +244,74 @@ def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
     return dump(config)
 
 
+@dataclass(config=STRICT, frozen=True)
+class _Logs:
+    topics: Topics
+
+
+@dataclass(config=STRICT, frozen=True)
+class _TopicsFile:
+    logs: _Logs
+
+
+def _topics_alone(settings: Settings, _: Settings) -> Settings:
+    """The key `logs.topics` alone."""
+    logs = settings.get("logs")
+    return {"logs": {key: x for key, x in logs.items() if key == "topics"} if isinstance(logs, dict) else {}}
+
+
+_TOPICS = FileKind(
+    settings=_TopicsFile,
+    name="experiment",
+    keys="logs.topics",
+    list_example="logs.topics.joint_states.joints=[l_knee]",
+    prepare=_topics_alone,
+    accepted={"logs.topics.joint_states": JOINTS_ACCEPTED},
+)
+
+
+def load_topics(path: str | Path) -> Topics:
+    """Read `logs.topics` from an experiment file, whatever its other keys are.
+
+    Raises:
+        ConfigError: unreadable file, no `logs.topics`, a value of the wrong kind.
+        UnknownNameError: a key that does not exist; the message names the nearest that do.
+    """
+    topics = load(_TOPICS, Path(path)).logs.topics
+    check_topics(path, topics)
+    return topics
+
+
+def _check_extras(path: Path, config: _Common) -> None:
+    """Refuse the same extra parameter under two keys, and extra parameters for a descent, which has none."""
+    actuators, sensors = config.actuators, config.sensors
+    if actuators.torque_offset and "joint_torque" in sensors.offsets:
+        found = "set together with sensors.offsets.joint_torque, which is the same"
+        raise ConfigError(path, "actuators.torque_offset", found, "one of the two")
+    unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items()}
+    unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
+    for field, wanted in unknowns.items():
+        if wanted and config.estimator.name == "sgd":
+            raise ConfigError(path, field, "set, which sgd has not", "estimator.name: least_squares or consistent")
+
+
+def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
+    """The logs with patterns resolved; refuses logs that an estimator has no use for, or with two uses."""
+    _check_held_out(path, config.estimator, logs)
+    found = {key: _matching(path, f"logs.{key}", getattr(logs, key)) for key in ("train", "test", "validation")}
+    for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
+        both = sorted({*found[key]} & {*found["test"]})
+        if both:
+            message = f"{path}: logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion"
+            warn(message)
+    both = sorted({*found["train"]} & {*found["validation"]})
+    if both:
+        raise ConfigError(path, "logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
+    if logs.topics is not None:
+        check_topics(path, logs.topics)
+    return LogsConfig(**found, topics=logs.topics)
+
+
 def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
     """The paths, with every file that matches in place of a name with * or ? in it."""
     out: list[Path] = []
@@ -323,7 +320,7 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
             out.append(path)
             continue
         matching = path.parent.glob(path.name.replace("[", "[[]"))
-        found = sorted(file for file in matching if file.is_file() or bag_files(file))
+        found = sorted(file for file in matching if file.is_file() or list_bag_files(file))
         if not found:
             raise ConfigError(source, field, f"no file matches {path}", "a log, or a pattern of several")
         out += found
@@ -334,7 +331,7 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
 
 
 def _check_held_out(path: Path, estimator: EstimatorConfig, logs: LogsConfig) -> None:
-    """Held-out logs are for a descent, and patience needs some."""
+    """Refuse held-out logs without a descent, and patience without held-out logs."""
     if logs.validation and estimator.name != "sgd":
         raise ConfigError(path, "logs.validation", f"set, which {estimator.name} has no use for", "estimator.name: sgd")
     if estimator.training.patience is not None and not logs.validation:

@@ -1,4 +1,4 @@
-"""Any kind of settings file: YAML and overrides into a checked dataclass, and every slip into one line."""
+"""Settings files of any kind: YAML and overrides into a validated dataclass, and every error in one line."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from pydantic import TypeAdapter, ValidationError
 from torchid.errors import ConfigError, UnknownNameError, during
 from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML, read_bytes
 from torchid.logs.containers import READABLE
-from torchid.text import is_plain, shown
+from torchid.settings import accepted_values
+from torchid.text import excerpt, is_plain
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TAG = "tag:yaml.org,2002:"
-#: Tags that settings may have; others make dates, sets or bytes, which stand nowhere in them.
+#: Tags that settings may have; others make dates, sets or bytes, which no key accepts.
 _KINDS = ("str", "int", "float", "bool", "null", "map", "seq", "merge")
 _NUMBERS = ("int", "float", "bool", "null")
 
@@ -55,7 +56,7 @@ class _Count:
 
 
 def check_yaml(text: str) -> None:
-    """Refuse what would unfold beyond all bounds, what cannot be shown, and `${...}`, whose value lies elsewhere.
+    """Refuse YAML that unfolds beyond bounds, control characters, and interpolations `${...}`.
 
     Raises:
         ValueError, yaml.YAMLError: what was found.
@@ -67,7 +68,7 @@ def check_yaml(text: str) -> None:
         _check_tag(event)
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in count.anchored:
-                raise ValueError(f"'*{shown(str(event.anchor))}', which stands for nothing complete")
+                raise ValueError(f"'*{excerpt(str(event.anchor))}', which stands for nothing complete")
             count.add(count.anchored[event.anchor])
         elif isinstance(event, yaml.CollectionStartEvent):
             count.start(event.anchor)
@@ -81,26 +82,26 @@ def check_yaml(text: str) -> None:
 
 
 def _check_tag(event: yaml.Event) -> None:
-    """Refuse a tag that says what its value is not: what builds values of it fails in ways of its own."""
+    """Refuse a tag that contradicts its value, whose construction would fail with errors of its own."""
     tag = getattr(event, "tag", None)
     if tag in (None, "!"):
         return
     kind = tag.removeprefix(_TAG)
     if kind not in _KINDS:
-        raise ValueError(f"the tag '{shown(tag)}', which settings have no use for")
+        raise ValueError(f"the tag '{excerpt(tag)}', which settings have no use for")
     if isinstance(event, yaml.ScalarEvent) and kind in _NUMBERS:
         resolved = yaml.resolver.Resolver().resolve(yaml.ScalarNode, event.value, (True, False)).removeprefix(_TAG)
         if resolved != kind and (kind, resolved) != ("float", "int"):
-            raise ValueError(f"'{shown(event.value)}', which is no !!{kind}")
+            raise ValueError(f"'{excerpt(event.value)}', which is no !!{kind}")
 
 
 def _check_scalar(value: str) -> None:
     if len(value) > MAX_TEXT:
         raise ValueError(f"a text of {len(value)} characters, more than {MAX_TEXT}")
     if not is_plain(value.replace("\n", "")):
-        raise ValueError(f"'{shown(value)}', with a control character")
+        raise ValueError(f"'{excerpt(value)}', with a control character")
     if "${" in value:
-        raise ValueError(f"'{shown(value)}', but ${{...}} stands for nothing here")
+        raise ValueError(f"'{excerpt(value)}', but ${{...}} stands for nothing here")
 
 
 #: What YAML and OmegaConf raise at a value that is not what its tag or its place says.
@@ -121,7 +122,7 @@ def _as_is(settings: Settings, _: Settings) -> Settings:
 
 @dataclasses.dataclass(frozen=True)
 class FileKind(Generic[T]):
-    """One kind of settings file: what it holds, and how messages speak of it.
+    """One kind of settings file: its dataclass, its paths, and its words in messages.
 
     Attributes:
         settings: the pydantic dataclass of the whole file. Those inside it may lie in lists, in mappings and in
@@ -133,8 +134,8 @@ class FileKind(Generic[T]):
         outputs: places that hold the path of a result.
         prepare: takes settings and those that will override them, and returns the settings to merge; it is called for
             the file and nothing, then, for each override, for all before and it, and for it and nothing.
-        accepted: what a message says is accepted, by place (`*` for a name that the file gives), where the type alone
-            says too little.
+        accepted: the accepted values in messages, by place (`*` for a name from the file), where the type alone says
+            too little.
     """
 
     settings: type[T]
@@ -182,7 +183,7 @@ def _load(kind: FileKind[T], path: Path, overrides: Sequence[str]) -> T:
             settings = _container(OmegaConf.merge(*layers))
         except (OmegaConfBaseException, TypeError) as error:
             accepted = f"key.subkey=value, a list as a whole: '{kind.list_example}'"
-            raise ConfigError("command line", shown(text), "does not fit the file", accepted) from error
+            raise ConfigError("command line", excerpt(text), "does not fit the file", accepted) from error
     try:
         return TypeAdapter(kind.settings).validate_python(settings)
     except ValidationError as error:
@@ -215,17 +216,17 @@ def _no_settings(kind: FileKind[T], path: Path, found: str, accepted: str) -> Co
 
 
 def _why(error: Exception) -> str:
-    """What a reader of YAML found, in its own words where these are made for readers."""
+    """The cause of an error in reading YAML, in the words of its reader where these are made for users."""
     if isinstance(error, UnicodeDecodeError):
         return "no text"
     spoken = isinstance(error, (OmegaConfBaseException, yaml.YAMLError, ValueError))
-    return shown(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
+    return excerpt(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
 
 
 def _parsed(text: str) -> Settings:
     key, equals, value = text.partition("=")
     if not equals:
-        raise ConfigError("command line", shown(text), "not an override", "key.subkey=value")
+        raise ConfigError("command line", excerpt(text), "not an override", "key.subkey=value")
     try:
         check_yaml(key)
         check_yaml(value)
@@ -233,7 +234,7 @@ def _parsed(text: str) -> Settings:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         return _container(OmegaConf.from_dotlist([text]))
     except _NO_YAML as error:
-        raise ConfigError("command line", shown(text), _why(error), "key.subkey=value, in YAML") from error
+        raise ConfigError("command line", excerpt(text), _why(error), "key.subkey=value, in YAML") from error
 
 
 def _cleared(settings: Settings, given: Settings) -> Settings:
@@ -261,7 +262,7 @@ def _absolute(source: object, settings: Settings, places: Sequence[str], folder:
 
 
 def _absolute_at(value: Any, place: Sequence[str], folder: Path) -> Any:
-    """The value with the path at a place made absolute; what is no path where one belongs is left to the checks."""
+    """The value with the path at a place made absolute; values of another type are left to the validation."""
     if not place:
         return _absolute_path(value, folder) if isinstance(value, str) else value
     key, *rest = place
@@ -278,12 +279,12 @@ def _absolute_path(value: str, folder: Path) -> str:
     names = [len(os.fsencode(name)) for name in Path(path).parts]
     too_long = max(names) > _LONGEST_NAME or sum(names) + len(names) > _LONGEST_PATH
     if not value.strip() or not Path(path).name or not is_plain(value) or too_long:
-        raise ValueError(f"'{shown(value)}', no name for a file or folder")
+        raise ValueError(f"'{excerpt(value)}', no name for a file or folder")
     return path
 
 
 def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> ConfigError | UnknownNameError:
-    """The first complaint, an unknown key before others: it is the likeliest cause of the rest."""
+    """The first validation error as one line; an unknown key first, the likeliest cause of the others."""
     complaints = sorted(error.errors(), key=lambda e: e["type"] != "unexpected_keyword_argument")
     first = complaints[0]
     place = [str(part) for part in first["loc"] if part != "[key]"]
@@ -306,24 +307,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
     if first["type"] == "dataclass_type":
         accepted = f"a mapping with {', '.join(_keys_at(kind.settings, place))}"
     else:
-        count = first.get("ctx", {}).get("min_length", 1)
-        plain = {
-            "float_parsing": "a number",
-            "float_type": "a number",
-            "int_parsing": "a whole number",
-            "int_type": "a whole number",
-            "int_from_float": "a whole number",
-            "bool_parsing": "true or false",
-            "bool_type": "true or false",
-            "string_type": "a text",
-            "path_type": "a path",
-            "list_type": "a list",
-            "dict_type": "a mapping",
-            "too_short": f"at least {count} items",
-            "string_too_short": "a name",
-        }
-        described = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-        accepted = plain.get(first["type"], described)
+        accepted = accepted_values(first)
     if first["type"] in ("dataclass_type", "dict_type"):
         accepted = kind.accepted_at(place, accepted)
     return ConfigError(path, field, f"found {shown}", accepted)
@@ -331,7 +315,7 @@ def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> Confi
 
 def _repr(value: object) -> str:
     try:
-        return shown(repr(value))
+        return excerpt(repr(value))
     except ValueError:  # Python spells no number of more than 4300 digits
         return f"a number of more than {sys.get_int_max_str_digits()} digits"
 
@@ -350,7 +334,7 @@ def _hint_at(settings: Any, place: Sequence[str]) -> Any:
 
 
 def _places_of(name: str, settings: Any, place: str = "") -> Iterator[str]:
-    """Where else in a dataclass there is a key of a name, for one that is written in the wrong place."""
+    """Other places in a dataclass with a key of that name, for one that is written in the wrong place."""
     for key, hint in get_type_hints(settings).items():
         if key == name:
             yield place + key

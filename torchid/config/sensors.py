@@ -1,4 +1,4 @@
-"""The values that settings are made of, and the sensors of an experiment file with their noise."""
+"""The sensors of an experiment file with their noise, and values that all settings files share."""
 
 from __future__ import annotations
 
@@ -7,20 +7,14 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError
 from torchid.problem.extras import CHANNELS
+from torchid.settings import Positive
 
 STRICT = ConfigDict(extra="forbid")
-
-
-def no_flag(value: object) -> object:
-    """The value, unless it is true or false, which pydantic takes for 1 and 0."""
-    if isinstance(value, bool):
-        raise ValueError("a number")  # and not 1.0 for `true`
-    return value
 
 
 def _torch_device(value: str) -> str:
@@ -35,10 +29,6 @@ def _file_name(value: str) -> str:
     return value
 
 
-Number = Annotated[float, BeforeValidator(no_flag), Field(allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0.0)]
-NotNegative = Annotated[Number, Field(ge=0.0)]
-Seed = Annotated[int, BeforeValidator(no_flag), Field(ge=0)]
 FileName = Annotated[str, AfterValidator(_file_name)]
 Device = Annotated[str, AfterValidator(_torch_device)]
 
@@ -85,7 +75,7 @@ class NoiseConfig:
 class ChoiceConfig:
     """A named set, or sensors by name; `full` is short for `{set: full}`.
 
-    `ft_sensors`, the fixed joints that carry a force/torque sensor, may stand beside a named set too.
+    `ft_sensors`, the fixed joints that carry a force/torque sensor, may be given with a named set too.
     """
 
     set: Literal["full", "contacts", "joints"] | None = None
@@ -108,12 +98,12 @@ Channel = Literal["joint_torque", "contact_force", "contact_moment", "ft_force",
 Scope = Literal["log", "all"]
 Scopes = Annotated[dict[Channel, Scope], BeforeValidator(_every_channel)]
 SCOPES_ACCEPTED = f"log, all, or a mapping from kinds of channels ({', '.join(CHANNELS)}) to log or all"
-"""What a message says of `Scopes`."""
+"""Accepted for `Scopes`, in messages."""
 
 
 @dataclass(config=STRICT, frozen=True)
 class SensorsConfig(ChoiceConfig):
-    """The sensors of a run, their noise and calibration, and what to do where they lose the base.
+    """The sensors of a run, their noise and calibration, and whether to stop where they lose the base.
 
     `offsets` and `scales` say which channels have an unknown one, constant over a `log` or over `all`; a scope alone is
     short for every kind of channel.
@@ -131,14 +121,14 @@ def spelled_out(value: object) -> object:
 
 
 CHOICE_ACCEPTED = "full, contacts, joints, or a mapping with sensors by name"
-"""What a message says of a choice of sensors."""
+"""Accepted for a choice of sensors, in messages."""
 
 Choice = Annotated[ChoiceConfig, BeforeValidator(spelled_out)]
 Sensors = Annotated[SensorsConfig, BeforeValidator(spelled_out)]
 
 
-def check_choice(path: Path, field: str, sensors: ChoiceConfig, may_be_empty: bool = False) -> None:
-    """Refuse a named set with sensors by name beside it, and a choice of nothing.
+def validate_choice(path: Path, field: str, sensors: ChoiceConfig, may_be_empty: bool = False) -> None:
+    """Refuse a named set together with sensors by name, and a choice without any sensor.
 
     Raises:
         ConfigError: either.

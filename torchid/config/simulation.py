@@ -1,4 +1,4 @@
-"""The settings file of `torchid simulate`: a robot, its feet, motions, and what is wrong with its sensors."""
+"""The settings file of `torchid simulate`: a robot, its feet, motions, and its sensors' imperfections."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.reading import FileKind, load
-from torchid.config.sensors import STRICT, FileName, NotNegative, Number, Positive, Seed
+from torchid.config.sensors import STRICT, FileName
 from torchid.errors import ConfigError
+from torchid.settings import BelowOne, NotNegative, Number, Positive, Seed
 
 Point = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
@@ -95,7 +96,7 @@ class BiasConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class DelayConfig:
-    """How late the foot sensors are [s]."""
+    """The delay of the foot sensors [s]."""
 
     enabled: bool = False
     feet_s: NotNegative = 0.01
@@ -117,7 +118,7 @@ class FrictionConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class SensorImperfectionsConfig:
-    """What the log has that the robot had not; a contact is active while its measured load exceeds a threshold [N]."""
+    """Errors of the sensors; a contact is active while its measured load exceeds a threshold [N]."""
 
     noise: WhiteNoiseConfig = dataclasses.field(default_factory=WhiteNoiseConfig)
     bias: BiasConfig = dataclasses.field(default_factory=BiasConfig)
@@ -127,7 +128,7 @@ class SensorImperfectionsConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class BoundsConfig:
-    """What a run must keep [m]: base height near the stance's, feet that do not slip, a zero-moment point inside.
+    """Limits of a motion [m]: of base height from the stance's, of slipping feet, of the zero-moment point.
 
     `zmp_m` is the least distance from the zero-moment point to the border of the support polygon.
     """
@@ -141,7 +142,7 @@ class BoundsConfig:
 class NominalConfig:
     """The nominal robot: mass, centre of mass and inertia of every body off by up to `error`, as a share."""
 
-    error: Annotated[Number, Field(ge=0.0, lt=1.0)] = 0.2
+    error: BelowOne = 0.2
     seed: Seed = 0
 
 

@@ -1,15 +1,15 @@
 """Estimators: from a linear problem to parameters."""
 
 from torchid.estimators.conditions import Conditions, Enclosure, Mirror, Violation, violations
-from torchid.estimators.consistent import Consistent, ConsistentEstimate, project
+from torchid.estimators.consistent import Consistent, ConsistentEstimate, nearest_consistent
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
-from torchid.estimators.least_squares import BoundEstimate, Estimate, LeastSquares
+from torchid.estimators.least_squares import ConstrainedEstimate, Estimate, LeastSquares
 from torchid.estimators.residual import ResidualEffect, WeightChoice
-from torchid.estimators.sgd import PenaltyWeights, Sgd
+from torchid.estimators.sgd import PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.training import Epoch, SgdEstimate, Trainer
 
 __all__ = [
-    "BoundEstimate",
+    "ConstrainedEstimate",
     "Conditions",
     "Consistent",
     "ConsistentEstimate",
@@ -26,8 +26,9 @@ __all__ = [
     "Sgd",
     "SgdEstimate",
     "Trainer",
+    "TrainingSettings",
     "Violation",
     "WeightChoice",
-    "project",
+    "nearest_consistent",
     "violations",
 ]

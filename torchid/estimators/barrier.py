@@ -1,8 +1,7 @@
-"""The fast path: a barrier method whose Newton steps are batched over bodies in torch."""
+"""The barrier method for the conic problem, its Newton steps batched over bodies in torch."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,27 +9,28 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from torchid.errors import InputError, NumericalWarning
-from torchid.estimators.conic import ConicProblem, Solution
+from torchid.errors import InputError, NumericalWarning, warn
+from torchid.estimators.conic_problem import ConicProblem, Solution
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 
 _SHRINK = 0.02  # of the barrier's weight from stage to stage; 0.1 takes a fifth more steps, 0.01 no fewer
 _CENTRED = 0.25  # squared Newton decrement at which a full step ends a stage
 _STEPS, _STAGES = 200, 40
-_INSIDE = 1e-6  # least slack of a good starting point, _ROOM of any
-_ROOM = 1e-9
-_DEEP = 0.01  # and the most that is looked for
-_LOOSE = 1e-6  # relative gap worth a warning
-_SHORTEST = 1e-6  # step, as a share of what should stay inside, at which rounding rules
+_GOOD_SLACK = 1e-6  # of a starting point; the search for one with more ends there
+_LEAST_SLACK = 1e-9  # of a starting point that is accepted in the end
+_MOST_SLACK = 0.01  # that phase I rewards
+_LOOSE = 1e-6  # relative gap beyond which a warning is due
+_SHORTEST = 1e-6  # share of a step that should stay inside, below which rounding decides
 
 
 def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
     """Follow the central path until the duality gap is below `tolerance` times the objective.
 
-    Newton's method on the quadratic minus kappa times the log-determinants of the blocks and the logarithms of the
-    linear slacks, in the null space of the equalities. Newton or Gauss-Newton steps in log-Cholesky coordinates need
-    ten times as many iterations: their curvature excites the stiff directions of the data.
+    The barrier method of Boyd, Vandenberghe, "Convex Optimization", section 11.3: Newton's method on the quadratic less
+    kappa times the log-determinants of the blocks and the logarithms of the linear slacks, in the null space of the
+    equalities. Newton or Gauss-Newton steps in log-Cholesky coordinates need ten times as many iterations: their
+    curvature excites the stiff directions of the data.
 
     Args:
         problem: what to minimize.
@@ -43,66 +43,67 @@ def solve_barrier(problem: ConicProblem, tolerance: float = 1e-9) -> Solution:
         NumericalWarning: rounding ended the path early.
     """
     with one_thread():
-        return _follow(problem, tolerance)
+        return _follow_central_path(problem, tolerance)
 
 
-def _follow(problem: ConicProblem, tolerance: float) -> Solution:
-    x, steps = interior(problem)
-    path = _Path(problem)
+def _follow_central_path(problem: ConicProblem, tolerance: float) -> Solution:
+    x, steps = find_strictly_feasible(problem)
+    path = _CentralPath(problem)
     kappa = max(problem.objective(x), problem.floor) / max(problem.degree, 1)
     best = Solution(x, problem.objective(x), np.inf, steps)
     for _ in range(_STAGES):
         point = path.centre(x, kappa)
         x, steps, gap = point.x, steps + point.steps, problem.gap(point.x, point.Z, point.y)
         if gap >= best.gap:
-            break  # rounding is all that is left: the best point of the path stands
+            break  # rounding outweighs progress: the best point so far is returned
         best = Solution(x, problem.objective(x), gap, steps)
         if gap <= tolerance * max(best.objective, problem.floor):
             break
         kappa *= _SHRINK
     if not best.gap <= max(_LOOSE, tolerance) * max(best.objective, problem.floor):
         message = f"estimator: the barrier method stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
-        warnings.warn(message, NumericalWarning, stacklevel=5)
+        warn(message, NumericalWarning)
     return best
 
 
-def interior(problem: ConicProblem, patience: int = _STEPS * _STAGES) -> tuple[Array, int]:
-    """A strictly feasible x, near 0 if that is one, and the Newton steps it took to find.
+def find_strictly_feasible(problem: ConicProblem, patience: int = _STEPS * _STAGES) -> tuple[Array, int]:
+    """A strictly feasible x, (n,), near 0 where possible, and the Newton steps it took to find (phase I).
 
     Args:
-        problem: whose conditions.
-        patience: Newton steps after which the search is given up.
+        problem: whose conditions it is to meet.
+        patience: Newton steps after which the search ends.
 
     Raises:
-        InputError: there is none, or none was found.
+        InputError: none was found; names the condition that is violated most.
     """
     x = problem.E.T @ problem.e if problem.start is None else problem.start
     worst = float(problem.slack(x).min(initial=np.inf))
-    if worst > _INSIDE:
+    if worst > _GOOD_SLACK:
         return x, 0
     z, kappa, steps = np.append(x, 1.0 - worst), 1.0, 0
-    while kappa * (problem.degree + 1) > 0.1 * _ROOM and steps < patience:
-        point = _Path(_relaxed(problem, kappa)).centre(z, kappa, patience - steps)
+    while kappa * (problem.degree + 1) > 0.1 * _LEAST_SLACK and steps < patience:
+        point = _CentralPath(_phase_one(problem, kappa)).centre(z, kappa, patience - steps)
         z, steps = point.x, steps + point.steps
-        if problem.slack(z[:-1]).min() > _INSIDE:
+        if problem.slack(z[:-1]).min() > _GOOD_SLACK:
             return z[:-1], steps
         kappa *= _SHRINK
     slack = problem.slack(z[:-1])
-    if slack.min() > _ROOM:
+    if slack.min() > _LEAST_SLACK:
         return z[:-1], steps
     which = int(slack.argmin())
-    name = problem.names[which // 4 if which < 4 * len(problem.base) else which - 3 * len(problem.base)]
+    name = problem.names[which // 4 if which < 4 * len(problem.F0) else which - 3 * len(problem.F0)]
     raise InputError("estimator", name, "excluded by the other conditions", "conditions that some robot can meet")
 
 
-def _relaxed(problem: ConicProblem, kappa: float) -> ConicProblem:
-    """Min s, with s added to every eigenvalue and slack: negative s is what `interior` looks for.
+def _phase_one(problem: ConicProblem, kappa: float) -> ConicProblem:
+    """Min s, with s added to every eigenvalue and slack: a point with negative s is strictly feasible.
 
-    A pull to 0 that fades with the barrier keeps at its place what could grow for ever. A bound on s stops the search
-    at what is deep enough: 122 steps instead of 211 for the worst of 600 random problems.
+    Boyd, Vandenberghe, section 11.4, with two additions. A quadratic that fades with the barrier keeps directions
+    without a minimum bounded. A lower bound on s ends the search at a slack that suffices: 122 steps instead of 211 for
+    the worst of 600 random problems.
     """
-    n, blocks, rows = len(problem.linear), len(problem.base), len(problem.h)
-    slopes = np.concatenate([problem.slopes, np.broadcast_to(np.eye(4), (blocks, 1, 4, 4))], axis=1)
+    n, blocks, rows = len(problem.linear), len(problem.F0), len(problem.h)
+    F = np.concatenate([problem.F, np.broadcast_to(np.eye(4), (blocks, 1, 4, 4))], axis=1)
     variables = np.concatenate([problem.variables, np.full((blocks, 1), n)], axis=1)
     return replace(
         problem,
@@ -110,17 +111,17 @@ def _relaxed(problem: ConicProblem, kappa: float) -> ConicProblem:
         root=np.sqrt(0.5 * kappa) * np.hstack([problem.deviations, np.zeros((n, 1))]),
         target=np.zeros(n),
         linear=np.eye(n + 1)[n],
-        slopes=slopes,
+        F=F,
         variables=variables,
         weights=np.zeros(blocks),
         G=np.vstack([np.hstack([problem.G, np.ones((rows, 1))]), np.eye(n + 1)[n:]]),
-        h=np.append(problem.h, -_DEEP),
+        h=np.append(problem.h, -_MOST_SLACK),
         E=np.hstack([problem.E, np.zeros((len(problem.e), 1))]),
     )
 
 
 @dataclass(frozen=True)
-class _Point:
+class _CentralPoint:
     """A point (n,) on or near the central path, multipliers (K, 4, 4) and (M,), the Newton steps it took."""
 
     x: Array
@@ -129,17 +130,17 @@ class _Point:
     steps: int
 
 
-class _Path:
-    """The central path of a problem, as tensors."""
+class _CentralPath:
+    """The central path of a problem, whose arrays it holds as tensors."""
 
     def __init__(self, problem: ConicProblem) -> None:
         self.problem = problem
-        self.base, self.slopes = torch.from_numpy(problem.base), torch.from_numpy(problem.slopes)
+        self.F0, self.F = torch.from_numpy(problem.F0), torch.from_numpy(problem.F)
         self.variables, self.weights = torch.from_numpy(problem.variables), torch.from_numpy(problem.weights)
         self.G, self.h = torch.from_numpy(problem.G), torch.from_numpy(problem.h)
-        self.H, self.moves = torch.from_numpy(problem.hessian), torch.from_numpy(problem.moves)
+        self.H, self.null_space = torch.from_numpy(problem.hessian), torch.from_numpy(problem.null_space)
 
-    def centre(self, start: Array, kappa: float, patience: int = _STEPS) -> _Point:
+    def centre(self, start: Array, kappa: float, patience: int = _STEPS) -> _CentralPoint:
         """The point of the path at barrier weight `kappa`, from `start`, (n,), inside.
 
         The last step is a full one: with the multipliers that Newton's equations give it, the dual residual is zero.
@@ -152,10 +153,13 @@ class _Path:
         for steps in range(1, most + 1):
             root, slack = factors
             smooth = torch.from_numpy(self.problem.gradient(x.numpy()))
-            half = torch.linalg.solve_triangular(root[:, None], self.slopes, upper=False)
+            half = torch.linalg.solve_triangular(root[:, None], self.F, upper=False)
             inside = torch.linalg.solve_triangular(root[:, None], half.mT, upper=False)  # (K, V, 4, 4), C^-1 E C^-T
             gradient, hessian = self._derivatives(smooth, inside, slack, weights, kappa)
-            move = -(self.moves @ _solved(self.moves.T @ hessian @ self.moves, self.moves.T @ gradient))
+            move = -(
+                self.null_space
+                @ _solve_damped(self.null_space.T @ hessian @ self.null_space, self.null_space.T @ gradient)
+            )
             change = (move[self.variables, None, None] * inside).sum(1)  # of the blocks, relative
             growth = self.G @ move / slack
             decrement = float(-gradient @ move) / kappa
@@ -163,7 +167,7 @@ class _Path:
                 break
             rates = torch.cat([torch.linalg.eigvalsh(change).ravel(), growth]).numpy()
             shares = torch.cat([weights.repeat_interleave(4), torch.full_like(slack, kappa)]).numpy()
-            length = _length(float(smooth @ move), float(move @ self.H @ move), rates, shares)
+            length = _step_length(float(smooth @ move), float(move @ self.H @ move), rates, shares)
             after = self._factors(x + length * move)
             while after is None and length > _SHORTEST:  # rounding: the step's length keeps it inside
                 length *= 0.5
@@ -177,11 +181,11 @@ class _Path:
             change, growth = torch.zeros_like(change), torch.zeros_like(growth)
         inverse = torch.linalg.solve_triangular(root, torch.eye(4, dtype=root.dtype), upper=False)
         Z = weights[:, None, None] * inverse.mT @ (torch.eye(4, dtype=root.dtype) - change) @ inverse
-        return _Point(x.numpy(), Z.numpy(), (kappa / slack * (1.0 - growth)).numpy(), steps)
+        return _CentralPoint(x.numpy(), Z.numpy(), (kappa / slack * (1.0 - growth)).numpy(), steps)
 
     def _factors(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         """Cholesky factors (K, 4, 4) of the blocks and slacks (M,) of the rows; None outside."""
-        blocks = self.base + (x[self.variables, None, None] * self.slopes).sum(1)
+        blocks = self.F0 + (x[self.variables, None, None] * self.F).sum(1)
         root, failed = torch.linalg.cholesky_ex(blocks)
         slack = self.G @ x - self.h
         return None if failed.any() or not (slack > 0.0).all() else (root, slack)
@@ -201,20 +205,20 @@ class _Path:
         return gradient, hessian
 
 
-def _length(slope: float, curvature: float, rates: Array, shares: Array) -> float:
+def _step_length(slope: float, curvature: float, rates: Array, shares: Array) -> float:
     """Length of the best step along a move: the quadratic's slope and curvature, and logarithms log(1 + length rate).
 
     In closed form: differences of the objective itself drown in rounding near the end of the path.
     """
 
-    def rise(length: float) -> float:
+    def slope_at(length: float) -> float:
         return slope + length * curvature - float(shares @ (rates / (1.0 + length * rates)))
 
     longest = min(10.0, 0.99 / max(-float(rates.min(initial=0.0)), 1e-9))
-    return longest if rise(longest) <= 0.0 else float(brentq(rise, 0.0, longest, xtol=1e-3 * longest))
+    return longest if slope_at(longest) <= 0.0 else float(brentq(slope_at, 0.0, longest, xtol=1e-3 * longest))
 
 
-def _solved(A: Tensor, b: Tensor) -> Tensor:
+def _solve_damped(A: Tensor, b: Tensor) -> Tensor:
     """A^-1 b for A positive semidefinite, with as much damping as it takes (Levenberg)."""
     diagonal = A.diagonal().abs().clamp_min(torch.finfo(A.dtype).tiny)
     scale = diagonal.rsqrt()

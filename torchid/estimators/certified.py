@@ -1,4 +1,4 @@
-"""The certified path: the same problem as a semidefinite programme (the only module that imports CVXPY)."""
+"""The conic problem solved by Clarabel, a primal-dual solver (the only module that imports CVXPY)."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ import warnings
 import cvxpy as cp
 import numpy as np
 
-from torchid.errors import InputError, NumericalWarning
-from torchid.estimators.barrier import interior
-from torchid.estimators.conic import ConicProblem, Solution
+from torchid.errors import InputError, NumericalWarning, warn
+from torchid.estimators.barrier import find_strictly_feasible
+from torchid.estimators.conic_problem import ConicProblem, Solution
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 
-_LOOSE = 1e-6  # relative gap that is worth another try, and in the end a warning
-_OUTSIDE = 1e-8  # how far conditions may be missed, in units of the scale: most solutions are within; or another try,
-_FAR = 1e-7  # and in the end a warning
+_LOOSE = 1e-6  # relative gap beyond which another try is made, and in the end a warning
+_OUTSIDE = 1e-8  # violation of a condition, in units of the scale, beyond which another try is made; rarely exceeded
+_FAR = 1e-7  # and beyond which, in the end, a warning
 _TRIES = ((1.0, 1.0), (0.1, 1.0), (0.01, 10.0), (10.0, 10.0), (0.1, 100.0), (100.0, 1000.0))
 """Units of the objective and of the tolerance: Clarabel stalls on one in 300 problems with an entropic prior."""
 _AGAIN = ((0.1, 1.0), (1.0, 1.0), (0.01, 10.0), (0.1, 100.0))  # units of the objective before anything is explained
 
 
 def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution:
-    """Solve with Clarabel, a primal-dual interior-point method: its multipliers certify what it finds.
+    """Solve with Clarabel, a primal-dual find_strictly_feasible-point method: its multipliers certify what it finds.
 
     Raises:
-        InputError: the conditions exclude each other, or the solver found nothing.
+        InputError: the conditions exclude each other, or the solver found no solution.
 
     Warns:
-        NumericalWarning: the solver stopped short.
+        NumericalWarning: the solution is not as accurate as it should be.
     """
     size = max(problem.constant, problem.floor, 10.0 * float(problem.weights.max(initial=0.0)))
     whole = max(problem.constant + float(problem.target @ problem.target), size)
@@ -44,25 +44,25 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
             return found[-1]
     if not found:
         with one_thread():
-            interior(problem)  # names what is excluded
+            find_strictly_feasible(problem)  # names what is excluded
         raise InputError("estimator", "method", f"certified, but Clarabel says {status}", "barrier")
     best = min(found, key=lambda solution: _excess(problem, solution))
-    if best.gap <= _LOOSE * max(best.objective, problem.floor) and _outside(problem, best) <= _FAR:
+    if best.gap <= _LOOSE * max(best.objective, problem.floor) and _violation(problem, best) <= _FAR:
         return best
     message = f"estimator: the conic solver stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
-    message += f", {_outside(problem, best):.1g} outside the conditions"
-    warnings.warn(message, NumericalWarning, stacklevel=4)
+    message += f", {_violation(problem, best):.1g} outside the conditions"
+    warn(message, NumericalWarning)
     return best
 
 
 def _excess(problem: ConicProblem, solution: Solution) -> float:
-    """How many times the gap or a condition is off by more than is accepted."""
+    """The gap or the largest violation, whichever is larger, in units of what is accepted."""
     gap = solution.gap / max(solution.objective, problem.floor)
-    return max(gap / _LOOSE, _outside(problem, solution) / _OUTSIDE)
+    return max(gap / _LOOSE, _violation(problem, solution) / _OUTSIDE)
 
 
-def _outside(problem: ConicProblem, solution: Solution) -> float:
-    """How far a condition is missed, 0 if none is."""
+def _violation(problem: ConicProblem, solution: Solution) -> float:
+    """The largest violation of a condition, 0 if all are met."""
     return -float(problem.slack(solution.x).min(initial=0.0))
 
 
@@ -71,10 +71,8 @@ def _solve(problem: ConicProblem, size: float, tolerance: float) -> Solution:
     x = cp.Variable(len(problem.linear))
     objective = cp.sum_squares((problem.root @ x - problem.target) / np.sqrt(size)) + (problem.linear / size) @ x
     blocks = []
-    for base, slopes, variables, weight in zip(
-        problem.base, problem.slopes, problem.variables, problem.weights, strict=True
-    ):
-        block = cp.reshape(slopes.reshape(10, 16).T @ x[variables] + base.ravel(), (4, 4), order="C")
+    for F0, F, variables, weight in zip(problem.F0, problem.F, problem.variables, problem.weights, strict=True):
+        block = cp.reshape(F.reshape(10, 16).T @ x[variables] + F0.ravel(), (4, 4), order="C")
         blocks.append(block >> 0)
         if weight > 0.0:
             objective -= (weight / size) * cp.log_det(block)
@@ -92,7 +90,7 @@ def _solve(problem: ConicProblem, size: float, tolerance: float) -> Solution:
 
 
 def _run(programme: cp.Problem, tolerance: float) -> None:
-    """Solve, accepting what is not quite optimal: the gap says by how much.
+    """Solve, accepting a solution that is not quite optimal: the gap says by how much.
 
     Raises:
         SolverError: nothing was found.

@@ -1,13 +1,17 @@
-"""What a physical robot satisfies: conditions on the parameters, and how far some parameters break them."""
+"""Conditions of physical consistency on the parameters, and by how much given parameters violate them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from torchid import parameters
 from torchid.parameters import PER_BODY, Array
+from torchid.settings import BelowOne, Positive, validate_settings
+
+EnclosureKind = Literal["box", "ellipsoid"]
 
 _ROUNDING = 1e-6  # of matrices that users write down with six digits
 
@@ -21,15 +25,14 @@ class Enclosure:
     """
 
     body: int
-    kind: str
+    kind: EnclosureKind
     centre: Array
     axes: Array
     half: Array
 
     def __post_init__(self) -> None:
         """Check kind, place and size."""
-        if self.kind not in ("box", "ellipsoid"):
-            raise ValueError(f"kind: found {self.kind!r}; accepted: box, ellipsoid")
+        validate_settings(self)
         if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
             raise ValueError(f"centre: found {_short(self.centre)}; accepted: three finite numbers")
         if np.shape(self.half) != (3,) or not (np.isfinite(self.half).all() and (self.half > 0.0).all()):
@@ -79,8 +82,8 @@ class Conditions:
         names: of the bodies, for messages; numbers if empty.
     """
 
-    margin: float = 1e-4
-    total_mass: float | None = None
+    margin: BelowOne = 1e-4
+    total_mass: Positive | None = None
     enclosures: tuple[Enclosure, ...] = ()
     mirrors: tuple[Mirror, ...] = ()
     lower: Array | None = None
@@ -88,21 +91,18 @@ class Conditions:
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
-        if not (np.isfinite(self.margin) and 0.0 <= self.margin < 1.0):
-            raise ValueError(f"margin: found {self.margin}; accepted: a number from 0 to 1, without 1")
-        if self.total_mass is not None and not (np.isfinite(self.total_mass) and self.total_mass > 0.0):
-            raise ValueError(f"total_mass: found {self.total_mass}; accepted: a positive number")
+        """Check the numbers; `bounds` checks those by body."""
+        validate_settings(self)
 
-    def called(self, body: int) -> str:
-        """What messages call a body."""
+    def body_name(self, body: int) -> str:
+        """The name of a body in messages."""
         return self.names[body] if self.names else f"body {body}"
 
-    def check_bodies(self, bodies: int) -> None:
-        """Make sure that they are about a robot of that many bodies.
+    def validate_bodies(self, bodies: int) -> None:
+        """Refuse conditions on bodies that a robot of so many does not have.
 
         Raises:
-            ValueError: they name another body.
+            ValueError: names the body.
         """
         for body in [e.body for e in self.enclosures] + [b for m in self.mirrors for b in (m.body, m.image)]:
             if not 0 <= body < bodies:
@@ -121,8 +121,8 @@ class Conditions:
         return lower, upper
 
 
-def mirrored_parameters(reflection: Array) -> Array:
-    """Matrix (12, 12) that takes a body's parameters to those of its mirror image."""
+def mirror_matrix(reflection: Array) -> Array:
+    """The matrix (12, 12) that maps a body's parameters to those of its mirror image; reflection is (3, 3)."""
     T = np.eye(4)
     T[:3, :3] = reflection
     out = np.eye(PER_BODY)
@@ -132,7 +132,7 @@ def mirrored_parameters(reflection: Array) -> Array:
 
 @dataclass(frozen=True)
 class Violation:
-    """A condition that a body breaks: how far it is off, in the unit given."""
+    """A condition that a body violates, and by how much, in the unit given."""
 
     body: int | None
     condition: str
@@ -140,11 +140,11 @@ class Violation:
     unit: str
 
 
-def check_parameters(**arrays: Array) -> None:
-    """Make sure that arrays, by their names, are of one shape (L, 12) and finite, and what is called scale positive.
+def validate_parameters(**arrays: Array) -> None:
+    """Refuse arrays that are not of one shape (L, 12) or not finite, and an array named scale that is not positive.
 
     Raises:
-        ValueError: one is not.
+        ValueError: names the array.
     """
     shape = (*next(iter(arrays.values())).shape[:1], PER_BODY)
     for name, array in arrays.items():
@@ -157,7 +157,7 @@ def check_parameters(**arrays: Array) -> None:
 
 
 def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float = 1e-9) -> list[Violation]:
-    """Every condition that parameters (L, 12) break by more than `tolerance` of its natural size.
+    """The conditions that parameters (L, 12) violate by more than `tolerance` of their natural size.
 
     Args:
         phi: parameters.
@@ -165,32 +165,32 @@ def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: floa
         conditions: what to check.
         tolerance: relative.
     """
-    check_parameters(phi=phi, scale=scale)
-    conditions.check_bodies(len(phi))
+    validate_parameters(phi=phi, scale=scale)
+    conditions.validate_bodies(len(phi))
     out: list[Violation] = []
     for body in np.flatnonzero(phi[:, parameters.INERTIAL].any(axis=1)):
-        out += _of_matter(int(body), phi[body], scale[body], conditions.margin, tolerance)
+        out += _matter_violations(int(body), phi[body], scale[body], conditions.margin, tolerance)
     for enclosure in (e for e in conditions.enclosures if phi[e.body, parameters.MASS] > 0.0):
-        outside = _outside(phi[enclosure.body], enclosure)
+        outside = _excursion(phi[enclosure.body], enclosure)
         if outside > tolerance:
             out.append(
                 Violation(enclosure.body, f"centre of mass outside its {enclosure.kind}", outside, "of its size")
             )
     for mirror in conditions.mirrors:
-        image = mirrored_parameters(mirror.reflection) @ phi[mirror.body]
+        image = mirror_matrix(mirror.reflection) @ phi[mirror.body]
         off = float(np.max(np.abs(image - phi[mirror.image]) / scale[mirror.image]))
         if off > tolerance:
             out.append(
-                Violation(mirror.image, f"no mirror image of {conditions.called(mirror.body)}", off, "of its scale")
+                Violation(mirror.image, f"no mirror image of {conditions.body_name(mirror.body)}", off, "of its scale")
             )
     if conditions.total_mass is not None:
         off = float(abs(phi[:, parameters.MASS].sum() - conditions.total_mass))
         if off > tolerance * conditions.total_mass:
             out.append(Violation(None, "total mass is another", off, "kg"))
-    return out + _beyond(phi, scale, conditions, tolerance)
+    return out + _bound_violations(phi, scale, conditions, tolerance)
 
 
-def _beyond(phi: Array, scale: Array, conditions: Conditions, tolerance: float) -> list[Violation]:
+def _bound_violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float) -> list[Violation]:
     """Parameters outside their bounds."""
     out = []
     lower, upper = conditions.bounds(len(phi))
@@ -203,7 +203,7 @@ def _beyond(phi: Array, scale: Array, conditions: Conditions, tolerance: float) 
     return out
 
 
-def _of_matter(body: int, phi: Array, scale: Array, margin: float, tolerance: float) -> list[Violation]:
+def _matter_violations(body: int, phi: Array, scale: Array, margin: float, tolerance: float) -> list[Violation]:
     """Mass, inertia about the centre of mass, triangle inequality, pseudo-inertia of one body."""
     if phi[parameters.MASS] <= 0.0:
         return [Violation(body, "mass not positive", float(-phi[parameters.MASS]), "kg")]
@@ -221,7 +221,7 @@ def _of_matter(body: int, phi: Array, scale: Array, margin: float, tolerance: fl
     return out
 
 
-def _outside(phi: Array, enclosure: Enclosure) -> float:
+def _excursion(phi: Array, enclosure: Enclosure) -> float:
     """How far the centre of mass is outside, as a share of the half sizes; negative inside."""
     com = phi[parameters.FIRST_MOMENT] / phi[parameters.MASS]
     local = np.abs(enclosure.axes.T @ (com - enclosure.centre)) / enclosure.half

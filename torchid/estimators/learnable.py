@@ -1,4 +1,4 @@
-"""Parameters that an optimizer moves: a raw vector, a preconditioner, and a map that may keep every body physical."""
+"""Learnable parameters: a raw vector, a preconditioner, and a map that may keep every body physically consistent."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import torch
 from torch import Tensor, nn
 
 from torchid import parameters
+from torchid.estimators.conditions import Conditions
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 
-_LEAST_FRICTION = 0.01  # of its scale: where friction starts if the URDF has none, since 0 is out of reach
-_LEAST_EIGENVALUE = 1e-3  # above the margin, where the URDF's body is not that far inside
+_LEAST_FRICTION = 0.01  # of its scale: where friction starts if the URDF has none, since a softplus is never 0
+_LEAST_EIGENVALUE = 1e-3  # above the margin, for a URDF's body that has a smaller one
 
 
 class LearnableParameters(nn.Module, ABC):
     """phi, (12 L,), as a function of `raw`, which is 0 at the nominal parameters.
 
-    `raw` counts in units in which the compressed problem's Hessian is near the identity: what is mapped to phi is
+    In the units of `raw` the compressed problem's Hessian is near the identity: phi is a function of
     `preconditioner @ raw`.
     """
 
@@ -33,8 +34,8 @@ class LearnableParameters(nn.Module, ABC):
         """Start at the nominal parameters, without a preconditioner.
 
         Args:
-            problem: whose nominal parameters, scale and free parameters are used.
-            size: numbers in `raw`.
+            problem: its nominal parameters, scale and free parameters are used.
+            size: of `raw`.
         """
         super().__init__()
         self.register_buffer("nominal", torch.from_numpy(problem.nominal.copy()))
@@ -51,19 +52,19 @@ class LearnableParameters(nn.Module, ABC):
         """phi, (12 L,)."""
         return self.constrained(self.preconditioner @ self.raw)
 
-    @one_thread()  # with two on a busy machine 1.4 s were seen instead of 3 ms
+    @one_thread()  # on a busy machine two took up to 1.4 s instead of 3 ms
     def precondition(self, problem: LinearProblem, ridge: float, damping: float) -> None:
         """Set the preconditioner to (H + damping I)^(-1/2).
 
         H is the Gauss-Newton Hessian at the nominal parameters of the mean squared residual plus ridge, in the
         variables of `constrained`. Without it a problem of condition number 1e5 takes first-order methods some 1e10
-        steps; without the damping, directions that the data hardly see would be stretched until no step is safe.
+        steps; without the damping, directions that the data hardly excite would be stretched until no step is safe.
         """
         start = torch.zeros_like(self.raw)
         slopes = torch.autograd.functional.jacobian(self.constrained, start, vectorize=True).cpu()
         data = torch.from_numpy(problem.A) @ slopes
-        pull = slopes / self.scale.cpu()[:, None]
-        hessian = 2.0 * (data.T @ data / max(problem.rows, 1) + ridge * pull.T @ pull)
+        prior = slopes / self.scale.cpu()[:, None]
+        hessian = 2.0 * (data.T @ data / max(problem.rows, 1) + ridge * prior.T @ prior)
         values, vectors = torch.linalg.eigh(hessian)
         self.preconditioner.copy_(vectors @ ((values.clamp_min(0.0) + damping).rsqrt()[:, None] * vectors.T))
 
@@ -97,7 +98,7 @@ class LogCholeskyParameters(LearnableParameters):
     root: Tensor
     friction_start: Tensor
 
-    def __init__(self, problem: LinearProblem, margin: float = 1e-4) -> None:
+    def __init__(self, problem: LinearProblem, margin: float = Conditions.margin) -> None:
         """Start at the nominal parameters, or the nearest eigenvalues inside.
 
         Args:

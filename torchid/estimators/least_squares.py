@@ -1,10 +1,10 @@
-"""What an estimator returns, and batch least squares with the nominal parameters as prior."""
+"""Least squares with the nominal parameters as prior, and what every estimator returns."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -13,26 +13,28 @@ from torchid.errors import InputError
 from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, relative_tolerance
+from torchid.settings import NotNegative, Tolerance, validate_settings
 
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
-UNSEEN, FIXED = "cannot be seen", "fixed"
-VERDICTS = (IDENTIFIED, PRIOR, COMBINED, UNSEEN, FIXED)
+UNOBSERVABLE, FIXED = "cannot be seen", "fixed"
+VERDICTS = (IDENTIFIED, PRIOR, COMBINED, UNOBSERVABLE, FIXED)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters with the figures that say how far to trust them.
+    """Estimated parameters, with the statistics that say how far to trust them.
 
     Attributes:
         phi: (P,) estimated parameters; those that were not free are nominal.
         standard_error: (P,), NaN where the data do not determine the parameter.
-        seen: (P,) bool, whether the data depend on the parameter at all.
+        observable: (P,) bool, whether the data depend on the parameter at all.
         identifiable: (P,) bool, whether the data alone determine the parameter.
         data_share: (P,), diagonal of the resolution matrix of the scaled problem with its Euclidean ridge: 1 where the
-            data alone make the estimate, 0 where the nominal value does, NaN where the parameter was not free. It needs
-            no right-hand side.
-        singular_values: of the scaled problem without the pull to the nominal parameters, descending.
-        rank: its rank.
+            data alone determine the estimate, 0 where the nominal value does, NaN where the parameter was not free. It
+            needs no right-hand side.
+        singular_values: of the scaled problem without its ridge, descending.
+        rank: of that problem.
         condition_number: ratio of its largest singular value to the smallest that is not zero.
         cost, nominal_cost: sum of squared whitened residuals at `phi` and at the nominal parameters.
         rows: number of scalar equations.
@@ -41,7 +43,7 @@ class Estimate:
 
     phi: Array
     standard_error: Array
-    seen: np.ndarray
+    observable: np.ndarray
     identifiable: np.ndarray
     data_share: Array
     singular_values: Array
@@ -63,13 +65,13 @@ class Estimate:
 
         "identified": the data determine it and have the larger share; "dominated by the prior": they determine it, but
         the nominal value has the larger share; "only in combination": they determine it together with others, not
-        alone, however large their share; "cannot be seen": they do not depend on it; "fixed": not free.
+        alone, however large their share; "cannot be seen": it is unobservable, no row depends on it; "fixed": not free.
 
-        Source: the three kinds of Atkeson, An, Hollerbach, IJRR 1986, and a pull to nominal values.
+        Source: the three kinds of Atkeson, An, Hollerbach, IJRR 1986, and the prior.
         """
         larger_share = self.data_share >= 0.5
-        decided = [np.isnan(self.data_share), ~self.seen, ~self.identifiable, ~larger_share]
-        return np.select(decided, [FIXED, UNSEEN, COMBINED, PRIOR], IDENTIFIED)
+        decided = [np.isnan(self.data_share), ~self.observable, ~self.identifiable, ~larger_share]
+        return np.select(decided, [FIXED, UNOBSERVABLE, COMBINED, PRIOR], IDENTIFIED)
 
     def verdict_counts(self) -> dict[str, int]:
         """Number of parameters by verdict."""
@@ -80,15 +82,15 @@ def residual_std(cost: float, rows: int, rank: int, oversampling: float) -> floa
     """Standard deviation of whitened residuals whose noise fills 1/oversampling of the band.
 
     A fit of slow motions removes `oversampling` times the variance of one row for each independent parameter. In a log
-    so short that nothing would be left, some of the motion must lie outside the band, and the residual counts as if its
-    rows were independent but fewer.
+    so short that no variance would remain, some of the motion must lie outside the band, and the residual counts as if
+    its rows were independent but fewer.
     """
     return float(np.sqrt(cost / max(rows - oversampling * rank, (rows - rank) / oversampling, 1.0)))
 
 
 @dataclass(frozen=True)
-class BoundEstimate(Estimate):
-    """An estimate that is bound by conditions, beside what is best without.
+class ConstrainedEstimate(Estimate):
+    """An estimate under conditions, compared with the best one without.
 
     Attributes:
         objective: mean squared whitened residual plus prior.
@@ -103,22 +105,22 @@ class BoundEstimate(Estimate):
     eigenvalues: Array
 
     @property
-    def price(self) -> float | None:
-        """What the conditions cost: objective less the unconstrained one; None where that is not known."""
+    def increase(self) -> float | None:
+        """By how much the conditions raise the objective; None where the unconstrained one is not known."""
         return None if self.unconstrained is None else self.objective - self.unconstrained
 
     @property
-    def relative_price(self) -> float | None:
-        """The price as a share of the unconstrained objective; None where that is not known or 0."""
-        return None if self.price is None or not self.unconstrained else self.price / self.unconstrained
+    def relative_increase(self) -> float | None:
+        """The increase as a share of the unconstrained objective; None where that is not known or 0."""
+        return None if self.increase is None or not self.unconstrained else self.increase / self.unconstrained
 
 
 @contextmanager
-def rounding_reported(estimator: str) -> Iterator[None]:
-    """Run an estimator, whose linear algebra fails on numbers that no rounding allows for.
+def report_rounding(estimator: str) -> Iterator[None]:
+    """Run an estimator, and turn a failure of its linear algebra into an error that says what to change.
 
     Raises:
-        InputError: it failed.
+        InputError: a decomposition failed, as rounding hides the solution.
     """
     try:
         yield
@@ -128,59 +130,74 @@ def rounding_reported(estimator: str) -> Iterator[None]:
         raise InputError("estimator", "name", found, accepted) from error
 
 
-_SEEN = 1e-12  # a finger's share in a sum with the trunk's mass is 1e-7, that of no row but rounding
-_HIDDEN = 1e-6  # far above rounding (1e-10 on a humanoid) and below any share found in a robot (1e-4)
+_OBSERVABLE = 1e-12  # squared share in the row space: a finger's in a sum with the trunk's mass is 1e-7
 
 
 @dataclass(frozen=True)
-class LeastSquares:
-    """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
-
-    With `ridge` 0 the deviation from the nominal parameters of least scaled norm among all minimizers.
+class Regularized:
+    """The settings that all estimators have.
 
     Attributes:
-        ridge: weight of the pull to the nominal parameters against the mean square of the whitened residual.
+        ridge: weight of the prior, the squared deviation from the nominal parameters, against the mean squared whitened
+            residual.
         rank_tolerance: a singular value of the scaled problem below this share of the largest counts as zero.
     """
 
-    ridge: float = 0.0
-    rank_tolerance: float = 1e-10
+    ridge: NotNegative = 0.0
+    rank_tolerance: Tolerance = field(default=RANK_TOLERANCE, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check the weights."""
-        if not (np.isfinite(self.ridge) and self.ridge >= 0.0):
-            raise ValueError(f"ridge: found {self.ridge}; accepted: a finite number of at least 0")
-        if not 0.0 < self.rank_tolerance < 1.0:
-            raise ValueError(f"rank_tolerance: found {self.rank_tolerance}; accepted: a number between 0 and 1")
+        """Check the settings.
 
-    @rounding_reported("least_squares")
+        Raises:
+            ValueError: names the first that is not accepted.
+        """
+        validate_settings(self)
+
+    @property
+    def least_squares(self) -> LeastSquares:
+        """Least squares with the same ridge and the same rank."""
+        return LeastSquares(self.ridge, rank_tolerance=self.rank_tolerance)
+
+
+@dataclass(frozen=True)
+class LeastSquares(Regularized):
+    """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
+
+    With `ridge` 0 the deviation from the nominal parameters of least scaled norm among all minimizers.
+    """
+
+    @report_rounding("least_squares")
     @one_thread()  # twice as fast as two on some hundred columns
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters.
 
-        Standard errors propagate the sensor noise, scaled to the residual that was found, through the estimator, and
-        count only as many rows as the filtered noise leaves independent; they say nothing of the pull's bias. They are
+        Standard errors propagate the sensor noise, scaled to the observed residual, through the estimator, and count
+        only as many rows as the filtered noise leaves independent; they do not contain the bias of the prior. They are
         NaN where the data alone do not determine the parameter.
+
+        Raises:
+            InputError: rounding hides the solution.
         """
         free, scale = problem.free, problem.scale[problem.free]
         A = problem.A[:, free] * scale
         b = problem.b - problem.A @ problem.nominal
         pinv, values, rank = _pseudo_inverse(A, self.rank_tolerance)
-        hidden = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # share in directions that no row sees
+        null_share = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # of each parameter in the null space
         gain = pinv
         if self.ridge > 0.0:
-            pull = np.sqrt(self.ridge * problem.rows)
-            stacked = np.vstack([A, pull * np.eye(A.shape[1])])
+            prior = np.sqrt(self.ridge * problem.rows) * np.eye(A.shape[1])
+            stacked = np.vstack([A, prior])
             gain = _pseudo_inverse(stacked, 0.0)[0][:, : len(b)]
-            gain = pinv @ (A @ gain)  # what no row sees stays nominal: a tiny pull would leave it to rounding
+            gain = pinv @ (A @ gain)  # the null space stays nominal: a tiny ridge would leave it to rounding
         step = gain @ b
 
         phi = problem.nominal.copy()
         phi[free] += scale * step
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
-        seen, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
-        seen[free], identifiable[free] = hidden**2 < 1.0 - _SEEN, hidden < _HIDDEN
+        observable, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
+        observable[free], identifiable[free] = null_share**2 < 1.0 - _OBSERVABLE, null_share < UNOBSERVABLE_SHARE
         standard_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
         standard_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
         standard_error[~identifiable] = np.nan
@@ -188,7 +205,7 @@ class LeastSquares:
         return Estimate(
             phi=phi,
             standard_error=standard_error,
-            seen=seen,
+            observable=observable,
             identifiable=identifiable,
             data_share=data_share,
             singular_values=values,
@@ -204,6 +221,6 @@ class LeastSquares:
 def _pseudo_inverse(A: Array, tolerance: float) -> tuple[Array, Array, int]:
     """Minimum-norm inverse, singular values and rank, from one call of `torch.linalg.lstsq`."""
     identity = torch.eye(A.shape[0], dtype=torch.float64)
-    rcond = max(tolerance, np.finfo(float).eps * max(A.shape))
+    rcond = relative_tolerance(tolerance, A.shape)
     solved = torch.linalg.lstsq(torch.from_numpy(np.ascontiguousarray(A)), identity, rcond=rcond, driver="gelss")
     return solved.solution.numpy(), solved.singular_values.numpy(), int(solved.rank)

@@ -1,4 +1,4 @@
-"""Optimizers and learning-rate schedules of `torch.optim` by name, tried out before any work depends on them."""
+"""Optimizers and learning-rate schedules of `torch.optim`, by name, and a trial of their options."""
 
 from __future__ import annotations
 
@@ -20,47 +20,48 @@ Group = dict[str, Any]
 _WHOLE_RUN = ("T_max", "total_steps")  # lengths that are the number of epochs unless given
 _UNSUITED = {"SparseAdam": "takes sparse gradients alone", "Muon": "takes matrices alone"}
 _FAILURES = (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-"""What torch's classes have been seen to raise at options that cannot be."""
+"""What torch's classes raise at options that they do not accept."""
 
 
 @dataclass(frozen=True)
-class Method:
-    """How an optimizer of torch is used here.
+class OptimizerUse:
+    """How an optimizer of torch is used for the preconditioned parameters.
 
     Attributes:
-        defaults: options for those that are not given. Torch's own suit networks, whose curvature nobody knows; that of
+        defaults: options for those that are not given. Torch's own suit networks of unknown curvature; that of the
             preconditioned parameters is near one.
         alone: further options where none at all is given.
-        whole: whether a step takes all samples at once, an epoch being one step: a line search or a memory of signs
-            compares gradients from step to step, which mini-batches make differ by chance. Gradients are not clipped.
+        full_batch: whether a step takes all samples at once, an epoch being one step: a line search or a memory of
+            signs compares gradients from step to step, which differ by chance between mini-batches. Gradients are not
+            clipped.
     """
 
     defaults: Mapping[str, Any] = field(default_factory=dict)
     alone: Mapping[str, Any] = field(default_factory=dict)
-    whole: bool = False
+    full_batch: bool = False
 
 
-METHODS: dict[str, Method] = {
-    "ASGD": Method({"lr": 1.0}),
-    "Adadelta": Method({"lr": 30.0}),
-    "Adafactor": Method({"lr": 0.1, "eps": (None, 1.0)}),  # steps count in units of the second, not of parameters
-    "Adagrad": Method({"lr": 0.5}),
-    "Adam": Method({"lr": 0.05}),
-    "AdamW": Method({"lr": 0.05}),
-    "Adamax": Method({"lr": 0.3}),
-    "LBFGS": Method({"line_search_fn": "strong_wolfe"}, whole=True),
-    "NAdam": Method({"lr": 0.1}),
-    "RAdam": Method({"lr": 0.3}),
-    "RMSprop": Method({"lr": 0.05}),
-    "Rprop": Method({"lr": 0.2}, whole=True),
-    "SGD": Method({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
+OPTIMIZERS: dict[str, OptimizerUse] = {
+    "ASGD": OptimizerUse({"lr": 1.0}),
+    "Adadelta": OptimizerUse({"lr": 30.0}),
+    "Adafactor": OptimizerUse({"lr": 0.1, "eps": (None, 1.0)}),  # steps count in units of the second, not of parameters
+    "Adagrad": OptimizerUse({"lr": 0.5}),
+    "Adam": OptimizerUse({"lr": 0.05}),
+    "AdamW": OptimizerUse({"lr": 0.05}),
+    "Adamax": OptimizerUse({"lr": 0.3}),
+    "LBFGS": OptimizerUse({"line_search_fn": "strong_wolfe"}, full_batch=True),
+    "NAdam": OptimizerUse({"lr": 0.1}),
+    "RAdam": OptimizerUse({"lr": 0.3}),
+    "RMSprop": OptimizerUse({"lr": 0.05}),
+    "Rprop": OptimizerUse({"lr": 0.2}, full_batch=True),
+    "SGD": OptimizerUse({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
 }
-"""The optimizers that come near the closed form; docs/estimators.md says how near."""
+"""The supported optimizers, those that come near the closed form; docs/estimators.md says how near."""
 
 
 def optimizer_names() -> list[str]:
-    """Names of the classes in `torch.optim` that are supported: those in `METHODS` that this torch has."""
-    return sorted(name for name, _ in _classes(torch.optim, Optimizer) if name in METHODS)
+    """Names of the classes in `torch.optim` that are supported: those in `OPTIMIZERS` that this torch has."""
+    return sorted(name for name, _ in _classes(torch.optim, Optimizer) if name in OPTIMIZERS)
 
 
 def schedule_names() -> list[str]:
@@ -68,15 +69,20 @@ def schedule_names() -> list[str]:
     return sorted(name for name, _ in _classes(lr_scheduler, LRScheduler))
 
 
-def make_optimizer(name: str, options: Mapping[str, Any], groups: Sequence[Group]) -> Optimizer:
-    """An optimizer of parameter groups; options that are not given are those of `METHODS`.
+def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimizer:
+    """An optimizer of parameter groups.
+
+    Args:
+        chosen: its name, and options; those that are not given are as in `OPTIMIZERS`.
+        groups: of parameters, as torch takes them.
 
     Raises:
         UnknownNameError: no class of `torch.optim`, or one that is not supported.
         InputError: an option it does not take.
     """
+    name, options = _split(chosen)
     found = dict(_classes(torch.optim, Optimizer)).get(name)
-    if found is not None and name not in METHODS:
+    if found is not None and name not in OPTIMIZERS:
         accepted = ", ".join(optimizer_names())
         raise InputError("estimator", f"optimizer {name}", _UNSUITED.get(name, "not supported"), accepted)
     if found is None:
@@ -88,22 +94,26 @@ def make_optimizer(name: str, options: Mapping[str, Any], groups: Sequence[Group
             )
         groups = [{"params": [x for group in groups for x in group["params"]]}]
     try:
-        return found(list(groups), **{**_defaults(METHODS[name], options), **options})
+        return found(list(groups), **{**_defaults(OPTIMIZERS[name], options), **options})
     except _FAILURES as error:
         raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(found)) from error
 
 
-def make_schedule(
-    name: str | None, options: Mapping[str, Any], optimizer: Optimizer, epochs: int
-) -> LRScheduler | None:
-    """A schedule that is stepped once per epoch; `T_max` and `total_steps` are `epochs` unless given.
+def make_schedule(chosen: Mapping[str, Any] | None, optimizer: Optimizer, epochs: int) -> LRScheduler | None:
+    """A schedule that is stepped once per epoch.
+
+    Args:
+        chosen: its name, and options, of which `T_max` and `total_steps` are `epochs` unless given; None for none.
+        optimizer: whose learning rate it sets.
+        epochs: of the whole run.
 
     Raises:
         UnknownNameError: `torch.optim.lr_scheduler` has no such class.
         InputError: an option it does not take, or one that only code can give.
     """
-    if name is None:
+    if chosen is None:
         return None
+    name, options = _split(chosen)
     found = dict(_classes(lr_scheduler, LRScheduler)).get(name)
     if found is None:
         raise _unknown("schedule", name, schedule_names())
@@ -122,18 +132,18 @@ def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
         schedule.step()
 
 
-def try_out(
-    optimizer: str, options: Mapping[str, Any], schedule: str | None, schedule_options: Mapping[str, Any], epochs: int
-) -> None:
-    """Take two steps on a parabola and the schedule through all epochs, so that what does not work is known at once.
+def try_out(optimizer: Mapping[str, Any], schedule: Mapping[str, Any] | None, epochs: int) -> None:
+    """Take two steps on a parabola, and the schedule through all epochs: options that do not work fail here.
+
+    Arguments as of `make_optimizer` and `make_schedule`.
 
     Raises:
         UnknownNameError: a name that torch does not have.
         InputError: options, or a kind of optimizer, that do not work here.
     """
     x = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
-    tried = make_optimizer(optimizer, options, [{"params": [x]}])
-    schedule_of = make_schedule(schedule, schedule_options, tried, epochs)
+    tried = make_optimizer(optimizer, [{"params": [x]}])
+    schedule_of = make_schedule(schedule, tried, epochs)
 
     def loss() -> torch.Tensor:
         tried.zero_grad()
@@ -148,16 +158,22 @@ def try_out(
                 tried.step(loss)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
     except _FAILURES as error:
         found = f"cannot take a step: {_short(error)}"
-        raise InputError("estimator", f"optimizer {optimizer}", found, "other options") from error
+        raise InputError("estimator", f"optimizer {optimizer['name']}", found, "other options") from error
     try:
         for _ in range(epochs):
             step_schedule(schedule_of, 1.0)
     except _FAILURES as error:
-        found = f"does not last {epochs} epochs: {_short(error)}"
-        raise InputError("estimator", f"schedule {schedule}", found, "other options, or another schedule") from error
+        found, name = f"does not last {epochs} epochs: {_short(error)}", (schedule or {}).get("name")
+        raise InputError("estimator", f"schedule {name}", found, "other options, or another schedule") from error
 
 
-def _defaults(method: Method, options: Mapping[str, Any]) -> dict[str, Any]:
+def _split(chosen: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The name of a class, and its options."""
+    options = dict(chosen)
+    return options.pop("name"), options
+
+
+def _defaults(method: OptimizerUse, options: Mapping[str, Any]) -> dict[str, Any]:
     return dict(method.defaults) if options else {**method.defaults, **method.alone}
 
 

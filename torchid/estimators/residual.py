@@ -1,4 +1,4 @@
-"""A residual module beside the rigid body: how strongly it is held back, and what it took of the force."""
+"""A residual module beside the rigid bodies: the choice of its weight, and its share of the force."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from torchid.estimators.sgd import Loss
 from torchid.parameters import INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem, MiniBatches
 
-WEIGHTS = (10.0, 1.0, 0.1, 0.01, 0.001, 0.0)
-"""What is tried: a module that could give any force gives 1 / (1 + weight) of what the parameters leave."""
+CANDIDATE_WEIGHTS = (10.0, 1.0, 0.1, 0.01, 0.001, 0.0)
+"""Candidates: a module that could give any force gives 1 / (1 + weight) of the parameters' residual."""
 
 
 @dataclass(frozen=True)
 class WeightChoice:
-    """The weight of a residual module, chosen by what it predicts of held-out samples.
+    """The weight of a residual module, chosen by its predictions of held-out samples.
 
     Attributes:
         weight: the largest whose held-out loss is at most one standard error above the least.
-        candidates: what was tried, descending.
+        candidates: weights that were tried, descending.
         losses: of each, the held-out mean squared whitened residual.
         standard_error: of the least loss, over blocks of time.
         alone: the held-out loss of rigid bodies without the module.
@@ -42,7 +42,7 @@ def choose_weight(candidates: Sequence[float], losses: Array, alone: float) -> W
 
     Args:
         candidates: W weights.
-        losses: (W, blocks) held-out losses, at least two blocks; infinite where a descent did not hold.
+        losses: (W, blocks) held-out losses, at least two blocks; infinite where the descent diverged.
         alone: held-out loss without the module.
 
     Source: Breiman, Friedman, Olshen, Stone, "Classification and Regression Trees", 1984, section 3.4.3.
@@ -56,7 +56,7 @@ def choose_weight(candidates: Sequence[float], losses: Array, alone: float) -> W
 
 @dataclass(frozen=True)
 class ResidualEffect:
-    """What a residual module took of the force, on the training samples.
+    """The share of a residual module in the force, on the training samples.
 
     Attributes:
         weight: under which it was trained.
@@ -64,8 +64,8 @@ class ResidualEffect:
         rms: of the module's force by group, "base_force" [N], "base_moment" [N m], "joint_torque" [N m, N] and
             "limb_wrench" [N, N m].
         shares: by group, that rms over the rms of the whole force, rigid bodies and module together.
-        rigid_share: the rms of what rigid bodies could give of the module's projected whitened force, over its own
-            rms; 0 if they could give nothing of it.
+        rigid_share: the rms of the part of the module's projected whitened force that rigid bodies could give, over its
+            own rms; 0 if they could give none of it.
         moved: (12 L,), by how much the module moves the parameters: the least squares estimate on the force without the
             module's part less that on the whole force.
         moved_scaled: (L,), the largest of each body's ten inertial parameters, in units of their scale.
@@ -85,7 +85,7 @@ class ResidualEffect:
 def residual_effect(
     loss: Loss, problem: LinearProblem, batches: MiniBatches, estimator: LeastSquares, choice: WeightChoice | None
 ) -> ResidualEffect | None:
-    """What the residual module of a loss took; None without a module.
+    """The share of a loss's residual module in the force; None without a module.
 
     Args:
         loss: with parameters and module as they are now.
@@ -145,7 +145,7 @@ def _by_group(module: nn.Module, phi: Array, batches: MiniBatches) -> tuple[dict
 
 
 def _groups(base_rows: int, nv: int, rows: int) -> dict[str, slice]:
-    """Rows by group, those that there are."""
+    """Rows by group, without empty groups."""
     base = {"base_force": slice(0, 3), "base_moment": slice(3, 6)} if base_rows else {}
     groups = base | {"joint_torque": slice(base_rows, nv), "limb_wrench": slice(nv, rows)}
     return {name: rows for name, rows in groups.items() if rows.stop > rows.start}

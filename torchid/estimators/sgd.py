@@ -1,20 +1,22 @@
-"""Mini-batch descent: its settings, its objective, and the penalties that keep bodies physical."""
+"""Mini-batch descent: its settings, its loss, and the penalties on bodies that are not physically consistent."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field
+from typing import Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchid import parameters
+from torchid.estimators.conditions import Conditions
 from torchid.estimators.learnable import LearnableParameters
+from torchid.estimators.least_squares import Regularized
 from torchid.estimators.optimizers import try_out
 from torchid.problem import Batch, LinearProblem, MiniBatches
+from torchid.settings import BelowOne, Count, NamedClass, NotNegative, Positive, validate_settings
 
 
 @dataclass(frozen=True)
@@ -22,23 +24,20 @@ class PenaltyWeights:
     """Weights of the penalties beside the mean squared whitened residual.
 
     Attributes:
-        eigenvalue: squares of what the eigenvalues of scaled pseudo-inertias lack to the margin.
-        log_det: minus the logarithms of these eigenvalues above the margin, a barrier.
+        eigenvalue: squares of the shortfall of scaled pseudo-inertias' eigenvalues from the margin.
+        log_det: minus the logarithms of these eigenvalues less the margin, a barrier.
         mass: squares of negative masses, in units of their scale.
         friction: squares of negative friction, in units of its scale.
     """
 
-    eigenvalue: float = 10.0
-    log_det: float = 0.0
-    mass: float = 10.0
-    friction: float = 10.0
+    eigenvalue: NotNegative = 10.0
+    log_det: NotNegative = 0.0
+    mass: NotNegative = 10.0
+    friction: NotNegative = 10.0
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise ValueError(f"penalties.{item.name}: found {value}; accepted: a finite number of at least 0")
+        validate_settings(self)
 
     @property
     def curvature(self) -> float:
@@ -56,8 +55,8 @@ def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWei
 
     Args:
         scaled: (L, 12), parameters in units of their scale.
-        bodies: (L',) int, bodies whose inertia is asked to be possible; friction is asked to be of all.
-        margin: least eigenvalue asked for.
+        bodies: (L',) int, bodies whose inertia is penalized; friction is, of all.
+        margin: least eigenvalue without a penalty.
         weights: of the terms.
     """
     out: dict[str, Tensor] = {}
@@ -75,7 +74,7 @@ def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWei
 
 
 def _extended_log(x: Tensor, least: float = 1e-4) -> Tensor:
-    """The logarithm, and below `least` its tangent: a descent that starts outside still finds its way in."""
+    """The logarithm, and below `least` its tangent: the gradient of a body outside the cone points inside."""
     inside = x.clamp_min(least)
     return inside.log() + (x - inside) / least
 
@@ -85,24 +84,47 @@ ResidualMode = Literal["joint", "parameters_first", "alternating"]
 
 
 @dataclass(frozen=True)
-class Sgd:
+class TrainingSettings:
+    """How a descent is trained, and when it stops.
+
+    Attributes:
+        epochs: passes over the logs, at most.
+        optimizer: the name of one of `optimizer_names()`, classes of `torch.optim`, and what it takes; what is not
+            given is as in `OPTIMIZERS`.
+        schedule: the name of a class of `torch.optim.lr_scheduler`, stepped once per epoch, and what it takes; None for
+            none.
+        patience: epochs without a better loss on the held-out logs after which to stop; None: never.
+        clip: largest norm of a gradient.
+        damping: of the preconditioner, in units of the mean squared whitened residual per squared scale.
+    """
+
+    epochs: Count = 200
+    optimizer: NamedClass = field(default_factory=lambda: {"name": "Adam"})
+    schedule: NamedClass | None = field(default_factory=lambda: {"name": "CosineAnnealingLR"})
+    patience: Count | None = None
+    clip: Positive = 1.0
+    damping: Positive = 1.0
+
+    def try_out(self) -> None:
+        """Take a few steps on a parabola: optimizer and schedule that do not work are known before any work.
+
+        Raises:
+            UnknownNameError: an optimizer or a schedule that torch does not have.
+            InputError: options, or a kind of optimizer, that do not work here.
+        """
+        try_out(self.optimizer, self.schedule, self.epochs)
+
+
+@dataclass(frozen=True)
+class Sgd(TrainingSettings, Regularized):
     """min of the mean squared whitened residual + ridge * prior + penalties, one mini-batch at a time.
 
     The prior is that of `LeastSquares`, ||(phi - nominal) / scale||^2.
 
     Attributes:
-        ridge: weight of the prior.
-        rank_tolerance: of the statistics, as in `LeastSquares`.
-        consistency: "log_cholesky", every step's parameters are physical; "penalties", steps are pulled there.
+        consistency: "log_cholesky", every step's parameters are physical; "penalties", violations cost.
         margin: least eigenvalue of every body's scaled pseudo-inertia, kept or aimed at.
         penalties: their weights, with "penalties".
-        optimizer, optimizer_options: one of `optimizer_names()`, classes of `torch.optim`, and what it takes; what is
-            not given is as in `METHODS`.
-        schedule, schedule_options: a class of `torch.optim.lr_scheduler`, stepped once per epoch; None for none.
-        epochs: passes over the logs, at most.
-        patience: epochs without a better loss on the held-out logs after which to stop; None: never.
-        clip: largest norm of a gradient.
-        damping: of the preconditioner, in units of the mean squared whitened residual per squared scale.
         residual: with a residual module: train it and the parameters together, the parameters for the first half of the
             epochs and then the module, or each in every other epoch.
         residual_lr: learning rate of the module; None: the optimizer's.
@@ -110,49 +132,17 @@ class Sgd:
             held-out samples is not significantly above the least.
     """
 
-    ridge: float = 0.0
-    rank_tolerance: float = 1e-10
     consistency: Consistency = "log_cholesky"
-    margin: float = 1e-4
+    margin: BelowOne = Conditions.margin
     penalties: PenaltyWeights = field(default_factory=PenaltyWeights)
-    optimizer: str = "Adam"
-    optimizer_options: Mapping[str, Any] = field(default_factory=dict)
-    schedule: str | None = "CosineAnnealingLR"
-    schedule_options: Mapping[str, Any] = field(default_factory=dict)
-    epochs: int = 200
-    patience: int | None = None
-    clip: float = 1.0
-    damping: float = 1.0
     residual: ResidualMode = "joint"
-    residual_lr: float | None = None
-    residual_weight: float | None = None
-
-    def __post_init__(self) -> None:
-        """Check names and numbers.
-
-        Raises:
-            ValueError: a number out of range or an unknown mode.
-            InputError: an optimizer or a schedule that torch does not have or that does not take its options.
-        """
-        for name, accepted in (("consistency", get_args(Consistency)), ("residual", get_args(ResidualMode))):
-            if getattr(self, name) not in accepted:
-                raise ValueError(f"{name}: found {getattr(self, name)!r}; accepted: {', '.join(accepted)}")
-        for name in ("ridge", "residual_weight"):
-            value = getattr(self, name)
-            if not (value is None and name == "residual_weight") and not (np.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}: found {value}; accepted: a finite number of at least 0")
-        for name in ("clip", "damping", "epochs", "patience", "residual_lr"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}: found {value}; accepted: a positive number")
-        if not (np.isfinite(self.margin) and 0.0 <= self.margin < 1.0):
-            raise ValueError(f"margin: found {self.margin}; accepted: a number from 0 to 1, without 1")
-        try_out(self.optimizer, self.optimizer_options, self.schedule, self.schedule_options, self.epochs)
+    residual_lr: Positive | None = None
+    residual_weight: NotNegative | None = None
 
 
 @dataclass(frozen=True)
-class Terms:
-    """Terms of the loss of a batch, and sums of squares of its projected whitened forces, both by name."""
+class LossTerms:
+    """LossTerms of the loss of a batch, and sums of squares of its projected whitened forces, both by name."""
 
     losses: dict[str, Tensor]
     squares: dict[str, Tensor]
@@ -161,10 +151,10 @@ class Terms:
         """Sum of the terms."""
         return torch.stack(list(self.losses.values())).sum()
 
-    def plus(self, other: Terms, share: float) -> Terms:
+    def plus(self, other: LossTerms, share: float) -> LossTerms:
         """These and those of another batch, which holds this share of the samples, without their gradients."""
         losses = {name: self.losses.get(name, 0.0) + share * x.detach() for name, x in other.losses.items()}
-        return Terms(losses, {name: self.squares.get(name, 0.0) + x for name, x in other.squares.items()})
+        return LossTerms(losses, {name: self.squares.get(name, 0.0) + x for name, x in other.squares.items()})
 
 
 class Loss(nn.Module):
@@ -172,7 +162,7 @@ class Loss(nn.Module):
 
     Attributes:
         learnable: parameters of the bodies.
-        residual: module r(q, v, a) -> (B, nv) [N, N m] whose output adds to K phi, or None.
+        residual: module r(q, v, a) -> (B, n_rows) [N, N m] whose output adds to K phi, or None.
         residual_weight: of the mean square of the module's whitened force; None, which counts as 0, until it is chosen.
     """
 
@@ -184,7 +174,7 @@ class Loss(nn.Module):
         learnable: LearnableParameters,
         residual: nn.Module | None,
     ) -> None:
-        """Fix what is trained on which logs."""
+        """Set parameters, module and logs."""
         super().__init__()
         self.settings = settings
         self.learnable, self.residual = learnable, residual
@@ -195,8 +185,8 @@ class Loss(nn.Module):
             "_bodies", torch.from_numpy(problem.free_bodies()).to(batches.columns.device), persistent=False
         )
 
-    def forward(self, batch: Batch) -> Terms:
-        """Terms of one batch."""
+    def forward(self, batch: Batch) -> LossTerms:
+        """LossTerms of one batch."""
         settings, phi = self.settings, self.learnable()
         rigid, other = self.forces(batch, phi)
         share = self._per_row / len(batch)
@@ -213,10 +203,10 @@ class Loss(nn.Module):
             forces["residual"] = other
             if self.residual_weight:
                 losses["residual"] = self.residual_weight * share * other.square().sum()
-        return Terms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
+        return LossTerms(losses, {name: x.detach().square().sum() for name, x in forces.items()})
 
     def forces(self, batch: Batch, phi: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Whitened projected forces, (B, nv), of parameters (12 L,) and of the residual module."""
+        """Whitened projected forces, (B, n_rows), of parameters (12 L,) and of the residual module."""
         rigid = batch.K @ (self._columns @ phi)
         if self.residual is None:
             return rigid, None

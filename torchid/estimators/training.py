@@ -1,4 +1,4 @@
-"""Mini-batch descent, epoch by epoch, with a state that can be saved and taken up again."""
+"""Mini-batch descent, epoch by epoch, with a state that can be saved and resumed."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from torch import Tensor, nn
 from torchid import parameters
 from torchid.errors import InputError
 from torchid.estimators.learnable import FreeParameters, LearnableParameters, LogCholeskyParameters
-from torchid.estimators.least_squares import BoundEstimate, LeastSquares, rounding_reported
-from torchid.estimators.optimizers import METHODS, make_optimizer, make_schedule, step_schedule
-from torchid.estimators.residual import WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
-from torchid.estimators.sgd import Loss, Sgd, Terms
-from torchid.estimators.state import check_state
+from torchid.estimators.least_squares import ConstrainedEstimate, report_rounding
+from torchid.estimators.optimizers import OPTIMIZERS, make_optimizer, make_schedule, step_schedule
+from torchid.estimators.residual import CANDIDATE_WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
+from torchid.estimators.sgd import Loss, LossTerms, Sgd
+from torchid.estimators.training_state import validate_state
 from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
 from torchid.problem.chunks import one_thread
@@ -34,7 +34,7 @@ _DIVERGED = 1e6  # times the loss at the nominal parameters, or that of stated n
 
 @dataclass(frozen=True)
 class Epoch:
-    """What an epoch left behind.
+    """Losses and figures of one epoch.
 
     Attributes:
         number: from 1.
@@ -42,7 +42,7 @@ class Epoch:
         held_out: mean squared whitened residual on the held-out logs after the epoch, None without any.
         objective: mean squared whitened residual on all training samples plus prior, of the parameters alone, after the
             epoch.
-        closed_form: the least that any parameters have, from `LeastSquares`.
+        closed_form: the least objective of any parameters, from `LeastSquares`.
         distance: rms difference of the projected whitened forces from those of the closed form.
         shares: rms of the projected whitened force of the parameters, and of the residual module, over that of the
             measured one, in the epoch.
@@ -62,13 +62,13 @@ class Epoch:
 
 
 @dataclass(frozen=True)
-class SgdEstimate(BoundEstimate):
-    """What a descent arrived at; objective and distance are those of the parameters alone.
+class SgdEstimate(ConstrainedEstimate):
+    """The result of a descent; objective and distance are those of the parameters alone.
 
     Attributes:
         epochs: that were run.
         best_epoch: whose parameters these are.
-        residual: what the residual module took, None without one.
+        residual: the share of the residual module, None without one.
     """
 
     epochs: int
@@ -83,7 +83,7 @@ class Trainer:
     new trainer.
     """
 
-    @rounding_reported("sgd")
+    @report_rounding("sgd")
     def __init__(
         self,
         settings: Sgd,
@@ -92,18 +92,22 @@ class Trainer:
         held_out: MiniBatches | None = None,
         residual: nn.Module | None = None,
     ) -> None:
-        """Get ready at the nominal parameters.
+        """Start at the nominal parameters.
 
         Args:
             settings: of the descent.
-            problem: the compressed training logs: preconditioner, prior, and what to compare with.
+            problem: the compressed training logs: for the preconditioner, the prior, and the closed form.
             batches: of the training logs.
             held_out: of logs for early stopping.
-            residual: any module r(q, v, a) -> (B, nv) [N, N m], on the device of the batches, whose output adds to
+            residual: any module r(q, v, a) -> (B, n_rows) [N, N m], on the device of the batches, whose output adds to
                 K phi; arguments as in `Batch`.
+
+        Raises:
+            InputError: an optimizer or a schedule that does not work with its options.
         """
+        settings.try_out()
         self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out
-        self._least_squares = LeastSquares(settings.ridge, settings.rank_tolerance)
+        self._least_squares = settings.least_squares
         self.closed_form = self._least_squares.solve(problem)
         device = batches.columns.device
         self.loss = Loss(settings, problem, batches, _learnable(settings, problem).to(device), residual)
@@ -113,13 +117,13 @@ class Trainer:
         groups: list[dict[str, Any]] = [{"params": trained} for trained in self._trained]
         if residual is not None and settings.residual_lr is not None:
             groups[1]["lr"] = settings.residual_lr
-        self.optimizer = make_optimizer(settings.optimizer, settings.optimizer_options, groups)
-        self.schedule = make_schedule(settings.schedule, settings.schedule_options, self.optimizer, settings.epochs)
+        self.optimizer = make_optimizer(settings.optimizer, groups)
+        self.schedule = make_schedule(settings.schedule, self.optimizer, settings.epochs)
         if not any(self._trained[1:]):
-            self.loss.residual_weight = settings.residual_weight or 0.0  # there is nothing to hold back
+            self.loss.residual_weight = settings.residual_weight or 0.0  # nothing to regularize
         self.weight_choice: WeightChoice | None = None
         self.epoch, self.best_epoch, self.best_loss = 0, 0, float("inf")
-        self._best = self._learned()
+        self._best = self._snapshot()
 
     @property
     def finished(self) -> bool:
@@ -127,7 +131,7 @@ class Trainer:
         if self.epoch >= self.settings.epochs:
             return True
         late = self.loss.residual is not None and self.settings.residual == "parameters_first"
-        since = max(self.best_epoch, self.settings.epochs // 2 if late else 0)  # the module has its turn in any case
+        since = max(self.best_epoch, self.settings.epochs // 2 if late else 0)  # the module is trained in any case
         patience = self.settings.patience
         return patience is not None and self.held_out is not None and self.epoch - since >= patience
 
@@ -155,7 +159,7 @@ class Trainer:
         if self.loss.residual_weight is None:
             self.choose_residual_weight()
         self.epoch += 1
-        self._choose_trained()
+        self._freeze()
         self.loss.train()
         rate, start = float(self.optimizer.param_groups[0]["lr"]), time.perf_counter()
         losses: dict[str, float] = {}
@@ -172,22 +176,22 @@ class Trainer:
         losses["total"] = sum(losses.values())
         phi, size = self.phi(), squares.pop("measured")
         with np.errstate(over="ignore", invalid="ignore"):
-            self._check(self._objective(phi))  # no batch has seen the last step yet
-        self._check(0.0 if held_out is None else held_out)
+            self._require_converging(self._objective(phi))  # after the last step, which no batch was evaluated at
+        self._require_converging(0.0 if held_out is None else held_out)
         if not all(bool(x.isfinite().all()) for group in self._trained for x in group):
-            self._check(float("nan"))  # of a module, in the last step
-        self._learn_all()
+            self._require_converging(float("nan"))  # of a module, in the last step
+        self._unfreeze()
         step_schedule(self.schedule, losses["total"] if held_out is None else held_out)
         if held_out is None or held_out < self.best_loss * (1.0 - _BETTER):
             self.best_epoch, self.best_loss = self.epoch, losses["total"] if held_out is None else held_out
-            self._best = self._learned()
+            self._best = self._snapshot()
         return Epoch(
             number=self.epoch,
             losses=losses,
             held_out=held_out,
             objective=self._objective(phi),
             closed_form=self._objective(self.closed_form.phi),
-            distance=self.problem.distance(phi, self.closed_form.phi),
+            distance=self.problem.prediction_distance(phi, self.closed_form.phi),
             shares={name: float(np.sqrt(x / size)) if size else 0.0 for name, x in squares.items()},
             learning_rate=rate,
             samples_per_second=self.batches.samples / elapsed,
@@ -196,13 +200,14 @@ class Trainer:
     def choose_residual_weight(self) -> WeightChoice:
         """Choose the weight of the residual module by held-out samples; the first epoch does so if none is given.
 
-        From where rigid bodies alone arrive, a copy of the module is trained under each of `WEIGHTS` for half of the
-        epochs. What is held out are the held-out logs or, without any, a quarter of the training samples, in blocks.
+        From the result of rigid bodies alone, a copy of the module is trained under each of `CANDIDATE_WEIGHTS` for
+        half of the epochs. The held-out samples are the held-out logs or, without any, a quarter of the training
+        samples, in blocks.
 
         Raises:
             InputError: too few samples, or no weight under which the loss does not diverge.
         """
-        train, blocks = self.batches, [] if self.held_out is None else self.held_out.blocks(_BLOCKS)
+        train, blocks = self.batches, [] if self.held_out is None else self.held_out.split_blocks(_BLOCKS)
         if self.held_out is None:
             train, blocks = self.batches.hold_out(_BLOCKS, _EVERY)
         if len(blocks) < _FEWEST:
@@ -212,18 +217,18 @@ class Trainer:
             alone = self._trial(train, None, 0.0, self.settings.epochs)
             alone.run()
             start = alone.loss.learnable.state_dict()
-            losses = [self._trial_losses(train, weight, start, blocks) for weight in WEIGHTS]
+            losses = [self._trial_losses(train, weight, start, blocks) for weight in CANDIDATE_WEIGHTS]
         if not np.isfinite(losses).any():
             raise InputError("estimator", "training", "a loss that diverges under every residual_weight", _SMALLER)
         without = float(np.mean([alone.loss.mean_square(block) for block in blocks]))
-        self.weight_choice = choose_weight(WEIGHTS, np.array(losses), without)
+        self.weight_choice = choose_weight(CANDIDATE_WEIGHTS, np.array(losses), without)
         self.loss.residual_weight = self.weight_choice.weight
         return self.weight_choice
 
     def _trial(self, train: MiniBatches, residual: nn.Module | None, weight: float, epochs: int) -> Trainer:
-        """A descent on some of the samples."""
+        """A trainer on some of the samples."""
         settings = replace(self.settings, residual_weight=weight, epochs=epochs, patience=None)
-        return Trainer(settings, self.problem.share(train.samples / self.batches.samples), train, residual=residual)
+        return Trainer(settings, self.problem.fraction(train.samples / self.batches.samples), train, residual=residual)
 
     def _trial_losses(
         self, train: MiniBatches, weight: float, start: Mapping[str, Tensor], blocks: Sequence[MiniBatches]
@@ -248,13 +253,13 @@ class Trainer:
 
         Statistics are those of least squares with the same ridge.
         """
-        self._learn(self._best)
+        self._restore(self._best)
         plain, phi = self.closed_form, self.phi()
         return SgdEstimate(
             **(vars(plain) | {"phi": phi, "cost": self.problem.cost(phi)}),
             objective=self._objective(phi),
             unconstrained=self._objective(plain.phi),
-            distance=self.problem.distance(phi, plain.phi),
+            distance=self.problem.prediction_distance(phi, plain.phi),
             eigenvalues=parameters.least_eigenvalues(phi, self.problem.scale),
             epochs=self.epoch,
             best_epoch=self.best_epoch,
@@ -262,9 +267,9 @@ class Trainer:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a new trainer of the same settings and logs needs to go on: plain types and tensors."""
+        """The state that a new trainer of the same settings and logs resumes from: plain types and tensors."""
         return {
-            "learned": self._learned(),
+            "learned": self._snapshot(),
             "best": self._best,
             "optimizer": copy.deepcopy(self.optimizer.state_dict()),  # torch hands out what the next step writes to
             "schedule": None if self.schedule is None else copy.deepcopy(self.schedule.state_dict()),
@@ -277,14 +282,14 @@ class Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where `state_dict` was called.
+        """Resume from where `state_dict` was called.
 
         Raises:
-            ValueError: something in the state cannot be; what is wrong inside an optimizer's or a schedule's own state
-                raises whatever torch does.
+            ValueError: a value that no state of these settings has. Inside the states of optimizer and schedule torch
+                raises its own errors.
         """
-        check_state(state, self.state_dict(), self.settings.epochs)
-        self._learn(state["learned"])
+        validate_state(state, self.state_dict(), self.settings.epochs)
+        self._restore(state["learned"])
         self._best = state["best"]
         self._load_optimizer(copy.deepcopy(state["optimizer"]))
         if self.schedule is not None:
@@ -306,18 +311,18 @@ class Trainer:
                 if isinstance(value, Tensor):
                     own[name] = own[name].to(value.dtype)
 
-    def _learned(self) -> dict[str, Tensor]:
+    def _snapshot(self) -> dict[str, Tensor]:
         return {name: x.detach().clone() for name, x in self.loss.state_dict().items()}
 
-    def _learn(self, learned: Mapping[str, Tensor]) -> None:
+    def _restore(self, learned: Mapping[str, Tensor]) -> None:
         self.loss.load_state_dict(learned)
 
     def _objective(self, phi: Array) -> float:
         deviation = (phi - self.problem.nominal) / self.problem.scale
         return self.problem.cost(phi) / max(self.problem.rows, 1) + self.settings.ridge * float(deviation @ deviation)
 
-    def _choose_trained(self) -> None:
-        """Which of parameters and residual module learn in this epoch."""
+    def _freeze(self) -> None:
+        """Freeze the parameters or the residual module where they have no turn in this epoch."""
         if self.loss.residual is None:
             return
         first = self.epoch <= self.settings.epochs // 2
@@ -330,38 +335,40 @@ class Trainer:
             for x in group:
                 x.requires_grad_(trained)
 
-    def _learn_all(self) -> None:
-        """Leave nothing frozen: another trainer may take the residual module up."""
+    def _unfreeze(self) -> None:
+        """Unfreeze all: another trainer may train the residual module next."""
         for group in self._trained:
             for x in group:
                 x.requires_grad_(True)
 
-    def _check(self, loss: float) -> None:
+    def _require_converging(self, loss: float) -> None:
         if not loss <= _DIVERGED * max(1.0, self.problem.cost(self.problem.nominal) / max(self.problem.rows, 1)):
             rate = float(self.optimizer.param_groups[0]["lr"])
-            found = f"a loss of {loss:.3g} in epoch {self.epoch}, with {self.settings.optimizer} at lr {rate:.3g}"
+            found = (
+                f"a loss of {loss:.3g} in epoch {self.epoch}, with {self.settings.optimizer['name']} at lr {rate:.3g}"
+            )
             raise InputError("estimator", "training", found, _SMALLER)
 
     def _steps(self) -> Iterator[tuple[Callable[[], Iterable[Batch]], int]]:
         """The batches that each step of an epoch is taken on, with the number of their samples."""
-        if METHODS[self.settings.optimizer].whole:
+        if OPTIMIZERS[self.settings.optimizer["name"]].full_batch:
             yield self.batches.chunks, self.batches.samples
         else:
             for batch in self.batches.epoch(self.epoch):
                 yield partial(list, [batch]), len(batch)
 
-    def _step(self, batches: Callable[[], Iterable[Batch]], samples: int) -> Terms:
+    def _step(self, batches: Callable[[], Iterable[Batch]], samples: int) -> LossTerms:
         """One step of the optimizer; terms are those before it."""
-        found: list[Terms] = []
+        found: list[LossTerms] = []
 
         def closure() -> Tensor:
             self.optimizer.zero_grad()
-            terms = Terms({}, {})
+            terms = LossTerms({}, {})
             for batch in batches():
                 part, share = self.loss(batch), len(batch) / samples
                 (share * part.total()).backward()
                 terms = terms.plus(part, share)
-            if not METHODS[self.settings.optimizer].whole:
+            if not OPTIMIZERS[self.settings.optimizer["name"]].full_batch:
                 for group in self.optimizer.param_groups:
                     nn.utils.clip_grad_norm_(group["params"], self.settings.clip)
             found.append(terms)
@@ -370,8 +377,8 @@ class Trainer:
         try:
             self.optimizer.step(closure)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
         except torch.linalg.LinAlgError:  # type: ignore[attr-defined]  # eigenvalues of what is not finite
-            self._check(float("nan"))
-        self._check(float(found[0].losses["data"]))
+            self._require_converging(float("nan"))
+        self._require_converging(float(found[0].losses["data"]))
         return found[0]
 
 

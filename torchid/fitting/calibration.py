@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import ConfoundedWarning, LogError, TorchidWarning
+from torchid.errors import ConfoundedWarning, LogError, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import RobustLoss, fit_extras_robustly
@@ -22,10 +21,10 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
 from torchid.problem.compression import Part
 from torchid.problem.extras import Extra
-from torchid.problem.predict import calibrated
-from torchid.problem.samples import check_forces
+from torchid.problem.predict import calibrate_readings
+from torchid.problem.samples import require_forces
 from torchid.robot import Robot
-from torchid.text import listed
+from torchid.text import join_names
 
 T = TypeVar("T")
 
@@ -79,7 +78,7 @@ class Calibration:
         if not self.changes_readings:
             return list(logs)
         extras, tree = self.builder.extras, self._on_cpu.tree
-        return [calibrated(log, extras, self._values_for(log), tree) for log in logs]
+        return [calibrate_readings(log, extras, self._values_for(log), tree) for log in logs]
 
     def parameters(self, evaluation: Evaluation) -> Array:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""
@@ -87,7 +86,7 @@ class Calibration:
 
     def columns(self, builder: RowBuilder, log: Samples) -> Tensor:
         """Parameters in a builder's columns for the rows of a log, (width,)."""
-        return builder.columns_of(np.append(self.phi, self._values_for(log))[None])[0]
+        return builder.to_columns(np.append(self.phi, self._values_for(log))[None])[0]
 
     @cached_property
     def _on_cpu(self) -> RowBuilder:
@@ -112,10 +111,10 @@ class Calibration:
         """Extra parameters of a log, with everything else known."""
         builder = self._on_cpu
         try:
-            check_forces(log, self.robot, builder.contacts, builder.sensors)
+            require_forces(log, self.robot, builder.contacts, builder.sensors)
         except LogError as error:
             message = f"{error.source}: {error.field}: {error.found}; offsets and scales of this log stay unknown"
-            warnings.warn(message, TorchidWarning, stacklevel=2)
+            warn(message)
             return 0.0
         own = np.array([x.per_log for x in builder.extras])
 
@@ -126,7 +125,7 @@ class Calibration:
         def columns(values: Array) -> Tensor:
             extras = np.empty(len(own))
             extras[own], extras[~own] = values, shared
-            return builder.columns_of(np.append(self.phi, extras)[None])[0]
+            return builder.to_columns(np.append(self.phi, extras)[None])[0]
 
         if self.loss is None:
             return solve(compress_parts([log], builder))
@@ -172,7 +171,7 @@ def warn_of_confounded(extras: Sequence[ExtraEstimate], source: object = "logs")
             others = _grouped(name for x in confounded for name in x.confounded_with if " of " not in name)
             message = f"{log or source}: {named} are confounded with {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
-            warnings.warn(f"{message}; {advice}", ConfoundedWarning, stacklevel=3)
+            warn(f"{message}; {advice}", ConfoundedWarning)
 
 
 def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
@@ -195,9 +194,9 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
             channels = (builder.extras[number] for number in sorted(gated))
             named = _grouped(f"{x.name} {x.component}" for x in channels)
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
-            warnings.warn(f"{message}, which says nothing of their offsets", TorchidWarning, stacklevel=3)
+            warn(f"{message}, which says nothing of their offsets")
     assembly = fitter.assemble(on_ground)
-    estimate = LeastSquares(estimator.ridge, estimator.rank_tolerance).solve(assembly.problem)
+    estimate = LeastSquares(estimator.ridge, rank_tolerance=estimator.rank_tolerance).solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, fitter.robot.body_names, estimator.rank_tolerance)
     noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
     contradictions = disagreements(fit.parts, builder, extras, noise)
@@ -210,7 +209,7 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
         )
         more = f"; and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
         advice = "look for drift, a gain, cross talk, wrong contact_active, or noise in the base's motion"
-        warnings.warn(f"{log}: {named}{more}; {advice}", TorchidWarning, stacklevel=3)
+        warn(f"{log}: {named}{more}; {advice}")
 
 
 def _grouped(labels: Iterable[str]) -> str:
@@ -221,5 +220,5 @@ def _grouped(labels: Iterable[str]) -> str:
         groups.setdefault(first, {})[last] = None
     order = sorted(groups, key=lambda first: -len(groups[first]))
     more = f"; and {len(order) - _NAMED} more" if len(order) > _NAMED else ""
-    named = ((first, listed(list(groups[first]), _NAMED)) for first in order[:_NAMED])
+    named = ((first, join_names(list(groups[first]), _NAMED)) for first in order[:_NAMED])
     return "; ".join(f"{first} {names}" if " of" in first else f"{names} of {first}" for first, names in named) + more

@@ -15,12 +15,10 @@ from torchid.fitting.fit import BatchEstimator, Fit, LogFitter
 from torchid.fitting.robust import RobustLoss
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples, compress_parts
-from torchid.problem.chunks import one_thread
-from torchid.problem.compression import Part, in_folds, states_together
-from torchid.problem.extras import read_components
+from torchid.problem.chunks import ProgressCallback, one_thread
+from torchid.problem.compression import Part, merge_states, split_into_folds
+from torchid.problem.extras import recorded_components
 from torchid.problem.metrics import ForceSums
-
-Progress = Callable[[int], None]
 
 RIDGES = tuple(float(f"1e{power}") for power in range(-7, 2))
 """Ridges that are tried, in decades: finer steps change predictions by less than their spread over the folds."""
@@ -56,7 +54,7 @@ def cross_validate(
 ) -> CrossValidation:
     """Errors of predicted forces on blocks of some logs, each block predicted by the fit of all others.
 
-    Blocks are contiguous in time, see `in_folds`: errors of successive samples are alike::
+    Blocks are contiguous in time, see `split_into_folds`: errors of successive samples are alike::
 
         found = torchid.cross_validate(logs, fitter)
         found.identified.rms["joint_torque"], found.nominal.rms["joint_torque"]  # [N m]
@@ -70,7 +68,7 @@ def cross_validate(
     Raises:
         LogError: too few samples to leave some out.
     """
-    blocks = in_folds(logs, fitter.builder)
+    blocks = split_into_folds(logs, fitter.builder)
     parts = compress_parts(blocks, fitter.builder)
     fit = fitter.fit(parts)
     without_folds = fitter.fit_without_folds(fit.parts)
@@ -80,7 +78,7 @@ def cross_validate(
 
     evaluation = Evaluation(fitter.robot, fitter.builder.contacts, str(fitter.builder.device), terms)
     scores = Scorer(evaluation, fitter.builder).score_training(
-        blocks, states_together(fit.parts, fitter.builder), compared(fit), [compared(one) for one in without_folds]
+        blocks, merge_states(fit.parts, fitter.builder), compared(fit), [compared(one) for one in without_folds]
     )
     if scores.cross_validation is None:
         raise _too_few(logs)
@@ -100,14 +98,14 @@ def choose_ridge(
     Source: the one-standard-error rule, Hastie, Tibshirani, Friedman, "The Elements of Statistical Learning", 7.10; the
     error is that of the difference between two ridges, fold by fold, which says whether they differ::
 
-        blocks = torchid.in_folds(logs, builder)
+        blocks = torchid.split_into_folds(logs, builder)
         parts = torchid.compress_parts(blocks, builder)
         estimators = [torchid.LeastSquares(ridge) for ridge in torchid.RIDGES]
         torchid.choose_ridge(parts, blocks, fitter, estimators).ridge
 
     Args:
         parts: of the blocks, compressed.
-        blocks: training logs, as `in_folds` cuts them.
+        blocks: training logs, as `split_into_folds` cuts them.
         fitter: of their rows.
         estimators: one for each ridge to try, ascending.
         loss: as in `Calibration`.
@@ -119,7 +117,7 @@ def choose_ridge(
     folds = sorted({part.fold for part in parts})
     if len(folds) < 2:
         raise _too_few(blocks)
-    together = states_together(parts, fitter.builder)
+    together = merge_states(parts, fitter.builder)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)  # the fit says the same
         squares = np.array(
@@ -182,7 +180,7 @@ class Scorer:
     builder: RowBuilder
 
     def score_logs(
-        self, logs: Sequence[Samples], compared: Comparison[Calibration], progress: Progress | None = None
+        self, logs: Sequence[Samples], compared: Comparison[Calibration], progress: ProgressCallback | None = None
     ) -> Comparison[Metrics]:
         """Errors on logs as recorded, each with the extra parameters that fit the bodies' parameters best.
 
@@ -198,12 +196,12 @@ class Scorer:
         parts: Sequence[Part],
         compared: Comparison[Calibration],
         without_folds: Sequence[Comparison[Calibration]],
-        progress: Progress | None = None,
+        progress: ProgressCallback | None = None,
     ) -> TrainingScore:
         """Errors of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
 
         Args:
-            logs: as `in_folds` has cut them.
+            logs: as `split_into_folds` has cut them.
             parts: compressed, with the weights of a robust fit.
             compared: parameters of the fit.
             without_folds: those of a fit without each fold, by its number; none without cross-validation.
@@ -227,7 +225,7 @@ class Scorer:
         logs: Sequence[Samples],
         parts: Sequence[Part],
         calibrations: Sequence[Calibration],
-        progress: Progress | None,
+        progress: ProgressCallback | None,
     ) -> list[tuple[ForceSums, ForceSums]]:
         """Of the measured forces and of the errors, for each calibration."""
         phi = np.stack([one.parameters(self.evaluation) for one in calibrations])
@@ -294,8 +292,8 @@ def with_all_readings(log: Samples, builder: RowBuilder) -> Samples:
     """The samples of a log that have every reading of the builder's sensors."""
     sensors, known = builder.sensors, torch.ones(len(log), dtype=torch.bool)
     if sensors.torque.any():
-        known &= torch.isfinite(builder.torque(log)[:, torch.from_numpy(sensors.torque)]).all(1)
-    needed = torch.from_numpy(read_components(builder.contacts, sensors, log.wrench_in_world))
+        known &= torch.isfinite(builder.recorded_torque(log)[:, torch.from_numpy(sensors.torque)]).all(1)
+    needed = torch.from_numpy(recorded_components(builder.contacts, sensors, log.wrench_in_world))
     touched = log.active[..., None] & needed
     lost = touched if log.wrench is None else touched & ~torch.isfinite(log.wrench)
     known &= ~lost.flatten(1).any(1)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
 from torchid import parameters
 from torchid.config.estimator import EstimatorConfig
-from torchid.errors import ConfigError, TorchidWarning, UnknownNameError
+from torchid.errors import ConfigError, UnknownNameError, warn
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.parameters import PARAMETERS, Array
 from torchid.robot import Robot, body_extents, mirror_pairs
@@ -29,18 +27,11 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
     Raises:
         InputError: the certified method without CVXPY and Clarabel.
     """
-    if settings.name == "consistent":
-        return Consistent(
-            ridge=settings.pull,
-            prior=settings.prior,
-            conditions=conditions,
-            method=settings.method,
-            certify=settings.certify,
-            rank_tolerance=settings.rank_tolerance,
-        )
-    if settings.name == "least_squares" or settings.consistency == "penalties" or not settings.pull:
-        return LeastSquares(settings.pull, settings.rank_tolerance)
-    return Consistent(settings.pull, conditions=conditions, rank_tolerance=settings.rank_tolerance)
+    if settings.name == "least_squares":
+        return settings.least_squares
+    if settings.name == "sgd" and (settings.consistency == "penalties" or not settings.numeric_ridge):
+        return settings.least_squares
+    return settings.consistent(conditions)
 
 
 def conditions_from(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> Conditions:
@@ -99,7 +90,7 @@ def _enclosures(settings: EstimatorConfig, robot: Robot, source: object) -> tupl
     if outside:
         message = f"the URDF's own centre of mass is outside the {settings.com_inside} at {', '.join(outside)}"
         advice = "are the shapes where the matter is? (estimator.com_shapes)"
-        warnings.warn(f"{source}: estimator.com_inside: {message}; {advice}", TorchidWarning, stacklevel=4)
+        warn(f"{source}: estimator.com_inside: {message}; {advice}")
     return tuple(out)
 
 

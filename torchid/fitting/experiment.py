@@ -28,9 +28,9 @@ from torchid.sensing import (
     Contact,
     SensorNoise,
     SensorSet,
-    check_contacts,
     chosen_sensors,
     named_sensors,
+    validate_contacts,
     with_ft_sensors,
 )
 
@@ -144,7 +144,7 @@ class Scene:
 
         Args:
             parts: of the blocks, compressed.
-            blocks: training logs, as `in_folds` cuts them.
+            blocks: training logs, as `split_into_folds` cuts them.
             fitter: of their rows.
             conditions: on the parameters.
 
@@ -212,7 +212,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "exp
         raise UnknownNameError(source, field, error.name, error.valid, error.what) from error
     if not robot.nv:
         raise ConfigError(source, "robot", "a bolted base without a joint, which never moves", "a robot that can move")
-    contacts = check_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
+    contacts = validate_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
     return Scene(config=config, robot=robot, contacts=contacts, source=source)
 
 

@@ -15,7 +15,7 @@ from torchid.estimators import Estimate, LeastSquares
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
-from torchid.problem.compression import Part, states_together
+from torchid.problem.compression import Part, merge_states
 from torchid.problem.elimination import Assembly
 from torchid.robot import Robot
 
@@ -59,7 +59,7 @@ class Fit:
         """Parameters in the builder's columns for the rows of a log, (width,)."""
         values = {x.extra.label: x.value for x in self.extras if x.log in ("", log)}
         extras = [values.get(extra.label, 0.0) for extra in builder.extras]
-        return builder.columns_of(np.append(self.estimate.phi, extras)[None])[0]
+        return builder.to_columns(np.append(self.estimate.phi, extras)[None])[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,7 @@ class LogFitter:
         assembly = self.assemble(parts)
         if not any(part.unloaded for part in parts):
             return LogProblem(list(parts), assembly)
-        first = LeastSquares(self.estimator.ridge, self.estimator.rank_tolerance).solve(assembly.problem)
+        first = LeastSquares(self.estimator.ridge, rank_tolerance=self.estimator.rank_tolerance).solve(assembly.problem)
         weighed = [_with_own_noise(part, first.residual_std) for part in parts]
         return LogProblem(weighed, self.assemble(weighed))
 
@@ -132,7 +132,7 @@ class LogFitter:
         folds = sorted({part.fold for part in parts})
         if len(folds) < 2:
             return []
-        blocks = states_together(parts, self.builder)
+        blocks = merge_states(parts, self.builder)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
             rests = ([block for block in blocks if block.fold != fold] for fold in folds)
@@ -168,4 +168,4 @@ def _with_own_noise(part: Part, residual_std: float) -> Part:
     """
     if not part.unloaded or residual_std <= 1.0:
         return part
-    return replace(part, factor=part.factor.times(residual_std))
+    return replace(part, factor=part.factor.scaled(residual_std))

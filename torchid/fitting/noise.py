@@ -13,7 +13,14 @@ from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, Samples
-from torchid.problem.noise import BASE, Components, SampledRows, VarianceComponents, by_group, of_groups
+from torchid.problem.noise import (
+    BASE_GROUPS,
+    GroupVariances,
+    SampledRows,
+    VarianceComponentEstimator,
+    noise_of_groups,
+    std_by_group,
+)
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
@@ -75,7 +82,7 @@ def estimate_noise(logs: Sequence[Samples], fitter: LogFitter, stated: Collectio
         return NoiseSummary(guess, [], {}, 0)
     tied = [name for name in rows.groups if name.partition(".")[0] in stated]
     variance, columns, passes = np.ones(len(rows.groups)), None, 0
-    estimator = VarianceComponents(rows, tied)
+    estimator = VarianceComponentEstimator(rows, tied)
     while True:
         columns, problem = _fit_rows(rows, variance, columns, fitter)
         passes += 1
@@ -85,9 +92,11 @@ def estimate_noise(logs: Sequence[Samples], fitter: LogFitter, stated: Collectio
         variance = components.variance
         if components.change < _SETTLED or passes == _PASSES:
             break
-    free = VarianceComponents(rows).estimate(variance, columns, problem) if tied else components
+    free = VarianceComponentEstimator(rows).estimate(variance, columns, problem) if tied else components
     common = variance[rows.groups.index(tied[0])] if tied else 1.0
-    used = np.where(np.isin(rows.groups, tied), rows.guess, _rounded(rows.guess * np.sqrt(variance / common)))
+    used = np.where(
+        np.isin(rows.groups, tied), rows.reference_std, _rounded(rows.reference_std * np.sqrt(variance / common))
+    )
     return _summary(guess, rows, tied, used, free, passes)
 
 
@@ -102,7 +111,7 @@ def recorded_sensors(
         logs: bound logs.
         noise: of the sensors.
     """
-    torque = np.ones(robot.dofs, dtype=bool)
+    torque = np.ones(robot.n_dofs, dtype=bool)
     wrench = np.ones((len(contacts), 6), dtype=bool)
     for log in logs:
         torque &= log.torque is not None and log.torque.isfinite().all(0).numpy()
@@ -120,7 +129,7 @@ def _fit_rows(
 ) -> tuple[Mapping[str, Tensor], LinearProblem]:
     """Parameters by log in the builder's columns, and the problem, by least squares without regularization."""
     estimator = LeastSquares(rank_tolerance=fitter.estimator.rank_tolerance)
-    fit = fitter.fit(rows.parts(variance, before), estimator.solve)
+    fit = fitter.fit(rows.compress(variance, before), estimator.solve)
     columns = {chunk.log: fit.columns(rows.builder, chunk.log) for chunk in rows.chunks}
     return {log: x.to("cpu", torch.float64) for log, x in columns.items()}, fit.assembly.problem
 
@@ -131,12 +140,12 @@ def _rounded(values: Array) -> Array:
 
 
 def _summary(
-    guess: SensorNoise, rows: SampledRows, tied: Sequence[str], used: Array, free: Components, passes: int
+    guess: SensorNoise, rows: SampledRows, tied: Sequence[str], used: Array, free: GroupVariances, passes: int
 ) -> NoiseSummary:
-    deviation = _rounded(rows.guess * np.sqrt(free.variance))
+    deviation = _rounded(rows.reference_std * np.sqrt(free.variance))
     groups = []
     for place, name in enumerate(rows.groups):
-        determined = bool(free.told[place])
+        determined = bool(free.estimated[place])
         origin = "stated" if name in tied else _origin(free, place)
         unit = "N" if "force" in name else "N m"
         groups.append(
@@ -148,33 +157,35 @@ def _summary(
                 residual=float(deviation[place]) if determined else None,
             )
         )
-    noise = of_groups(by_group(guess) | {one.group: one.used for one in groups})
+    noise = noise_of_groups(std_by_group(guess) | {one.group: one.used for one in groups})
     known = {
         name: float(x)
-        for name, x, yes in zip(rows.groups, deviation, free.told & ~free.at_most & ~free.confounded, strict=True)
+        for name, x, yes in zip(
+            rows.groups, deviation, free.estimated & ~free.upper_bound & ~free.confounded, strict=True
+        )
         if yes
     }
     return NoiseSummary(noise, groups, _suggested(guess, tied, known), passes)
 
 
-def _origin(components: Components, place: int) -> str:
-    if not components.told[place]:
+def _origin(components: GroupVariances, place: int) -> str:
+    if not components.estimated[place]:
         return "assumed"
-    return "at most" if components.at_most[place] else "confounded" if components.confounded[place] else "estimated"
+    return "at most" if components.upper_bound[place] else "confounded" if components.confounded[place] else "estimated"
 
 
 def _suggested(
     stated: SensorNoise, tied: Sequence[str], known: Mapping[str, float]
 ) -> dict[str, float | tuple[float, float, float]]:
     """Noise to state instead, if no common factor of at most 1 brings the stated one within a factor of two."""
-    before = by_group(stated)
+    before = std_by_group(stated)
     ratios = [known[name] / before[name] for name in tied if name in known]
     if not ratios or (max(ratios) <= _APART and max(ratios) <= _APART**2 * min(ratios)):
         return {}
     out: dict[str, float | tuple[float, float, float]] = {}
     for name in tied:
         key = name.partition(".")[0]
-        axes = [axis for axis in BASE if axis.partition(".")[0] == key]
+        axes = [axis for axis in BASE_GROUPS if axis.partition(".")[0] == key]
         if axes and all(axis in known for axis in axes):
             out[key] = (known[axes[0]], known[axes[1]], known[axes[2]])
         elif not axes and name in known:

@@ -13,11 +13,12 @@ import torch
 from torch import Tensor
 
 from torchid.errors import UnknownNameError
-from torchid.estimators import BoundEstimate
+from torchid.estimators import ConstrainedEstimate
 from torchid.fitting.fit import Fit, LogFitter, Solve
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
-from torchid.problem.compression import Part, merged
+from torchid.problem.chunks import ProgressCallback
+from torchid.problem.compression import Part, merge_factors
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
 """Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
@@ -99,7 +100,7 @@ def fit_robustly(
     *,
     first: Fit | None = None,
     solve: Solve | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: ProgressCallback | None = None,
 ) -> RobustFit:
     """Iteratively re-weighted least squares, a pass over the logs each time, memory flat in their length.
 
@@ -128,7 +129,7 @@ def fit_robustly(
         by_log = {source: fit.columns(builder, source) for source in sources}
         reweighting = Reweighting(current, by_log, max(scale, _TINY))
         before, done = fit, done + 1
-        fit = fitter.fit(compress_parts(logs, builder, progress=progress, weigh=reweighting), solve)
+        fit = fitter.fit(compress_parts(logs, builder, progress=progress, weight_rows=reweighting), solve)
         converged = current == loss and _settled(fit, before, scale, reweighting.median_scale)
         scale = reweighting.median_scale
     summary = RobustSummary(
@@ -160,13 +161,13 @@ def fit_extras_robustly(
     """
     parts = compress_parts([log], builder)
     values = solve(parts)
-    factor = merged((part.factor for part in parts), builder)
+    factor = merge_factors((part.factor for part in parts), builder)
     misfit = factor.triangle() @ torch.cat([columns(values), torch.tensor([-1.0], dtype=torch.float64)])
     scale = float(misfit.norm()) / np.sqrt(max(factor.rows, 1))
     for done in range(loss.passes):
         current = _loss_of_pass(loss, done)
         reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
-        before, values = values, solve(compress_parts([log], builder, weigh=reweighting))
+        before, values = values, solve(compress_parts([log], builder, weight_rows=reweighting))
         steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
         scale = reweighting.median_scale
         if current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME):
@@ -252,8 +253,8 @@ def _settled(fit: Fit, before: Fit, scale: float, new_scale: float) -> bool:
     So it has where nothing but rounding remains to be fitted.
     """
     problem, estimate = fit.assembly.problem, fit.estimate
-    moved = problem.distance(estimate.phi, before.estimate.phi)
-    if max(moved, new_scale) <= _EXACT * problem.distance(estimate.phi, np.zeros_like(estimate.phi)):
+    moved = problem.prediction_distance(estimate.phi, before.estimate.phi)
+    if max(moved, new_scale) <= _EXACT * problem.prediction_distance(estimate.phi, np.zeros_like(estimate.phi)):
         return True
     rows = problem.rows / problem.oversampling
     if moved > _CONVERGED * scale * np.sqrt(estimate.rank / rows) or abs(new_scale - scale) > _STEADY * scale:
@@ -272,7 +273,7 @@ def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
         return fit
     added = (factor**2 - 1.0) * estimate.cost
     changed: dict[str, Any] = {name: getattr(estimate, name) + added for name in ("cost", "nominal_cost")}
-    if isinstance(estimate, BoundEstimate):
+    if isinstance(estimate, ConstrainedEstimate):
         objectives = {name: getattr(estimate, name) for name in ("objective", "unconstrained")}
         changed |= {name: x + added / problem.rows for name, x in objectives.items() if x is not None}
     estimate = replace(estimate, standard_error=factor * estimate.standard_error, **changed)

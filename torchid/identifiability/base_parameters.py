@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -13,10 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from torchid import parameters
-from torchid.errors import NumericalWarning
+from torchid.errors import NumericalWarning, warn
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
+from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank
 
 _ROUNDING = 1e-9  # of a coefficient, columns having norm 1; joint angles written as 1.5707963 leave 1e-11
 _LEAST_PREFERENCE = 1e-2  # between 1e-1 and 1e-4 sums are shortest, and conditioning is the same
@@ -100,7 +100,7 @@ class BaseParameters(nn.Module):
 
 @one_thread()
 def base_parameters(
-    problem: LinearProblem, tolerance: float = 1e-10, preference: Array | None = None
+    problem: LinearProblem, tolerance: float = RANK_TOLERANCE, preference: Array | None = None
 ) -> BaseParameters:
     """Base parameters of a problem.
 
@@ -176,7 +176,7 @@ def unobservable_parameters(base: BaseParameters, body_names: Sequence[str]) -> 
 
 
 @one_thread()
-def structural_rank(problem: LinearProblem, tolerance: float = 1e-10) -> RankGap:
+def structural_rank(problem: LinearProblem, tolerance: float = RANK_TOLERANCE) -> RankGap:
     """Rank of a problem's free columns, scaled to norm 1.
 
     Args:
@@ -190,7 +190,7 @@ def structural_rank(problem: LinearProblem, tolerance: float = 1e-10) -> RankGap
     return rank_and_gap(scipy.linalg.svd(columns, compute_uv=False, lapack_driver="gesvd"), tolerance)
 
 
-def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
+def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
     """Rank of a matrix with columns of one size.
 
     Values below rounding count as `eps` times the largest one in the gap, which is 4.5e15 at most.
@@ -202,14 +202,14 @@ def rank_and_gap(values: Array, tolerance: float = 1e-10) -> RankGap:
     Warns:
         NumericalWarning: a gap below 1e3, so that another tolerance finds another rank.
     """
-    rank = int((values > tolerance * values[:1]).sum())
+    rank = numerical_rank(values, tolerance)
     if rank == 0:
         return RankGap(0, np.inf)
     dropped = max(float(values[rank]) if rank < len(values) else 0.0, np.finfo(float).eps * float(values[0]))
     gap = float(values[rank - 1]) / dropped
     if gap < _CLEAR_GAP:
         message = f"rank {rank}: the next singular value is only {gap:.3g} times smaller than the last that counts"
-        warnings.warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning, 2)
+        warn(f"{message}; the rank is a matter of the tolerance, {tolerance:g}", NumericalWarning)
     return RankGap(rank, gap)
 
 
@@ -221,7 +221,7 @@ def normalized_columns(problem: LinearProblem, tolerance: float) -> tuple[Array,
     scale = problem.scale[problem.free]
     columns = problem.A[:, problem.free] * scale
     norms = np.linalg.norm(columns, axis=0)
-    observable = norms > tolerance * norms.max(initial=0.0)
+    observable = is_significant(norms, tolerance)
     norms[~observable] = 1.0
     return np.where(observable, columns, 0.0) / norms, scale / norms
 

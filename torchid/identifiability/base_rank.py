@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,9 +10,9 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
-from torchid.errors import BaseLostError, BaseLostWarning
+from torchid.errors import BaseLostError, BaseLostWarning, warn
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import by_state, one_thread, spread_by_state
+from torchid.problem.chunks import chunks_by_state, one_thread, subsample_states
 from torchid.problem.contact_state import State, state_name
 from torchid.sensing.projection import base_rank, base_singular_values
 
@@ -51,16 +50,16 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
     counts = Counter[State]()
     for samples in logs:
         every = torch.arange(len(samples))
-        for state, index in by_state(samples):
+        for state, index in chunks_by_state(samples):
             counts[state] += len(every[index])
     rows, values, weights = (
         Counter[State](),
         defaultdict[State, list[Tensor]](list),
         defaultdict[State, list[Tensor]](list),
     )
-    for samples, state, weight in spread_by_state(logs, _CHECKED):
-        for _, V in builder.bases(samples.to(builder.device), state):
-            rows[state] = max(rows[state], V.shape[2] + len(builder.plan(state).lone_joints))
+    for samples, state, weight in subsample_states(logs, _CHECKED):
+        for _, V in builder.null_space_bases(samples.to(builder.device), state):
+            rows[state] = max(rows[state], V.shape[2] + len(builder.layout(state).uncoupled_joints))
             if builder.tree.base_rows:
                 values[state].append(base_singular_values(V).cpu())
                 weights[state].append(torch.full((len(V),), weight))
@@ -95,7 +94,7 @@ def require_base(reports: Sequence[StateReport], on_base_lost: str = "error") ->
     message = f"sensors: the base is lost, rank(S_b V_x) < 6, in contact with {where}"
     if on_base_lost == "error":
         raise BaseLostError(f"{message}; accepted: more sensors, other contacts, or sensors.on_base_lost: warn")
-    warnings.warn(f"{message}; parameters of some bodies are out of reach there", BaseLostWarning, stacklevel=2)
+    warn(f"{message}; parameters of some bodies are out of reach there", BaseLostWarning)
 
 
 def _of_base(values: Tensor, weight: Tensor) -> tuple[int, float, float, dict[int, float]]:

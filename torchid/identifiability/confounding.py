@@ -12,9 +12,10 @@ from torchid.estimators import Estimate
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder
 from torchid.problem.chunks import one_thread
-from torchid.problem.compression import Part, merged
+from torchid.problem.compression import Part, merge_factors
 from torchid.problem.elimination import Assembly, Elimination
 from torchid.problem.extras import Extra
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE
 
 INFLATION_LIMIT = 10.0
 """An extra parameter whose standard error grows more than this by not knowing all others is confounded with them.
@@ -22,9 +23,6 @@ INFLATION_LIMIT = 10.0
 It is a variance inflation of 100, ten times what is commonly taken for serious collinearity; source: Belsley, Kuh,
 Welsch, "Regression Diagnostics", 1980.
 """
-
-ROUNDING = 1e-6
-"""Share of a direction below which its part in the null space of the rows is rounding."""
 
 _NAMED = 4  # parameters, at most, that a message names
 _CONTRADICTS = 5.0  # standard errors between readings in the air and those in contact; noise is seldom white
@@ -61,7 +59,7 @@ class ExtraEstimate:
 
 @one_thread()
 def estimate_extras(
-    assembly: Assembly, estimate: Estimate, body_names: Sequence[str], rank_tolerance: float = 1e-10
+    assembly: Assembly, estimate: Estimate, body_names: Sequence[str], rank_tolerance: float = RANK_TOLERANCE
 ) -> list[ExtraEstimate]:
     """All extra parameters that were eliminated, at the estimated parameters of the bodies; not those that no row has.
 
@@ -79,7 +77,7 @@ def estimate_extras(
     )
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
     shared = next((elimination for elimination in assembly.eliminations if not elimination.log), None)
-    values = zip(assembly.unknowns(estimate.phi), assembly.unknowns(assembly.problem.nominal), strict=True)
+    values = zip(assembly.extras_at(estimate.phi), assembly.extras_at(assembly.problem.nominal), strict=True)
     out = []
     for elimination, pair in zip(assembly.eliminations, values, strict=True):
         out += _estimates(elimination, pair, noise, covariance, names, shared if elimination.log else None)
@@ -131,7 +129,9 @@ def disagreements(
     out = []
     for source in dict.fromkeys(part.source for part in parts if part.unloaded):
         own = {(x.extra.what, x.extra.contact): x for x in in_contact if x.log in ("", source)}
-        R = merged((part.factor for part in parts if part.unloaded and part.source == source), builder).triangle()
+        R = merge_factors(
+            (part.factor for part in parts if part.unloaded and part.source == source), builder
+        ).triangle()
         for number, extra in enumerate(builder.extras, start=builder.columns.count):
             column, offset = R[:, number].numpy(), own.get((extra.what, extra.contact))
             if extra.what == "offset" and extra.contact is not None and offset is not None and column.any():
@@ -146,7 +146,7 @@ def disagreements(
                         extra=extra, log=source, in_the_air=read, in_contact=expected, standard_error=deviation
                     )
                 )
-    sensors = builder.sensors.noise.wrench
+    sensors = builder.sensors.noise.wrench_std
     return sorted((x for x in out if x.is_significant(sensors)), key=lambda x: -x.standard_errors)
 
 
@@ -172,7 +172,7 @@ class TotalMass:
         return self.separable and 2.0 * self.standard_error <= self.nominal
 
 
-def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1e-10) -> TotalMass:
+def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = RANK_TOLERANCE) -> TotalMass:
     """The total mass of estimated parameters, with a standard error without regularization.
 
     Args:
@@ -192,7 +192,7 @@ def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = 1
 
 @one_thread()
 def combination_standard_error(
-    problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = 1e-10
+    problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = RANK_TOLERANCE
 ) -> float:
     """Standard error of a combination `weights @ phi`, (12 L,), without regularization.
 
@@ -200,7 +200,7 @@ def combination_standard_error(
     """
     covariance = ParameterCovariance.of(problem, rank_tolerance)
     along = covariance.scale_sensitivity(weights[None])
-    if np.linalg.norm(along @ covariance.null_space) > ROUNDING * np.linalg.norm(along):
+    if np.linalg.norm(along @ covariance.null_space) > UNOBSERVABLE_SHARE * np.linalg.norm(along):
         return float("inf")
     return float(np.sqrt(problem.oversampling) * estimate.residual_std * np.linalg.norm(along @ covariance.root))
 
@@ -245,7 +245,7 @@ class ParameterCovariance:
 
         None is taken to be off by more than its scale: else the least certain would be named, however little it weighs.
         """
-        noise = max(noise, ROUNDING**2)  # of exact data, whose variance is all due to the least certain
+        noise = max(noise, UNOBSERVABLE_SHARE**2)  # of exact data, whose variance is all due to the least certain
         rank = self.root.shape[1]
         directions = np.hstack([self.root * self.values[:rank], self.null_space])
         along = directions.T @ sensitivity / (1.0 + (self.values / noise) ** 2)
@@ -275,10 +275,10 @@ def _estimates(
         hidden.append(through @ shared.hidden)
     G = covariance.scale_sensitivity(sensitivity)
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
-    lost = np.linalg.norm(G @ covariance.null_space, axis=1) > ROUNDING * size
+    lost = np.linalg.norm(G @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
     through_parameters = ((G @ covariance.root) ** 2).sum(1)
     variance = sum((x**2).sum(1) for x in own) + through_parameters
-    undetermined = lost | ~elimination.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > ROUNDING)
+    undetermined = lost | ~elimination.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > UNOBSERVABLE_SHARE)
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
     for k, extra in enumerate(elimination.extras):
@@ -315,7 +315,7 @@ def _labels(elimination: Elimination) -> list[str]:
 def _largest(along: Array, names: Sequence[str]) -> tuple[str, ...]:
     """Names of the largest components of a direction, none that is small beside them."""
     order = np.argsort(-np.abs(along))[:_NAMED]
-    least = max(0.2 * np.abs(along).max(initial=0.0), ROUNDING)
+    least = max(0.2 * np.abs(along).max(initial=0.0), UNOBSERVABLE_SHARE)
     return tuple(names[k] for k in order if np.abs(along[k]) > least)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,10 +19,11 @@ from torchid.identifiability.information import (
 )
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread
+from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import state_name
-from torchid.problem.elimination import without
+from torchid.problem.elimination import eliminate_columns
+from torchid.rounding import RANK_TOLERANCE, numerical_rank
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ def contributions(
     builder: RowBuilder,
     problem: LinearProblem,
     dof_names: Sequence[str],
-    rank_tolerance: float = 1e-10,
-    done: Callable[[int], None] | None = None,
+    rank_tolerance: float = RANK_TOLERANCE,
+    done: ProgressCallback | None = None,
 ) -> Contributions:
     """Leave every log, contact state and sensor out in turn.
 
@@ -131,7 +132,7 @@ class ScaledParts:
             by_source.setdefault(self.parts[i].source if self.nuisance.of_log else "", []).append(self._factors[i])
         nothing = np.empty((0, self._factors[0].shape[1] - len(self.nuisance.of_log)))
         logs = (triangular_factor(np.concatenate(same)) for same in by_source.values())
-        of_sources = (without(X, self.nuisance.of_log) for X in logs)
+        of_sources = (eliminate_columns(X, self.nuisance.of_log) for X in logs)
         return triangular_factor(np.concatenate([nothing, *of_sources]))
 
     @cached_property
@@ -141,7 +142,9 @@ class ScaledParts:
 
     def singular_values(self, X: Array) -> Array:
         """Of X of several logs with nuisance parameters eliminated, descending."""
-        return np.asarray(np.linalg.svd(without(triangular_factor(X), self.nuisance.of_all), compute_uv=False))
+        return np.asarray(
+            np.linalg.svd(eliminate_columns(triangular_factor(X), self.nuisance.of_all), compute_uv=False)
+        )
 
 
 def leave_one_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float) -> list[PartContribution]:
@@ -193,8 +196,7 @@ def _without_each(factors: Sequence[Array]) -> Iterator[Array]:
 
 def _rank(values: Array, tolerance: float) -> int:
     """As `LeastSquares` counts it."""
-    least = max(tolerance, np.finfo(float).eps * len(values)) * values.max(initial=0.0)
-    return int((values > least).sum())
+    return numerical_rank(values, tolerance, values.shape)
 
 
 def _sensor_information(
@@ -202,7 +204,7 @@ def _sensor_information(
     builder: RowBuilder,
     directions: Array,
     nuisance: NuisanceColumns,
-    done: Callable[[int], None] | None,
+    done: ProgressCallback | None,
 ) -> SensorInformation:
     """As `sensor_information` has it, in scaled columns, without the nuisance parameters of each log."""
 

@@ -13,10 +13,11 @@ from torch import Tensor
 from torchid.identifiability.information import triangular_factor
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread, spread_by_state
+from torchid.problem.chunks import one_thread, subsample_states
 from torchid.problem.contact_state import State
-from torchid.problem.metrics import GROUPS, ForceSums, figure, projected
+from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components
 from torchid.problem.predict import predicted_forces
+from torchid.rounding import RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 
 _SAMPLES = 400  # a contact state
@@ -36,7 +37,7 @@ class ExpectedErrors:
     @property
     def total(self) -> dict[str, float | None]:
         """Expected difference between predicted and measured forces."""
-        pairs = {group: (self.model[group], self.sensors[group]) for group in GROUPS}
+        pairs = {group: (self.model[group], self.sensors[group]) for group in ROW_GROUPS}
         return {group: None if x is None or y is None else float(np.hypot(x, y)) for group, (x, y) in pairs.items()}
 
 
@@ -53,12 +54,12 @@ def expected_errors(
         directions: (M, 12 L), independent errors of the parameters, as `error_directions` gives them.
         noise: of the sensors that recorded these logs, with its floors of the base rows.
     """
-    columns = torch.from_numpy(triangular_factor(directions @ builder.columns.from_parameters().T)).to(builder.device)
+    columns = torch.from_numpy(triangular_factor(directions @ builder.columns.parameter_map().T)).to(builder.device)
     base, nv = builder.tree.base_rows, builder.tree.base_rows + len(builder.columns.joint_rows)
     model, sensors = ForceSums(nv), ForceSums(nv)
-    for samples, state, weight in spread_by_state(logs, _SAMPLES):
+    for samples, state, weight in subsample_states(logs, _SAMPLES):
         samples = samples.to(builder.device)
-        terms = builder.terms(samples)
+        terms = builder.dynamics(samples)
         predicted = torch.stack([predicted_forces(builder, terms, phi).T for phi in columns])
         rows = _row_noise(builder, samples, noise)
         through_contacts = _wrench_noise(builder, samples, state, noise)
@@ -67,15 +68,19 @@ def expected_errors(
             (sensors, torch.cat([rows, through_contacts]), rows),
         ):
             sums.rows.add(_together(errors), weight)
-            for inside in projected(builder, samples, state, without_contacts):
+            for inside in null_space_components(builder, samples, state, without_contacts):
                 sums.projected.add(_together(inside).flatten()[:, None], weight)
     errors_rms = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
-    return ExpectedErrors(*({group: figure(rms[group]) for group in GROUPS} for rms in errors_rms))
+    return ExpectedErrors(*({group: finite_or_none(rms[group]) for group in ROW_GROUPS} for rms in errors_rms))
 
 
 @one_thread()
 def error_directions(
-    problem: LinearProblem, ridge: float, noise_variance: float, prior_error: float, rank_tolerance: float = 1e-10
+    problem: LinearProblem,
+    ridge: float,
+    noise_variance: float,
+    prior_error: float,
+    rank_tolerance: float = RANK_TOLERANCE,
 ) -> Array:
     """Independent errors of least squares with a ridge, (M, P): their outer products sum up to the error's covariance.
 
@@ -110,11 +115,11 @@ def _together(errors: Tensor) -> Tensor:
 
 
 def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:
-    """One standard deviation of each base row's floor and each torque sensor, as generalized forces (nv, B, nv)."""
-    n, base = len(builder.columns.joint_rows), builder.tree.base_rows
-    std = np.append(noise.base[:base], noise.dofs(builder.tree.n, n))
+    """Forces (n_rows, B, n_rows) of one standard deviation of each base row's floor and each torque sensor."""
+    n, base = builder.tree.n_dofs, builder.tree.base_rows
+    std = np.append(noise.base_std[:base], noise.dof_std(builder.tree.n, n))
     rows = torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
-    axes = builder.noise_axes(samples.rotation_world_base) if noise.by_axis else None
+    axes = builder.noise_axes(samples.rotation_world_base) if noise.base_axes_differ else None
     if axes is None:
         return rows
     force, moment, rest = rows.split([3, 3, len(std) - 6], dim=2)
@@ -123,10 +128,10 @@ def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Ten
 
 
 def _wrench_noise(builder: RowBuilder, samples: Samples, state: State, noise: SensorNoise) -> Tensor:
-    """Generalized forces that one standard deviation of each contact sensor makes, (6 C, B, nv)."""
+    """Generalized forces that one standard deviation of each contact sensor makes, (6 C, B, n_rows)."""
     std = samples.time.new_zeros(len(builder.contacts), 6)
     for contact, active in enumerate(state):
         if active:
             possible = list(builder.contacts[contact].components)
-            std[contact, possible] = std.new_tensor(noise.wrench[possible])
+            std[contact, possible] = std.new_tensor(noise.wrench_std[possible])
     return (builder.contact_jacobian(samples) * std[..., None]).flatten(1, 2).transpose(0, 1)

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import by_state, one_thread, spread_by_state
-from torchid.problem.compression import unloaded_channels
+from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
+from torchid.problem.compression import unloaded_offset_equations
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
+from torchid.rounding import KINEMATIC_TOLERANCE
 
 DEPENDENT = 1e-9
 """A direction that moves the whitened rows by less than this share of its size does so by rounding."""
@@ -80,7 +81,7 @@ class SensorInformation:
 @one_thread()
 @torch.no_grad()
 def sensor_information(
-    logs: Sequence[Samples], builder: RowBuilder, most: int = SAMPLES, done: Callable[[int], None] | None = None
+    logs: Sequence[Samples], builder: RowBuilder, most: int = SAMPLES, done: ProgressCallback | None = None
 ) -> SensorInformation:
     """Information of some logs in the builder's columns, and the part of it due to each sensor.
 
@@ -99,7 +100,7 @@ def sensor_information(
     components = measured_components(builder.contacts, builder.sensors)
     contacts = np.flatnonzero(components.any(axis=1)).tolist()
     count, first = builder.width, 1 + len(joints) + len(limbs)
-    units = torch.eye(base + len(builder.columns.joint_rows), dtype=torch.float64, device=builder.device)
+    units = torch.eye(builder.tree.n_rows, dtype=torch.float64, device=builder.device)
     torques = units[[base + joint for joint in joints]]
     total = torch.zeros(first + len(contacts), count, count, dtype=torch.float64, device=builder.device)
     for samples, state, represented in _spread(logs, most):
@@ -152,7 +153,7 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
     `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
     `prior`, (12 L,), 0 where they are known, and extras with that of their size.
     """
-    rigid = triangular_factor((builder.columns.from_parameters() * prior).T).T
+    rigid = triangular_factor((builder.columns.parameter_map() * prior).T).T
     return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
 
 
@@ -162,16 +163,16 @@ def marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array
     Args:
         H: (N, N), X^T X.
         unknown: places of M columns.
-        size: (M,), squared norms of these; what is below the share `DEPENDENT` of them is rounding.
+        size: (M,), squared norms of these; what is below the share `KINEMATIC_TOLERANCE` of them is rounding.
     """
     if not unknown:
         return H
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
     crossed = np.delete(H[list(unknown)], unknown, axis=1) * scale[:, None]
     values, V = np.linalg.eigh(H[np.ix_(unknown, unknown)] * scale * scale[:, None])
-    along = V[:, values > DEPENDENT].T @ crossed
+    along = V[:, values > KINEMATIC_TOLERANCE].T @ crossed
     rest = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
-    return np.asarray(rest - along.T @ (along / values[values > DEPENDENT, None]))
+    return np.asarray(rest - along.T @ (along / values[values > KINEMATIC_TOLERANCE, None]))
 
 
 def rows_information(rows: Tensor, weight: float) -> Tensor:
@@ -187,12 +188,12 @@ def reading_directions(ways: Tensor, W: Tensor) -> Tensor:
     rows `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
 
     Args:
-        ways: (B, c, nv) or (c, nv).
-        W: (B, nv, nv), from `RowBuilder.rows_by_sample`.
+        ways: (B, c, n_rows) or (c, n_rows).
+        W: (B, n_rows, n_rows), from `RowBuilder.rows_by_sample`.
     """
     readings = ways @ W
     size = torch.linalg.vector_norm(readings, dim=-1, keepdim=True)
-    least = DEPENDENT * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
+    least = KINEMATIC_TOLERANCE * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
     return torch.where(size > least, readings / size, 0.0)
 
 
@@ -203,7 +204,7 @@ def triangular_factor(X: Array) -> Array:
 
 def _air_information(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
     """Contacts, and the information (count, count) that their readings in the air hold on offsets."""
-    for channel in unloaded_channels(builder, samples):
+    for channel in unloaded_offset_equations(builder, samples):
         if not channel.gated and (place := builder.extras[channel.offset].contact):
             columns, row = channel.row(builder)
             wide = row.new_zeros(count)
@@ -213,14 +214,14 @@ def _air_information(builder: RowBuilder, samples: Samples, count: int) -> Itera
 
 def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State, float]]:
     """Chunks of about `most` samples, evenly spread over contact states and logs, and how many each represents."""
-    states = {state for samples in logs for state, _ in by_state(samples)}
-    for samples, state, represented in spread_by_state(logs, max(most // max(len(states), 1), 1)):
+    states = {state for samples in logs for state, _ in chunks_by_state(samples)}
+    for samples, state, represented in subsample_states(logs, max(most // max(len(states), 1), 1)):
         for start in range(0, len(samples), _CHUNK):
             yield samples[start : start + _CHUNK], state, represented
 
 
 def _span(C: Tensor, W: Tensor) -> Tensor:
-    """Orthonormal rows, (B, c, nv), that span those of `C W`, zeros for dependent ones."""
+    """Orthonormal rows, (B, c, n_rows), that span those of `C W`, zeros for dependent ones."""
     _, values, Vh = torch.linalg.svd(C @ W, full_matrices=False)
-    least = DEPENDENT * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
+    least = KINEMATIC_TOLERANCE * torch.linalg.matrix_norm(C) * torch.linalg.matrix_norm(W)
     return Vh * (values > least[:, None])[..., None]

@@ -15,11 +15,11 @@ from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import State
 from torchid.regressor import FrameJacobian, motion_from_state
-from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross, joint_states
+from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross_product, joint_motion
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
+from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact, SensorSet
-from torchid.sensing.projection import RANK_TOLERANCE
 
 _ANGLE, _STROKE = 1.5, 0.3  # [rad], [m] either way
 _SAMPLES_PER_COLUMN = 2  # in every state: a sample gives one row or more, and some directions are rarely excited
@@ -92,8 +92,8 @@ def standing_samples(
         joint_position=q[:, q.shape[1] - robot.n :],
         joint_velocity=v[:, rows:],
         joint_acceleration=a[:, rows:],
-        base=BaseMotion.of(q, v, a, robot.fixed_base),
-        torque=q.new_zeros(count, robot.dofs),
+        base=BaseMotion.from_coordinates(q, v, a, robot.fixed_base),
+        torque=q.new_zeros(count, robot.n_dofs),
         wrench=q.new_zeros(count, len(contacts), 6),
         wrench_in_world=False,
         active=torch.tensor(state, dtype=torch.bool).expand(count, len(contacts)),
@@ -118,11 +118,11 @@ def standing_states(
     if not held:
         return q[:count], v[:count], a[:count]
     values = torch.linalg.svdvals(J)
-    regular = values > RANK_TOLERANCE * values[:, :1]
+    regular = values > KINEMATIC_TOLERANCE * values[:, :1]
     smallest = torch.where(regular, values, torch.inf).amin(1) / values[:, 0]
     best = torch.argsort(smallest, descending=True)[:count]
     q, v, a, J = q[best], v[best], a[best], J[best]
-    inverse = torch.linalg.pinv(J, rtol=RANK_TOLERANCE)
+    inverse = torch.linalg.pinv(J, rtol=KINEMATIC_TOLERANCE)
     v = _in_null_space(v, inverse, J)
     v = torch.where(v.abs() < _AT_REST, 0.0, v)
     drift = _drift(robot, held, q, v)
@@ -173,7 +173,7 @@ def _drift(robot: Robot, held: Sequence[Contact], q: Tensor, v: Tensor) -> Tenso
     """dJ_C/dt v, (B, k): what the held components would accelerate by with a = 0, in the contacts' own axes."""
     tree = KinematicTree(robot)
     motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
-    states = body_states(tree, motion, joint_states(tree, motion))
+    states = body_states(tree, motion, joint_motion(tree, motion))
     rows = []
     for contact in held:
         node, T_joint_frame = tree.frame(robot, contact.frame)
@@ -186,6 +186,8 @@ def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor) -> Tenso
     rotation = states.rotation[:, :, body]
     arm = (rotation * T_joint_frame[:3, 3, None]).sum(1)
     omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
-    linear = states.specific_force[:, body] + cross(alpha, arm) + cross(omega, cross(omega, arm))
+    linear = (
+        states.specific_force[:, body] + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
+    )
     in_joint_frame = (rotation[:, :, None] * torch.stack([linear, alpha], dim=1)[:, None]).sum(0)
     return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))

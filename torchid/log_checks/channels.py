@@ -1,4 +1,4 @@
-"""A log as groups of channels that one sensor, or one sort of sensor, gives, and what is usual beside a sample."""
+"""A log as groups of channels that one sensor, or one sort of sensor, gives."""
 
 from __future__ import annotations
 
@@ -9,49 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray, labels_of
-from torchid.parameters import COMPONENTS
-
-#: Standard deviations of a normal distribution in one median absolute deviation.
-NORMAL = 1.4826
-
-
-def beside(series: FloatArray, at: NDArray[np.intp], direction: int, count: int) -> FloatArray:
-    """The `count` items before (-1) or after (1) some places of a series (M, ...), nearest first, (P, count, ...).
-
-    NaN beyond the ends.
-    """
-    index = at[:, None] + direction * np.arange(1, count + 1)
-    inside = (index >= 0) & (index < len(series))
-    found = series[np.clip(index, 0, len(series) - 1)]
-    found[~inside] = np.nan
-    return found
-
-
-def median_known(values: FloatArray) -> FloatArray:
-    """Median along the second axis of (P, k, ...) over what is not NaN, the upper of two; 0 where nothing is."""
-    ordered = np.sort(values, axis=1)  # NaN last
-    count = np.sum(~np.isnan(ordered), axis=1, keepdims=True)
-    middle = np.take_along_axis(ordered, np.minimum(count // 2, values.shape[1] - 1), axis=1)[:, 0]
-    return np.where(count[:, 0] > 0, middle, 0.0)
-
-
-def block_spread(differences: FloatArray, block: int) -> FloatArray:
-    """Standard deviation (M,) of a normal distribution with the median size of its block of `differences` (M,)."""
-    block = min(block, len(differences))
-    whole = len(differences) // block
-    blocks = np.abs(differences[: whole * block]).reshape(whole, block)
-    medians = NORMAL * np.partition(blocks, block // 2, axis=1)[:, block // 2]
-    rest = len(differences) - whole * block
-    return np.append(np.repeat(medians, block), np.full(rest, medians[-1]))
-
-
-def near(where: BoolArray, distance: int) -> BoolArray:
-    """Which samples are within a distance of one in the mask (N,)."""
-    padded = np.concatenate([np.zeros(distance + 1, np.intp), np.cumsum(where)])
-    padded = np.concatenate([padded, np.full(distance, padded[-1])])
-    return np.asarray(padded[2 * distance + 1 :] > padded[: -2 * distance - 1])
-
+from torchid.logs.log import WRENCHES, BoolArray, FloatArray, column_labels
+from torchid.parameters import WRENCH_COMPONENTS
 
 #: Steps longer than this, in median steps, lack a sample.
 LONG_STEP = 1.5
@@ -81,7 +40,7 @@ def median_step(log: Log) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class ChannelGroup:
     """Channels of one field, of all joints, of the base, or of one contact, where they were measured.
 
     Attributes:
@@ -116,22 +75,22 @@ class Group:
 
 def channel_names(log: Log, field: str) -> tuple[str, ...]:
     """Names of a field's channels, in the order in which its array is flattened."""
-    labels = labels_of(field, log.names)
+    labels = column_labels(field, log.names)
     array = log.arrays()[field]
     if array.ndim == 3:
-        return tuple(f"{label} {component}" for label in labels for component in COMPONENTS)
+        return tuple(f"{label} {component}" for label in labels for component in WRENCH_COMPONENTS)
     return labels or tuple(AXES[: array.shape[1]] if array.ndim == 2 else ("",))
 
 
-def unit(field: str, name: str) -> str:
+def channel_unit(field: str, name: str) -> str:
     """Unit of a channel, "" for a number without one."""
     component = name.rpartition(" ")[2]
-    if field in UNITS or component not in COMPONENTS:
+    if field in UNITS or component not in WRENCH_COMPONENTS:
         return UNITS.get(field, "")
     return "N" if component.startswith("f") else "N m"
 
 
-def groups(log: Log) -> Iterator[Group]:
+def channel_groups(log: Log) -> Iterator[ChannelGroup]:
     """All groups of a log that hold anything."""
     for field in log.arrays():
         if field in NO_SIGNALS:
@@ -141,7 +100,7 @@ def groups(log: Log) -> Iterator[Group]:
         if values.ndim == 2:
             yield from _group(log, field, "", names, values, np.ones(len(log), dtype=bool))
             continue
-        for index, label in enumerate(labels_of(field, log.names)):
+        for index, label in enumerate(column_labels(field, log.names)):
             measured = np.ones(len(log), dtype=bool)
             if field in WRENCHES and log.contact_active is not None:
                 measured = log.contact_active[:, index] & (values[:, index] != 0.0).any(axis=1)
@@ -150,7 +109,7 @@ def groups(log: Log) -> Iterator[Group]:
 
 def _group(
     log: Log, field: str, name: str, names: tuple[str, ...], values: FloatArray, measured: BoolArray
-) -> Iterator[Group]:
+) -> Iterator[ChannelGroup]:
     some = ~np.isnan(values[measured]).all(axis=0) if measured.any() else np.zeros(values.shape[1], dtype=bool)
     if not some.any():
         return
@@ -162,4 +121,4 @@ def _group(
     apart = (np.diff(samples) > 1) | (np.diff(elapsed) > LONG_STEP)
     kept = chosen if len(samples) == len(log) else chosen[samples]
     piece = np.append(0, np.cumsum(apart))
-    yield Group(field, name, tuple(np.array(names)[some].tolist()), samples, kept, elapsed, piece)
+    yield ChannelGroup(field, name, tuple(np.array(names)[some].tolist()), samples, kept, elapsed, piece)

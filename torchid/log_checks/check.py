@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,16 +12,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchid.errors import LogError, TorchidWarning
-from torchid.log_checks.channels import channel_names, groups, median_step
-from torchid.log_checks.contacts import limb_sensors, standing, touching, without_offsets
+from torchid.errors import LogError, warn
+from torchid.log_checks.channels import channel_groups, channel_names, median_step
+from torchid.log_checks.contacts import (
+    check_contact_flags,
+    check_limb_sensors,
+    check_standing_feet,
+    subtract_contact_offsets,
+)
 from torchid.log_checks.findings import CONDEMNED, SEVERITIES, Finding, Skipped
-from torchid.log_checks.forces import forces
-from torchid.log_checks.frozen import frozen
-from torchid.log_checks.motion import angles, derivatives, turning
-from torchid.log_checks.spikes import spikes
-from torchid.log_checks.stamps import absurd, missing, stamps
-from torchid.log_checks.weight import accelerometer, weight
+from torchid.log_checks.forces import check_forces_against_urdf
+from torchid.log_checks.frozen import check_repeats
+from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
+from torchid.log_checks.spikes import check_jumps
+from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
+from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
@@ -30,8 +34,137 @@ from torchid.problem import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
+#: Share of a log's samples that may be condemned before nothing worth a fit is left.
+MOST_CONDEMNED = 0.5
+_SPELLED_OUT = 3
 
-def condemned(findings: Iterable[Finding], samples: int) -> BoolArray:
+
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """A log with what was found in it.
+
+    Attributes:
+        log: as it was read.
+        repaired: with condemned values interpolated, so that a filter has nothing to smear.
+        findings: the gravest first.
+        skipped: checks that could not be made.
+    """
+
+    log: Log
+    repaired: Log
+    findings: tuple[Finding, ...]
+    skipped: tuple[Skipped, ...]
+
+    @cached_property
+    def condemned(self) -> BoolArray:
+        """Which samples (N,) must not be fitted."""
+        return condemned_samples(self.findings, len(self.log))
+
+    @property
+    def usable(self) -> bool:
+        """Whether enough of the log may be fitted."""
+        return not self.reasons
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the log cannot be used; empty if it can."""
+        whole = tuple(f"{f.field}: {f.name}" for f in self.findings if f.condemns_all)
+        share = float(self.condemned.mean()) if len(self.log) else 1.0
+        if not whole and share > MOST_CONDEMNED:
+            return (f"{100 * share:.3g} % of its samples are condemned",)
+        return tuple(dict.fromkeys(whole))
+
+    @property
+    def verdict(self) -> str:
+        """In one line."""
+        count = int(self.condemned.sum())
+        if self.reasons:
+            return f"not usable: {'; '.join(self.reasons)}"
+        return f"usable without {count} of {len(self.log)} samples" if count else "usable"
+
+
+def check(
+    log: Log, robot: Robot | None = None, contacts: Sequence[Contact] = (), cutoff_hz: float | None = None
+) -> Checked:
+    """Check a log as it was read.
+
+    Args:
+        log: as `read_log` gives it, if need be with gaps.
+        robot: the robot; without one, what needs its URDF is skipped.
+        contacts: of the robot.
+        cutoff_hz: of the filter that the log will go through; None for a usual one.
+    """
+    found: list[Finding | Skipped] = list(check_magnitudes(log))
+    if (lost := _lost(found)) is not None:
+        return _concluded(log, log, [*found, _unchecked(lost)])
+    found += check_time_stamps(log)
+    found += (gaps := list(check_missing_values(log)))
+    if (lost := _lost(gaps)) is not None:
+        return _concluded(log, log, [*found, _unchecked(lost)])
+    mended = repair_log(log, _findings(found))
+    found += check_repeats(channel_groups(mended))
+    mended = repair_log(log, _findings(found))
+    found += check_jumps(mended, channel_groups(mended))
+    mended = repair_log(log, _findings(found))
+    if units := list(check_angle_unit(mended, robot)):  # what a step of a position is worth is told in radians
+        found = [one for one in found if not (isinstance(one, Finding) and one.name == "step" and one.whole)]
+    found += [*units, *check_contact_flags(mended)]
+    mended = repair_log(log, _findings(found))
+    if (lost := _lost(found)) is None or lost.field != "time":
+        found += [
+            *check_derivatives(mended),
+            *check_angular_velocity(mended, robot),
+            *check_accelerometer(mended, robot),
+        ]
+    if _lost(found) is None:
+        found += check_standing_feet(mended, robot, contacts)
+    lost = _lost(found)
+    if lost is None:
+        found += check_forces_against_urdf(subtract_contact_offsets(mended), robot, contacts, cutoff_hz)
+        found += check_limb_sensors(mended, robot, contacts, cutoff_hz)
+        lost = _lost(found)
+    if lost is None or lost.name == "sign":
+        found += check_weight(subtract_contact_offsets(mended), robot)
+    else:
+        found.append(_unchecked(lost))
+    return _concluded(log, mended, found)
+
+
+def _concluded(log: Log, mended: Log, found: Sequence[Finding | Skipped]) -> Checked:
+    findings = sorted(_merged(_findings(found)), key=lambda finding: SEVERITIES.index(finding.severity))
+    return Checked(log, mended, tuple(findings), tuple(skip for skip in found if isinstance(skip, Skipped)))
+
+
+def _unchecked(lost: Finding) -> Skipped:
+    return Skipped("what relies on it", f"{lost.field} is condemned throughout: {lost.name}")
+
+
+def _findings(found: Iterable[Finding | Skipped]) -> Iterator[Finding]:
+    return (one for one in found if isinstance(one, Finding))
+
+
+def _merged(found: Iterable[Finding]) -> Iterator[Finding]:
+    """Findings of the same kind in one field as one."""
+    alike: dict[tuple[str, str, str, str], list[Finding]] = {}
+    for one in found:
+        alike.setdefault((one.name, one.severity, one.field, one.advice), []).append(one)
+    for same in alike.values():
+        texts = [one.found for one in same]
+        more = f"; and {len(texts) - _SPELLED_OUT} more" if len(texts) > _SPELLED_OUT else ""
+        yield replace(
+            same[0],
+            found="; ".join(texts[:_SPELLED_OUT]) + more,
+            channels=tuple(dict.fromkeys(channel for one in same for channel in one.channels)),
+            spans=tuple(span for one in same for span in one.spans),
+        )
+
+
+def _lost(found: Iterable[Finding | Skipped]) -> Finding | None:
+    """A finding that condemns the whole log, after which nothing can be told from what relies on the field."""
+    return next((one for one in _findings(found) if one.condemns_all), None)
+
+
+def condemned_samples(findings: Iterable[Finding], samples: int) -> BoolArray:
     """Which of so many samples some finding condemns, (N,)."""
     mask = np.zeros(samples, bool)
     for finding in findings:
@@ -40,7 +173,7 @@ def condemned(findings: Iterable[Finding], samples: int) -> BoolArray:
     return mask
 
 
-def repaired(log: Log, findings: Iterable[Finding]) -> Log:
+def repair_log(log: Log, findings: Iterable[Finding]) -> Log:
     """The log with condemned values interpolated, and with jumps taken out that are no motion.
 
     Only the channels that a finding names are touched: the samples are to be left out, but a filter sees them. A flag
@@ -91,136 +224,10 @@ def _interpolate(time: FloatArray, flat: FloatArray, bad: BoolArray) -> None:
             flat[here, column] = np.interp(time[here], time[good], flat[good, column])
 
 
-#: Share of a log's samples that may be condemned before nothing worth a fit is left.
-MOST_CONDEMNED = 0.5
-_SPELLED_OUT = 3
-
-
-@dataclass(frozen=True, eq=False)
-class Checked:
-    """A log with what was found in it.
-
-    Attributes:
-        log: as it was read.
-        repaired: with condemned values interpolated, so that a filter has nothing to smear.
-        findings: the gravest first.
-        skipped: checks that could not be made.
-    """
-
-    log: Log
-    repaired: Log
-    findings: tuple[Finding, ...]
-    skipped: tuple[Skipped, ...]
-
-    @cached_property
-    def condemned(self) -> BoolArray:
-        """Which samples (N,) must not be fitted."""
-        return condemned(self.findings, len(self.log))
-
-    @property
-    def usable(self) -> bool:
-        """Whether enough of the log may be fitted."""
-        return not self.reasons
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why the log cannot be used; empty if it can."""
-        whole = tuple(f"{f.field}: {f.name}" for f in self.findings if f.condemns_all)
-        share = float(self.condemned.mean()) if len(self.log) else 1.0
-        if not whole and share > MOST_CONDEMNED:
-            return (f"{100 * share:.3g} % of its samples are condemned",)
-        return tuple(dict.fromkeys(whole))
-
-    @property
-    def verdict(self) -> str:
-        """In one line."""
-        count = int(self.condemned.sum())
-        if self.reasons:
-            return f"not usable: {'; '.join(self.reasons)}"
-        return f"usable without {count} of {len(self.log)} samples" if count else "usable"
-
-
-def check(
-    log: Log, robot: Robot | None = None, contacts: Sequence[Contact] = (), cutoff_hz: float | None = None
-) -> Checked:
-    """Check a log as it was read.
-
-    Args:
-        log: as `read_log` gives it, if need be with gaps.
-        robot: the robot; without one, what needs its URDF is skipped.
-        contacts: of the robot.
-        cutoff_hz: of the filter that the log will go through; None for a usual one.
-    """
-    found: list[Finding | Skipped] = list(absurd(log))
-    if (lost := _lost(found)) is not None:
-        return _concluded(log, log, [*found, _unchecked(lost)])
-    found += stamps(log)
-    found += (gaps := list(missing(log)))
-    if (lost := _lost(gaps)) is not None:
-        return _concluded(log, log, [*found, _unchecked(lost)])
-    mended = repaired(log, _findings(found))
-    found += frozen(groups(mended))
-    mended = repaired(log, _findings(found))
-    found += spikes(mended, groups(mended))
-    mended = repaired(log, _findings(found))
-    if units := list(angles(mended, robot)):  # what a step of a position is worth is told in radians
-        found = [one for one in found if not (isinstance(one, Finding) and one.name == "step" and one.whole)]
-    found += [*units, *touching(mended)]
-    mended = repaired(log, _findings(found))
-    if (lost := _lost(found)) is None or lost.field != "time":
-        found += [*derivatives(mended), *turning(mended, robot), *accelerometer(mended, robot)]
-    if _lost(found) is None:
-        found += standing(mended, robot, contacts)
-    lost = _lost(found)
-    if lost is None:
-        found += forces(without_offsets(mended), robot, contacts, cutoff_hz)
-        found += limb_sensors(mended, robot, contacts, cutoff_hz)
-        lost = _lost(found)
-    if lost is None or lost.name == "sign":
-        found += weight(without_offsets(mended), robot)
-    else:
-        found.append(_unchecked(lost))
-    return _concluded(log, mended, found)
-
-
-def _concluded(log: Log, mended: Log, found: Sequence[Finding | Skipped]) -> Checked:
-    findings = sorted(_merged(_findings(found)), key=lambda finding: SEVERITIES.index(finding.severity))
-    return Checked(log, mended, tuple(findings), tuple(skip for skip in found if isinstance(skip, Skipped)))
-
-
-def _unchecked(lost: Finding) -> Skipped:
-    return Skipped("what relies on it", f"{lost.field} is condemned throughout: {lost.name}")
-
-
-def _findings(found: Iterable[Finding | Skipped]) -> Iterator[Finding]:
-    return (one for one in found if isinstance(one, Finding))
-
-
-def _merged(found: Iterable[Finding]) -> Iterator[Finding]:
-    """Findings of the same kind in one field as one."""
-    alike: dict[tuple[str, str, str, str], list[Finding]] = {}
-    for one in found:
-        alike.setdefault((one.name, one.severity, one.field, one.advice), []).append(one)
-    for same in alike.values():
-        texts = [one.found for one in same]
-        more = f"; and {len(texts) - _SPELLED_OUT} more" if len(texts) > _SPELLED_OUT else ""
-        yield replace(
-            same[0],
-            found="; ".join(texts[:_SPELLED_OUT]) + more,
-            channels=tuple(dict.fromkeys(channel for one in same for channel in one.channels)),
-            spans=tuple(span for one in same for span in one.spans),
-        )
-
-
-def _lost(found: Iterable[Finding | Skipped]) -> Finding | None:
-    """A finding that condemns the whole log, after which nothing can be told from what relies on the field."""
-    return next((one for one in _findings(found) if one.condemns_all), None)
-
-
 _NAMED = 4
 
 
-def excluded(checked: Checked, time: FloatArray, cutoff_hz: float | None, derived: bool) -> BoolArray:
+def excluded_stamps(checked: Checked, time: FloatArray, cutoff_hz: float | None, derived: bool) -> BoolArray:
     """Which stamps (K,) [s] of a preprocessed log condemned samples reach.
 
     Args:
@@ -239,8 +246,8 @@ def excluded(checked: Checked, time: FloatArray, cutoff_hz: float | None, derive
     return np.asarray((time - padded[nearest] <= margin) | (padded[nearest + 1] - time <= margin))
 
 
-def without_condemned(samples: Samples, checked: Checked, cutoff_hz: float | None, derived: bool) -> Samples:
-    """The samples that condemned ones do not reach; see `excluded`.
+def drop_condemned(samples: Samples, checked: Checked, cutoff_hz: float | None, derived: bool) -> Samples:
+    """The samples that condemned ones do not reach; see `excluded_stamps`.
 
     Raises:
         LogError: the log is not usable, or nothing is left.
@@ -252,14 +259,14 @@ def without_condemned(samples: Samples, checked: Checked, cutoff_hz: float | Non
     if not checked.usable:
         accepted = "a log that torchid check finds usable, or preprocessing.exclude_condemned: false"
         raise LogError(source, "preprocessing.exclude_condemned", checked.verdict, accepted)
-    gone = excluded(checked, samples.time.cpu().numpy(), cutoff_hz, derived)
+    gone = excluded_stamps(checked, samples.time.cpu().numpy(), cutoff_hz, derived)
     if not gone.any():
         return samples
     reasons = _reasons(checked)
     if gone.all():
         raise LogError(source, "preprocessing.exclude_condemned", f"no sample left: {reasons}", "a longer log")
     message = f"{Path(source).name}: {gone.sum()} of {len(samples)} samples excluded: {reasons}"
-    warnings.warn(message, TorchidWarning, stacklevel=3)
+    warn(message)
     return samples[torch.from_numpy(np.flatnonzero(~gone))]
 
 

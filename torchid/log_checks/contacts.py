@@ -7,22 +7,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from torchid.errors import InputError
-from torchid.log_checks.channels import NORMAL, median_step
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, Span, spans_of
-from torchid.log_checks.mistakes import Mistake, mistakes
-from torchid.log_checks.model import COMPARED, bound, filtered, usual_cutoff
+from torchid.log_checks.channels import median_step
+from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, Span, find_spans
+from torchid.log_checks.mistakes import Mistake, possible_mistakes
+from torchid.log_checks.model import COMPARED, bind_some_samples, default_cutoff_hz, link_poses, preprocess_pieces
+from torchid.log_checks.statistics import NORMAL
 from torchid.log_checks.weight import GRAVITY, WRONG
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray
-from torchid.logs.quaternion import rotate
+from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.quaternion import rotate_to_world
 from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
-from torchid.text import counted
+from torchid.text import count_of
 
 #: Share of the weight that an inactive contact must not carry. Thresholds of flags are 20 to 50 N, for 60 kg 3 to 8 %.
 LOADED = 0.1
@@ -47,7 +47,7 @@ class _Contact:
     force: FloatArray  # (N, 3) [N], NaN where it was not read
 
 
-def touching(log: Log) -> Iterator[Finding | Skipped]:
+def check_contact_flags(log: Log) -> Iterator[Finding | Skipped]:
     """Findings about contacts, by what they carry together: forces may be in any unit."""
     if not log.contact_names:
         return
@@ -75,7 +75,7 @@ def touching(log: Log) -> Iterator[Finding | Skipped]:
 
 def _contacts(log: Log) -> Iterator[_Contact]:
     """Those whose force can be judged: NaN stands for no reading, which a contact may lack while it is in the air."""
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     if wrench is None or log.contact_active is None:
         return
     for index, name in enumerate(log.contact_names):
@@ -92,10 +92,10 @@ def _largest_load(contacts: list[_Contact]) -> float:
     return float(np.percentile(total, 90.0))
 
 
-def without_offsets(log: Log) -> Log:
+def subtract_contact_offsets(log: Log) -> Log:
     """The log with what contact sensors read steadily in the air taken off."""
     offsets = {contact.name: _offset(contact) for contact in _contacts(log)}
-    field = WRENCHES[0] if log.contact_wrench_world is None else WRENCHES[1]
+    field = log.contact_wrench_field
     if not any(np.any(offset) for offset in offsets.values()):
         return log
     wrench = getattr(log, field).copy()
@@ -119,16 +119,16 @@ def _contradictions(log: Log, contact: _Contact, size: FloatArray, weight: float
     """Forces without a contact, and contacts without a force."""
     loaded = ~contact.active & (size > LOADED * weight)
     if loaded.any():
-        samples = counted(int(loaded.sum()), "sample")
+        samples = count_of(int(loaded.sum()), "sample")
         text = f"{contact.name}: inactive with up to {size[loaded].max():.3g} N, in {samples}"
         advice = "set the flag where there is a force: what an inactive contact exerts is not counted"
-        spans = tuple(spans_of(loaded, contact.name))
+        spans = tuple(find_spans(loaded, contact.name))
         yield Finding("force without contact", CONDEMNED, "contact_active", text, advice, (contact.name,), spans)
     patience = max(1, round(_PATIENCE / median_step(log)))
     light = contact.active & (size < UNLOADED * weight)
-    spans = tuple(span for span in spans_of(light, contact.name) if len(span) > patience)
+    spans = tuple(span for span in find_spans(light, contact.name) if len(span) > patience)
     if spans:
-        samples = counted(sum(len(span) for span in spans), "sample")
+        samples = count_of(sum(len(span) for span in spans), "sample")
         never = " though the flag never changes" if contact.active.all() else ""
         text = f"{contact.name}: active without a force (below {UNLOADED * weight:.2g} N) in {samples}{never}"
         advice = "costs data, not truth; clear the flag where the foot is in the air"
@@ -176,19 +176,19 @@ _FIELDS = ("joint_names", "joint_position", "base_quat_xyzw", "contact_names", "
 _STANDING = "feet that stand"
 
 
-def standing(log: Log, robot: Robot | None, contacts: Sequence[Contact]) -> Iterator[Finding | Skipped]:
+def check_standing_feet(log: Log, robot: Robot | None, contacts: Sequence[Contact]) -> Iterator[Finding | Skipped]:
     """Findings about what moves feet whose flag says that they stand."""
     if robot is None or not contacts or robot.fixed_base:
         return
     log = _thinned(log)
-    moves = slip(log, robot, contacts)
+    moves = measure_foot_slip(log, robot, contacts)
     if moves is None:
         yield Skipped(_STANDING, "no orientation of the base, or no stance above which the base moves")
         return
     if moves < MOVES:
         return
     best, least = None, BETTER * moves
-    for mistake in mistakes(log):
+    for mistake in possible_mistakes(log):
         if mistake.field in _FIELDS and (found := _after(mistake, log, robot, contacts)) is not None and found < least:
             best, least = mistake, found
     if best is not None:
@@ -199,7 +199,7 @@ def standing(log: Log, robot: Robot | None, contacts: Sequence[Contact]) -> Iter
 
 
 def _after(mistake: Mistake, log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
-    return slip(mistake.mended(log), robot, contacts)
+    return measure_foot_slip(mistake.mended(log), robot, contacts)
 
 
 def _thinned(log: Log) -> Log:
@@ -208,7 +208,7 @@ def _thinned(log: Log) -> Log:
     return log.select(slice(None, None, every))
 
 
-def slip(log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
+def measure_foot_slip(log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
     """How much standing feet move in the world, in how much they move in the base; None where nothing can be told.
 
     Feet that are flat must not turn, feet that stand together keep what lies between them, and where the base's
@@ -217,8 +217,7 @@ def slip(log: Log, robot: Robot, contacts: Sequence[Contact]) -> float | None:
     feet = [c for c in contacts if c.frame in log.contact_names and c.frame in robot.links]
     if log.base_quat_xyzw is None or log.contact_active is None or set(log.joint_names) != set(robot.joint_names):
         return None
-    order = [log.joint_names.index(name) for name in robot.joint_names]
-    poses = robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+    poses = link_poses(log, robot)
     active = {c.frame: log.contact_active[:, log.contact_names.index(c.frame)] for c in feet}
     moved: list[tuple[float, float, int]] = []
     for i, foot in enumerate(feet):
@@ -245,11 +244,11 @@ def _motion(
     ends, shortest = round(_ENDS / step), max(4, round(_SHORTEST / step))
     quat = log.base_quat_xyzw
     out = []
-    for span in spans_of(active) if quat is not None else ():
+    for span in find_spans(active) if quat is not None else ():
         here = slice(span.first + ends, span.last + 1 - ends)
         if quat is None or here.stop - here.start < shortest:
             continue
-        world = rotate(quat[here], vector[here]) + (0.0 if origin is None else origin[here])
+        world = rotate_to_world(quat[here], vector[here]) + (0.0 if origin is None else origin[here])
         seen, known = (np.square((x - x.mean(axis=0)) / unit).sum() for x in (world, vector[here]))
         out.append((float(seen), float(known), here.stop - here.start))
     return out
@@ -262,15 +261,17 @@ _CLEAR = 0.9
 _LIMB_SENSORS = "limb sensors in the air"
 
 
-def limb_sensors(
+def check_limb_sensors(
     log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None
 ) -> Iterator[Finding | Skipped]:
-    """Findings about the forces that limb sensors read in the air; `cutoff_hz` as in `forces`."""
+    """Findings about the forces that limb sensors read in the air; `cutoff_hz` as in `check_forces_against_urdf`."""
     if robot is None or log.ft_wrench is None:
         return
     try:
-        parts = bound(filtered(log, cutoff_hz or usual_cutoff(log)), robot, contacts, 4 * COMPARED)
-    except InputError:  # said by `forces`
+        parts = bind_some_samples(
+            preprocess_pieces(log, cutoff_hz or default_cutoff_hz(log)), robot, contacts, 4 * COMPARED
+        )
+    except InputError:  # said by `check_forces_against_urdf`
         return
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names)))
     series = [force_series(builder, part, robot.nominal.flatten()[None]) for part in parts]

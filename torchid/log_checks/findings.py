@@ -89,7 +89,7 @@ class Skipped:
     reason: str
 
 
-def spans_of(where: BoolArray | NDArray[np.intp], channel: str = "") -> Iterator[Span]:
+def find_spans(where: BoolArray | NDArray[np.intp], channel: str = "") -> Iterator[Span]:
     """Runs of successive samples in a mask (N,) or in ascending sample numbers (M,)."""
     numbers = np.flatnonzero(where) if where.dtype == np.bool_ else where
     for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1):

@@ -8,24 +8,24 @@ import numpy as np
 
 from torchid.errors import InputError
 from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped
-from torchid.log_checks.mistakes import mistakes
+from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
     DIFFERENTIATED_TO_TRY,
     TRIED,
     ModelFit,
     TorqueFit,
-    bound,
-    filtered,
-    model_fit,
-    usual_cutoff,
+    bind_some_samples,
+    default_cutoff_hz,
+    fit_nominal_model,
+    preprocess_pieces,
 )
-from torchid.log_checks.scales import Gains, Stretch, gains, motion_cutoff, stretch
+from torchid.log_checks.scales import TimeScale, TorqueGains, fit_time_scale, fit_torque_gains, motion_cutoff_hz
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.problem import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact
-from torchid.text import listed
+from torchid.text import join_names
 
 #: Factor of time from which on no error of inertias is to blame: its square is 2.25. Blocks must agree on `SAME` of it.
 STRETCHED = 1.5
@@ -45,16 +45,16 @@ SAME = 0.5
 _KNOWN, _ENOUGH = 0.1, 3
 
 
-def time_fit(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Stretch | None:
+def fit_time_scale_of_log(log: Log, robot: Robot, contacts: Sequence[Contact]) -> TimeScale | None:
     """What time is worth by the forces; None where nothing moves, or the log is too short."""
-    cutoff = motion_cutoff(log)
+    cutoff = motion_cutoff_hz(log)
     try:
-        return None if cutoff is None else stretch(log, robot, contacts, cutoff)
+        return None if cutoff is None else fit_time_scale(log, robot, contacts, cutoff)
     except InputError:
         return None
 
 
-def time_finding(found: Stretch | None) -> Finding | None:
+def time_scale_finding(found: TimeScale | None) -> Finding | None:
     """That time is in another unit, if gravity and inertia only make up the forces in that unit.
 
     Noise in positions makes accelerations that no force answers to, which looks like time that is too short: so inertia
@@ -74,25 +74,25 @@ def time_finding(found: Stretch | None) -> Finding | None:
     return Finding("unit", CONDEMNED, "time", text, advice)
 
 
-def factor_findings(
+def gain_and_point_findings(
     log: Log, samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]
 ) -> Iterator[Finding]:
     """Findings about torques of another size and wrenches about another point."""
-    found = gains(samples, robot, contacts)
+    found = fit_torque_gains(samples, robot, contacts)
     if found is None:
         return
     yield from _gain_findings(found, robot)
     m = len(found.joints)
     off = _sure(found.point, found.spread[m:], found.blocks[:, m:]) & (np.abs(found.point) > POINT)
     if off.any():
-        field = WRENCHES[0] if log.contact_wrench_world is None else WRENCHES[1]
+        field = log.contact_wrench_field
         where = ", ".join(f"{1e3 * x:.0f}" for x in found.point)
         text = f"forces and moments fit the URDF about a point that lies {where} mm from the contact frames' origins"
         advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
         yield Finding("point", SUSPICIOUS, field, text, advice)
 
 
-def _gain_findings(found: Gains, robot: Robot) -> Iterator[Finding]:
+def _gain_findings(found: TorqueGains, robot: Robot) -> Iterator[Finding]:
     m = len(found.joints)
     spread = found.spread[:m]
     known = spread < _KNOWN
@@ -102,8 +102,8 @@ def _gain_findings(found: Gains, robot: Robot) -> Iterator[Finding]:
     off = large & _sure(relative - 1.0, spread / usual, blocks - 1.0)
     if off.any():
         names = [robot.joint_names[joint] for joint in found.joints[off]]
-        factors = listed([f"{gain:.3g} +- {sd:.2g}" for gain, sd in zip(relative[off], spread[off], strict=True)])
-        text = f"{listed(names)}: factors that fit the URDF best, against the other joints: {factors}"
+        factors = join_names([f"{gain:.3g} +- {sd:.2g}" for gain, sd in zip(relative[off], spread[off], strict=True)])
+        text = f"{join_names(names)}: factors that fit the URDF best, against the other joints: {factors}"
         advice = "look at gear ratios, torque constants and units; at friction and inertias of the URDF there"
         yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(names))
 
@@ -127,31 +127,33 @@ _UNIT_WITHIN = 3.0
 _NAME = "forces against the URDF"
 
 
-def forces(
+def check_forces_against_urdf(
     log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None
 ) -> Iterator[Finding | Skipped]:
     """Findings about joint torques and contact wrenches; `cutoff_hz` is that of the fit, None for a usual one."""
     if robot is None:
         yield Skipped(_NAME, "no robot (--urdf)")
         return
-    cutoff = cutoff_hz or usual_cutoff(log)
+    cutoff = cutoff_hz or default_cutoff_hz(log)
     try:
-        logs = filtered(log, cutoff)
+        logs = preprocess_pieces(log, cutoff)
     except InputError as error:  # too short, or too fast: by its stamps
-        yield time_finding(time_fit(log, robot, contacts)) or Skipped(_NAME, f"{error.field}: {error.found}")
+        yield time_scale_finding(fit_time_scale_of_log(log, robot, contacts)) or Skipped(
+            _NAME, f"{error.field}: {error.found}"
+        )
         return
     try:
-        samples = bound(logs, robot, contacts)
+        samples = bind_some_samples(logs, robot, contacts)
     except InputError as error:
         yield Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}")
         return
-    if log.joint_torque is None and log.contact_wrench_local is None and log.contact_wrench_world is None:
+    if log.joint_torque is None and log.contact_wrench is None:
         yield Skipped(_NAME, "neither joint torques nor contact wrenches")
         return
-    fit = model_fit(samples, robot, contacts)
+    fit = fit_nominal_model(samples, robot, contacts)
     wrong = _explained(log, robot, contacts, cutoff, fit) if fit.misfit > WRONG else None
-    timed = time_fit(log, robot, contacts) if wrong is None else None
-    wrong = wrong or time_finding(timed)
+    timed = fit_time_scale_of_log(log, robot, contacts) if wrong is None else None
+    wrong = wrong or time_scale_finding(timed)
     if wrong is None and fit.misfit > WRONG and (timed is None or timed.recorded > NEAR):
         text = f"{_apart(fit)}, and no usual mistake explains it"
         advice = "look at units, frames, the order of joints and contacts, friction, the URDF's base link and masses"
@@ -162,20 +164,22 @@ def forces(
     signs = [] if fit.torque is None else list(_signs(log, robot, fit.torque))
     yield from signs
     if not any(isinstance(one, Finding) for one in signs):
-        yield from factor_findings(log, samples, robot, contacts)
+        yield from gain_and_point_findings(log, samples, robot, contacts)
 
 
 def _explained(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit) -> Finding | None:
     """The mistake that leaves the least misfit, if it leaves much less."""
     best, least = None, BETTER * min(fit.misfit, 1.0)
-    for mistake in mistakes(log):
+    for mistake in possible_mistakes(log):
         if not _may_explain(mistake.field, fit):
             continue
         try:
-            samples = bound(filtered(mistake.mended(log), cutoff, DIFFERENTIATED_TO_TRY), robot, contacts, TRIED)
+            samples = bind_some_samples(
+                preprocess_pieces(mistake.mended(log), cutoff, DIFFERENTIATED_TO_TRY), robot, contacts, TRIED
+            )
         except InputError:  # a mended log may be too fast for the filter: then that was not the mistake
             continue
-        found = model_fit(samples, robot, contacts)
+        found = fit_nominal_model(samples, robot, contacts)
         if found.known == fit.known and found.misfit < least:  # a mistake must not win by forces that it makes unknown
             best, least = mistake, found.misfit
     if best is None:
@@ -201,7 +205,7 @@ def _percent(share: float) -> str:
 
 
 def _gains(gains: FloatArray) -> str:
-    return listed([f"{gain:.3g}" for gain in gains])
+    return join_names([f"{gain:.3g}" for gain in gains])
 
 
 def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped]:
@@ -209,7 +213,7 @@ def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
     reversed_ = fit.wrong & (fit.gain < 0.0)
     if reversed_.any():
         chosen = [str(name) for name in names[reversed_]]
-        text = f"{listed(chosen)}: reversed; factors that fit the URDF best: {_gains(fit.gain[reversed_])}"
+        text = f"{join_names(chosen)}: reversed; factors that fit the URDF best: {_gains(fit.gain[reversed_])}"
         yield Finding("sign", CONDEMNED, "joint_torque", text, "reverse these torques", tuple(chosen))
     other_unit = np.zeros(len(names), bool)
     for factor, unit in UNITS.items():
@@ -217,14 +221,14 @@ def _signs(log: Log, robot: Robot, fit: TorqueFit) -> Iterator[Finding | Skipped
         if here.any():
             other_unit |= here
             chosen = [str(name) for name in names[here]]
-            text = f"{listed(chosen)}: {unit}; factors that fit the URDF best: {_gains(fit.gain[here])}"
+            text = f"{join_names(chosen)}: {unit}; factors that fit the URDF best: {_gains(fit.gain[here])}"
             yield Finding("unit", CONDEMNED, "joint_torque", text, f"multiply by {factor:g}", tuple(chosen))
     scaled = fit.wrong & ~reversed_ & ~other_unit
     if scaled.any():
         chosen = [str(name) for name in names[scaled]]
-        text = f"{listed(chosen)}: factors that fit the URDF best: {_gains(fit.gain[scaled])}"
+        text = f"{join_names(chosen)}: factors that fit the URDF best: {_gains(fit.gain[scaled])}"
         advice = "look at gear ratios, torque constants and units"
         yield Finding("scale", SUSPICIOUS, "joint_torque", text, advice, tuple(chosen))
     if not fit.clear.all():
-        open_ = listed([str(name) for name in names[~fit.clear]])
+        open_ = join_names([str(name) for name in names[~fit.clear]])
         yield Skipped("sign of torques", f"too little in this motion but friction and noise: {open_}")

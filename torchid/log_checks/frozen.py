@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.log_checks.channels import Group, beside, median_known
+from torchid.log_checks.channels import ChannelGroup
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
+from torchid.log_checks.statistics import finite_median, neighbours_of
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
-from torchid.text import counted, listed
+from torchid.text import count_of, join_names
 
 #: Decades below which a run of repeats is no chance: of a million samples none would repeat like that.
 CHANCE = -8.0
@@ -73,7 +74,7 @@ class Runs:
         return np.asarray(np.cumsum(edges[:-1]) > 0)
 
 
-def held_for(values: FloatArray, repeated: BoolArray) -> float:
+def mean_hold(values: FloatArray, repeated: BoolArray) -> float:
     """For how many samples values (M, c) are held on average whose steps (M - 1,) `repeated` all; 0 if they are not.
 
     Held values repeat at more or less regular times while the robot moves on: the change after a repeat is no single
@@ -85,7 +86,7 @@ def held_for(values: FloatArray, repeated: BoolArray) -> float:
     if len(changes) < NEIGHBOURS:
         return 0.0
     lengths = np.diff(changes)
-    quanta = np.array([resolution(column) for column in values.T])
+    quanta = np.array([estimate_resolution(column) for column in values.T])
     after = changes[1:][lengths > 1]
     sizes = np.abs(values[after + 1] - values[after])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -99,7 +100,7 @@ def held_for(values: FloatArray, repeated: BoolArray) -> float:
     return mean if lengths[lengths > _LONG * mean].sum() <= _RESTING * lengths.sum() else 0.0
 
 
-def resolution(values: FloatArray) -> float:
+def estimate_resolution(values: FloatArray) -> float:
     """Quantum of the grid that the steps of a channel (M,) lie on; 0 if they lie on none, inf if too few tell."""
     sizes = np.abs(np.diff(values))
     sizes = sizes[sizes > _SINGLE * np.abs(values).max()]
@@ -113,15 +114,18 @@ def resolution(values: FloatArray) -> float:
     return 0.0
 
 
-def implausible(values: FloatArray, repeated: BoolArray) -> Runs:
+def implausible_runs(values: FloatArray, repeated: BoolArray) -> Runs:
     """Runs of repeats (M - 1,) in values (M, c), all channels at once, that are neither chance nor rest."""
     runs = Runs.of(repeated)
     if not 0 < len(runs) <= _MOST_RUNS:
         return runs.where(np.zeros(len(runs), bool))
     sizes = np.abs(np.diff(values, axis=0))
-    sides = [beside(sizes, runs.first, -1, NEIGHBOURS), beside(sizes, runs.last, 1, NEIGHBOURS)]  # (R, k, c)
-    typical = median_known(np.concatenate(sides, axis=1))
-    quanta = np.array([resolution(column) for column in values.T])
+    sides = [
+        neighbours_of(sizes, runs.first, -1, NEIGHBOURS),
+        neighbours_of(sizes, runs.last, 1, NEIGHBOURS),
+    ]  # (R, k, c)
+    typical = finite_median(np.concatenate(sides, axis=1))
+    quanta = np.array([estimate_resolution(column) for column in values.T])
     finest = np.maximum(_finest(sides, ROUNDING * np.abs(values).max(axis=0)), quanta)
     moving = np.ones(len(runs), bool)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -149,8 +153,8 @@ def in_dead_band(values: FloatArray, runs: Runs) -> BoolArray:
 
 def _pace(side: FloatArray) -> FloatArray:
     """Speed next to runs over that on the same side of them, (R,), of sizes of steps (R, k, c)."""
-    usual = median_known(side)
-    noisy = median_known(np.abs(np.diff(side, axis=1))) > 0.5 * usual
+    usual = finite_median(side)
+    noisy = finite_median(np.abs(np.diff(side, axis=1))) > 0.5 * usual
     nearest = np.where(noisy, side[:, :_NEAREST].mean(axis=1), side[:, 0])
     return _mean_known(np.where(usual > 0.0, nearest / usual, np.nan))
 
@@ -178,7 +182,7 @@ DEAD_BANDS = (*RATES, "joint_torque", "ft_wrench", *WRENCHES)
 _Stuck = list[tuple[str, Runs]]
 
 
-def frozen(groups: Iterable[Group]) -> Iterator[Finding]:
+def check_repeats(groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
     """Findings about frozen, held, saturated and constant channels."""
     given = tuple(groups)
     positions = next((group for group in given if group.field == "joint_position"), None)
@@ -191,11 +195,11 @@ def frozen(groups: Iterable[Group]) -> Iterator[Finding]:
             continue
         rests = _at_rest(group, steps, positions)
         together = ((steps == 0.0) & ~rests)[:, ~constant].all(axis=1) & group.joined
-        if every := held_for(group.values[:, ~constant], together):
+        if every := mean_hold(group.values[:, ~constant], together):
             yield _held(group, [(name, every) for name in group.names])
             continue
         moving = group.values[:, ~constant]
-        runs = implausible(moving, together)
+        runs = implausible_runs(moving, together)
         if group.field in DEAD_BANDS:
             runs = runs.where(~in_dead_band(moving, runs))
         if len(runs):
@@ -206,7 +210,7 @@ def frozen(groups: Iterable[Group]) -> Iterator[Finding]:
             yield from _by_channel(group, repeated, np.flatnonzero(~constant))
 
 
-def _at_rest(group: Group, steps: FloatArray, positions: Group | None) -> BoolArray:
+def _at_rest(group: ChannelGroup, steps: FloatArray, positions: ChannelGroup | None) -> BoolArray:
     """Which steps (M - 1, c) of joint velocities or accelerations are those of a joint that does not move."""
     if positions is None or group.field not in RATES or not np.isin(group.samples, positions.samples).all():
         return np.zeros(steps.shape, bool)
@@ -215,16 +219,16 @@ def _at_rest(group: Group, steps: FloatArray, positions: Group | None) -> BoolAr
     return np.asarray((steps == 0.0) & (group.values[1:] == 0.0) & (np.diff(position, axis=0) == 0.0))
 
 
-def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> Iterator[Finding]:
+def _by_channel(group: ChannelGroup, all_repeated: BoolArray, columns: np.ndarray) -> Iterator[Finding]:
     """Channels that repeat by themselves, of steps (M - 1, c)."""
     stuck: _Stuck = []
     dead: list[tuple[str, float, float]] = []
     limits: list[tuple[str, Runs, float]] = []
-    every = {column: held_for(group.values[:, [column]], all_repeated[:, column]) for column in columns}
+    every = {column: mean_hold(group.values[:, [column]], all_repeated[:, column]) for column in columns}
     for column in (column for column in columns if not every[column]):
         repeated = all_repeated[:, column]
         name, values = group.names[column], group.values[:, column]
-        runs = implausible(values[:, None], repeated)
+        runs = implausible_runs(values[:, None], repeated)
         zeros = values[runs.first] == 0.0
         quiet = in_dead_band(values[:, None], runs)
         if group.field in DEAD_BANDS and quiet.any() and 2 * quiet.sum() >= zeros.sum():
@@ -238,28 +242,28 @@ def _by_channel(group: Group, all_repeated: BoolArray, columns: np.ndarray) -> I
         if len(runs):
             stuck.append((name, runs))
     if stuck:
-        yield _frozen(group, listed([name for name, _ in stuck]), stuck, sum(len(runs) for _, runs in stuck))
+        yield _frozen(group, join_names([name for name, _ in stuck]), stuck, sum(len(runs) for _, runs in stuck))
     if dead:
         each = [f"{name} below {least:.3g} {group.unit} ({share:.2g} % of it)" for name, least, share in dead]
         advice = "switch the dead band off; a velocity may be left out, and is derived then"
         names = tuple(name for name, _, _ in dead)
-        yield Finding("dead band", SUSPICIOUS, group.field, f"reads 0: {listed(each)}", advice, names)
+        yield Finding("dead band", SUSPICIOUS, group.field, f"reads 0: {join_names(each)}", advice, names)
     if limits:
         yield _saturated(group, limits)
     if any(every.values()):
         yield _held(group, [(group.names[column], each) for column, each in every.items() if each])
 
 
-def _spans(group: Group, channel: str, runs: Runs, skip: int = 1) -> Iterator[Span]:
+def _spans(group: ChannelGroup, channel: str, runs: Runs, skip: int = 1) -> Iterator[Span]:
     """Samples that repeat the one before; with it for a `skip` of 0."""
     for first, last in zip(runs.first, runs.last, strict=True):
         yield Span(int(group.samples[first + skip]), int(group.samples[last + 1]), channel)
 
 
-def _frozen(group: Group, what: str, stuck: _Stuck, count: int) -> Finding:
+def _frozen(group: ChannelGroup, what: str, stuck: _Stuck, count: int) -> Finding:
     spans = tuple(span for name, runs in stuck for span in _spans(group, name, runs))
     longest = max(spans, key=len)
-    times = f"{counted(len(longest), 'sample')} at {longest}"
+    times = f"{count_of(len(longest), 'sample')} at {longest}"
     if count > 1:
         times = f"{count} times, the longest {times}"
     whose = f"{group.name}, " if group.name else ""
@@ -268,11 +272,11 @@ def _frozen(group: Group, what: str, stuck: _Stuck, count: int) -> Finding:
     return Finding("frozen", CONDEMNED, group.field, text, advice, tuple(name for name, _ in stuck), spans)
 
 
-def _saturated(group: Group, limits: list[tuple[str, Runs, float]]) -> Finding:
+def _saturated(group: ChannelGroup, limits: list[tuple[str, Runs, float]]) -> Finding:
     spans = tuple(span for name, runs, _ in limits for span in _spans(group, name, runs, 0))
     names = tuple(dict.fromkeys(name for name, _, _ in limits))
     shares = [(name, extreme, 100.0 * np.mean(group.values == extreme, axis=0)) for name, _, extreme in limits]
-    text = "stays at an extreme value: " + listed(
+    text = "stays at an extreme value: " + join_names(
         [f"{name} at {at:.4g} {group.unit} in {share[group.names.index(name)]:.2g} %" for name, at, share in shares]
     )
     if group.field == "joint_position":  # on a stop, or on the bound of an inverse kinematics: it may be right there
@@ -282,10 +286,10 @@ def _saturated(group: Group, limits: list[tuple[str, Runs, float]]) -> Finding:
     return Finding("saturated", CONDEMNED, group.field, text, advice, names, spans)
 
 
-def _held(group: Group, held: list[tuple[str, float]]) -> Finding:
+def _held(group: ChannelGroup, held: list[tuple[str, float]]) -> Finding:
     every = max(each for _, each in held)
     names = tuple(name for name, _ in held)
-    whose = f"{listed(names)}: " if len(names) < len(group.names) else ""
+    whose = f"{join_names(names)}: " if len(names) < len(group.names) else ""
     text = (
         f"{whose}new values only every {every:.3g} samples, repeated in between: "
         f"{0.5 * (every - 1):.2g} samples late on average"
@@ -294,12 +298,12 @@ def _held(group: Group, held: list[tuple[str, float]]) -> Finding:
     return Finding("held", SUSPICIOUS, group.field, text, advice, names)
 
 
-def _constant(group: Group, constant: BoolArray) -> Iterator[Finding]:
+def _constant(group: ChannelGroup, constant: BoolArray) -> Iterator[Finding]:
     names = tuple(name for name, still in zip(group.names, constant, strict=True) if still)
     zero = not group.values[0][constant].any()
     if zero and group.field in WRENCHES:  # what a point contact cannot exert
         return
-    text = f"{listed(names)}: {'0' if zero else 'one value'} throughout"
+    text = f"{join_names(names)}: {'0' if zero else 'one value'} throughout"
     if zero and group.field == "joint_torque":
         advice = "write NaN if they were not measured: zeros are fitted as measured torques"
         yield Finding("constant", SUSPICIOUS, group.field, text, advice, names)

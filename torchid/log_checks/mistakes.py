@@ -15,8 +15,8 @@ from torchid.log_checks.motion import TWO_TURNS
 from torchid.log_checks.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
-from torchid.logs.quaternion import compose, inverse, sign_continuous
-from torchid.text import listed
+from torchid.logs.quaternion import compose, inverse, make_sign_continuous
+from torchid.text import join_names
 
 #: Parts of names that tell the sides, and the ends, of a robot apart.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")
@@ -26,7 +26,7 @@ _PARTS = re.compile(r"([A-Za-z0-9]+)")
 _SHORT = 12
 
 
-def exchanges(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+def exchanged_names(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Other names that the columns may truly have, with what was mixed up: sides, ends, or the alphabet."""
     seen = {tuple(names)}
     for what, pairs in (("left and right", _SIDES), ("front and rear", _ENDS)):
@@ -40,7 +40,7 @@ def exchanges(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
             yield what, other
 
 
-def neighbours(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+def exchanged_neighbours(names: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Names with two that follow each other in a short chain exchanged."""
     for i in range(len(names) - 1 if len(names) <= _SHORT else 0):
         yield f"{names[i]} and {names[i + 1]}", (*names[:i], names[i + 1], names[i], *names[i + 2 :])
@@ -89,7 +89,7 @@ class Mistake:
     mended: Callable[[Log], Log]
 
 
-def mistakes(log: Log) -> Iterator[Mistake]:
+def possible_mistakes(log: Log) -> Iterator[Mistake]:
     """The mistakes that this log could hold."""
     for rates in (_JOINT_RATES, _BASE_RATES):
         given = [field for field in rates if getattr(log, field) is not None]
@@ -99,12 +99,12 @@ def mistakes(log: Log) -> Iterator[Mistake]:
     yield Mistake("joint_position", "in degrees", "convert to radians", lambda log: _in_degrees(log, slice(None)))
     far = np.flatnonzero(np.abs(log.joint_position).max(axis=0, initial=0.0) > TWO_TURNS)
     if 0 < len(far) < len(log.joint_names):
-        some = f"{listed([log.joint_names[joint] for joint in far])} in degrees"
+        some = f"{join_names([log.joint_names[joint] for joint in far])} in degrees"
         yield Mistake("joint_position", some, "convert to radians", lambda log: _in_degrees(log, far))
     yield from _of_orders(log)
     if log.base_quat_xyzw is not None:
         down, up = "in a world whose z axis points down", "turn positions, orientations and vectors so that z points up"
-        yield Mistake("base_quat_xyzw", down, up, turned_over)
+        yield Mistake("base_quat_xyzw", down, up, flip_world)
         order, rename = "w first against w last is mixed up", "rename base_quat_wxyz and base_quat_xyzw"
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, -1, axis=1)))
         yield Mistake("base_quat_xyzw", order, rename, _quaternions(lambda quat: np.roll(quat, 1, axis=1)))
@@ -126,10 +126,10 @@ def mistakes(log: Log) -> Iterator[Mistake]:
 
 def _of_orders(log: Log) -> Iterator[Mistake]:
     """Names of joints and contacts exchanged, flags that belong to other contacts."""
-    for what, other in (*exchanges(log.joint_names), *neighbours(log.joint_names)):
+    for what, other in (*exchanged_names(log.joint_names), *exchanged_neighbours(log.joint_names)):
         text, advice = f"{what} exchanged", "give joint_names in the order of the columns"
         yield Mistake("joint_names", text, advice, _renamed("joint_names", other))
-    for what, other in exchanges(log.contact_names):
+    for what, other in exchanged_names(log.contact_names):
         order = [log.contact_names.index(name) for name in other]
         text = f"{what} exchanged"
         advice = "give contact_names in the order of the columns"
@@ -146,7 +146,7 @@ def _reordered(fields: Sequence[str], order: list[int]) -> Callable[[Log], Log]:
     return _change(lambda log: {field: getattr(log, field)[:, order] for field in fields})
 
 
-def turned_over(log: Log) -> Log:
+def flip_world(log: Log) -> Log:
     """The log in a world half a turn about x from the one that it has."""
     half = np.array([1.0, 0.0, 0.0, 0.0])
     fields: dict[str, Any] = {}
@@ -193,4 +193,4 @@ def _in_degrees(log: Log, joints: slice | NDArray[np.intp]) -> Log:
 
 def _quaternions(change: Callable[[Any], Any]) -> Callable[[Log], Log]:
     rates = dict.fromkeys(_BASE_RATES)
-    return _change(lambda log: {"base_quat_xyzw": sign_continuous(change(log.base_quat_xyzw)), **rates})
+    return _change(lambda log: {"base_quat_xyzw": make_sign_continuous(change(log.base_quat_xyzw)), **rates})

@@ -15,8 +15,8 @@ from torchid.log_checks.channels import median_step
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
-from torchid.problem import RowBuilder, Samples, bind
-from torchid.problem.predict import force_series, in_null_space
+from torchid.problem import RowBuilder, Samples, bind_log
+from torchid.problem.predict import force_series, null_space_part
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors
 
@@ -109,12 +109,12 @@ def wrong_gains(gain: FloatArray, clear: BoolArray) -> BoolArray:
     return clear & ((gain < 0.0) | (np.abs(np.log(np.maximum(np.abs(gain), _TINY))) > np.log(SCALE)))
 
 
-def usual_cutoff(log: Log) -> float:
+def default_cutoff_hz(log: Log) -> float:
     """A cutoff [Hz] for a log that nobody has named one for."""
     return min(CUTOFF, _OF_RATE / median_step(log))
 
 
-def filtered(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) -> list[Log]:
+def preprocess_pieces(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) -> list[Log]:
     """The log with velocities and accelerations; of one longer than `most`, runs of samples from all over it.
 
     Raises:
@@ -128,7 +128,9 @@ def filtered(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) -> list[Log
         return [preprocess(log.select(slice(start, start + length)), cutoff_hz) for start in starts]
 
 
-def bound(logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED) -> list[Samples]:
+def bind_some_samples(
+    logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED
+) -> list[Samples]:
     """About `count` evenly spread samples of filtered logs.
 
     Raises:
@@ -136,12 +138,18 @@ def bound(logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count:
     """
     out = []
     for log in logs:
-        samples = bind(log, robot, contacts)
+        samples = bind_log(log, robot, contacts)
         out.append(samples[torch.linspace(0, len(samples) - 1, min(count // len(logs), len(samples))).long()])
     return out
 
 
-def model_fit(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> ModelFit:
+def link_poses(log: Log, robot: Robot) -> dict[str, torch.Tensor]:
+    """Poses (N, 4, 4) in the base of the robot's links, by name, at the samples of a log of all its joints."""
+    order = [log.joint_names.index(name) for name in robot.joint_names]
+    return robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+
+
+def fit_nominal_model(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> ModelFit:
     """Compare the forces of some samples with those of the URDF."""
     measured = np.zeros(robot.n, dtype=bool)
     if all(part.torque is not None for part in samples):
@@ -191,7 +199,7 @@ def _projected_fit(
         vectors[1 + place, :, base + joint] = torque[:, joint]
     ends = np.cumsum([len(part) for part in samples])[:-1]
     parts = np.split(vectors, ends, axis=1)
-    inside = np.concatenate([in_null_space(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
+    inside = np.concatenate([null_space_part(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
     inside = inside[..., rows].reshape(1 + len(joints), -1)
     y, A = inside[0], inside[1:].T
     norms = np.linalg.norm(A, axis=0)

@@ -7,15 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchid.log_checks.channels import NORMAL, channel_names
+from torchid.log_checks.channels import channel_names
 from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.statistics import NORMAL
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
-from torchid.logs.preprocess import CHAINS
-from torchid.logs.quaternion import angular_velocity_base, inverse, rotate, rotate_back, sign_continuous
+from torchid.logs.preprocess import DERIVATIVE_CHAINS
+from torchid.logs.quaternion import (
+    angular_velocity_base,
+    inverse,
+    make_sign_continuous,
+    rotate_to_base,
+    rotate_to_world,
+)
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
-from torchid.text import listed
+from torchid.text import join_names
 
 #: Two turns [rad]: a joint with stops goes nowhere near.
 TWO_TURNS = 4.0 * np.pi
@@ -25,7 +32,7 @@ _ADVICE = "convert joint_position, and velocities and accelerations with it, to 
 _ENDLESS = ("continuous", "prismatic")
 
 
-def angles(log: Log, robot: Robot | None) -> Iterator[Finding]:
+def check_angle_unit(log: Log, robot: Robot | None) -> Iterator[Finding]:
     """Findings about the unit of `joint_position`."""
     bodies = () if robot is None else robot.bodies
     joints = {body.joint.name: body.joint.kind for body in bodies if body.joint is not None}
@@ -37,7 +44,7 @@ def angles(log: Log, robot: Robot | None) -> Iterator[Finding]:
     far = np.abs(position).max(axis=0) > TWO_TURNS
     names = [log.joint_names[columns[i]] for i in np.flatnonzero(far)]
     if far.any():
-        text = f"{listed(names)}: up to {np.abs(position).max():.4g}, more than two turns: degrees?"
+        text = f"{join_names(names)}: up to {np.abs(position).max():.4g}, more than two turns: degrees?"
         certain = 2 * int(far.sum()) >= int(moved.sum())
         severity = CONDEMNED if certain else SUSPICIOUS
         yield Finding("unit", severity, "joint_position", text, _ADVICE, tuple(names))
@@ -78,14 +85,14 @@ class Comparison:
     misfit: float
 
 
-def compare(time: FloatArray, base: FloatArray, derivative: FloatArray, order: int = 1) -> Comparison | None:
+def compare_derivative(time: FloatArray, base: FloatArray, derivative: FloatArray, order: int = 1) -> Comparison | None:
     """Compare a derivative (N, c) of some order with its base (N, c), N stamps [s]; None if the log is too short."""
     step = float(np.median(np.diff(time))) if len(time) > 1 else LAG
     lag = max(2, round(LAG / step))
     if len(time) < order * lag + 6 * MAX_DELAY:
         return None
     for _ in range(order):
-        derivative = integral(time, derivative)
+        derivative = integrate(time, derivative)
     wanted, given = (_differences(values, lag, order) for values in (base, derivative))
     at = np.arange(MAX_DELAY, len(wanted) - MAX_DELAY, max(1, len(wanted) // _COMPARED))
     excess = (given[at] - wanted[at]).mean(axis=0) / (lag * step) ** order
@@ -108,7 +115,7 @@ def compare(time: FloatArray, base: FloatArray, derivative: FloatArray, order: i
     return Comparison(ratio, follows, delay, excess, min(misfits))
 
 
-def integral(time: FloatArray, values: FloatArray) -> FloatArray:
+def integrate(time: FloatArray, values: FloatArray) -> FloatArray:
     """Integral over time from the first sample on, (N, c), by the trapezoidal rule."""
     areas = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(areas, axis=0)])
@@ -148,22 +155,22 @@ _TINY = 1e-300
 _DERIVATIVES = "velocities and accelerations against positions"
 
 
-def derivatives(log: Log) -> Iterator[Finding | Skipped]:
+def check_derivatives(log: Log) -> Iterator[Finding | Skipped]:
     """Findings about the derivatives that the log gives."""
-    if not any(getattr(log, name) is not None for chain in CHAINS for name in chain[1:]):
+    if not any(getattr(log, name) is not None for chain in DERIVATIVE_CHAINS for name in chain[1:]):
         yield Skipped(_DERIVATIVES, "the log gives neither velocities nor accelerations")
-    for chain in CHAINS:
+    for chain in DERIVATIVE_CHAINS:
         given = [(order, name) for order, name in enumerate(chain) if getattr(log, name) is not None]
         for (low, base), (high, name) in zip(given, given[1:], strict=False):
-            found = compare(log.time, getattr(log, base), getattr(log, name), high - low)
+            found = compare_derivative(log.time, getattr(log, base), getattr(log, name), high - low)
             if found is None:
                 yield Skipped(_DERIVATIVES, f"{name}: the log is too short")
             else:
                 wrong = list(_frame(log, name, base, high - low, found))
-                yield from wrong or judged(found, name, base, channel_names(log, name))
+                yield from wrong or derivative_findings(found, name, base, channel_names(log, name))
 
 
-def judged(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -> Iterator[Finding]:
+def derivative_findings(found: Comparison, name: str, base: str, channels: tuple[str, ...]) -> Iterator[Finding]:
     """Findings about one derivative, given with the names of its channels."""
     follows = np.abs(found.correlation) >= FOLLOWS  # so written, NaN does not follow
     lost = ~follows & np.isfinite(found.correlation)
@@ -200,8 +207,8 @@ def _frame(log: Log, name: str, base: str, order: int, found: Comparison) -> Ite
         yield Finding("gravity", CONDEMNED, name, text, advice, ("z",))
     if not name.startswith("base_linear") or log.base_quat_xyzw is None or found.misfit < WRONG:
         return
-    for turn, actual in ((rotate, "base"), (rotate_back, "world")):
-        turned = compare(log.time, getattr(log, base), turn(log.base_quat_xyzw, getattr(log, name)), order)
+    for turn, actual in ((rotate_to_world, "base"), (rotate_to_base, "world")):
+        turned = compare_derivative(log.time, getattr(log, base), turn(log.base_quat_xyzw, getattr(log, name)), order)
         if turned is not None and turned.misfit < BETTER * found.misfit:
             text = f"follows {base} if it is in the {actual} frame, not in the one that its name says"
             yield Finding("frame", CONDEMNED, name, text, f"call it {name.replace('world', actual)}")
@@ -211,13 +218,13 @@ def _finding(
     name: str, severity: str, field: str, channels: tuple[str, ...], where: BoolArray, text: str, advice: str
 ) -> Finding:
     chosen = tuple(channel for channel, here in zip(channels, where, strict=True) if here)
-    return Finding(name, severity, field, f"{listed(list(chosen))}: {text}", advice, chosen)
+    return Finding(name, severity, field, f"{join_names(list(chosen))}: {text}", advice, chosen)
 
 
 _TURNING = "angular velocity against orientation"
 
 
-def turning(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
+def check_angular_velocity(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about angular velocities and the orientation."""
     quat = log.base_quat_xyzw
     if quat is None and robot is not None and robot.fixed_base:
@@ -230,13 +237,13 @@ def turning(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
         nowhere = "an IMU, and no robot that says where it is"
         yield Skipped(_TURNING, nowhere if log.imu_frame else "no angular velocity of the base")
     for field, omega in given.items():
-        found = compare(log.time, integral(log.time, _omega(log.time, quat)), omega)
+        found = compare_derivative(log.time, integrate(log.time, _omega(log.time, quat)), omega)
         if found is None:
             yield Skipped(_TURNING, f"{field}: the log is too short")
             continue
         mistaken = _explaining(log.time, quat, omega, found.misfit) if found.misfit > WRONG else None
         if mistaken is None:
-            yield from judged(found, field, "base_quat", ("x", "y", "z"))
+            yield from derivative_findings(found, field, "base_quat", ("x", "y", "z"))
         else:
             yield Finding("frame or order", CONDEMNED, mistaken.field or field, mistaken.found, mistaken.advice)
 
@@ -270,12 +277,15 @@ class _Mistake:
 def _mistakes(quat: FloatArray, omega: FloatArray) -> Iterator[_Mistake]:
     """Usual mistakes with an orientation (N, 4) and an angular velocity (N, 3)."""
     frame = "fits in the {} frame, not in the {} frame"
-    yield _Mistake(frame.format("world", "base"), "call it ..._world", "", quat, rotate_back(quat, omega))
-    yield _Mistake(frame.format("base", "world"), "call it ..._base", "", quat, rotate(quat, omega))
+    yield _Mistake(frame.format("world", "base"), "call it ..._world", "", quat, rotate_to_base(quat, omega))
+    yield _Mistake(frame.format("base", "world"), "call it ..._base", "", quat, rotate_to_world(quat, omega))
     order = "the components' order is the other one: w first against w last"
     for shift in (1, -1):
-        other = sign_continuous(np.roll(quat, shift, axis=1))
-        for value in (omega, rotate_back(other, rotate(quat, omega))):  # as it is, or as it was given in the world
+        other = make_sign_continuous(np.roll(quat, shift, axis=1))
+        for value in (
+            omega,
+            rotate_to_base(other, rotate_to_world(quat, omega)),
+        ):  # as it is, or as it was given in the world
             yield _Mistake(order, "rename base_quat_wxyz and base_quat_xyzw", "base_quat_xyzw", other, value)
     yield _Mistake("the sign is reversed", "reverse it", "", quat, -omega)
     name = "rotates world to base, not base to world"
@@ -289,7 +299,7 @@ def _explaining(time: FloatArray, quat: FloatArray, omega: FloatArray, misfit: f
     """
     best, least = None, BETTER * misfit
     for mistake in _mistakes(quat, omega):
-        found = compare(time, integral(time, _omega(time, mistake.quat)), mistake.omega)
+        found = compare_derivative(time, integrate(time, _omega(time, mistake.quat)), mistake.omega)
         if found is not None and found.misfit < least:
             best, least = mistake, found.misfit
     return best

@@ -10,11 +10,11 @@ import torch
 
 from torchid import parameters
 from torchid.log_checks.channels import median_step
-from torchid.log_checks.model import DIFFERENTIATED_TO_TRY, NOTHING, bound, filtered
+from torchid.log_checks.model import DIFFERENTIATED_TO_TRY, NOTHING, bind_some_samples, preprocess_pieces
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import by_state, one_thread
+from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series
 from torchid.regressor.kinematics import GRAVITY_WORLD
@@ -22,20 +22,20 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
 #: What a URDF may be off by, in units of `parameter_scale`: 0.1 is a mass, and an inertia, 15 to 20 % off.
-OFF = 0.1
+URDF_ERROR = 0.1
 #: Friction that a URDF lacks, in the joint's rms torque.
 FRICTION = 0.2
 #: What no parameters explain (flexibility, filters, shape of friction), as a share of the rms of each kind of force.
 UNMODELLED = 0.05
 #: Samples after one another that say the same: of 240 out of ten seconds, what friction and flexibility leave of them.
-ALIKE = 10.0
+CORRELATED_SAMPLES = 10.0
 #: Blocks of time that must agree.
 BLOCKS = 6
 _TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Terms:
+class NormalEquations:
     """Whitened equations of some samples, by blocks of time.
 
     Attributes:
@@ -54,13 +54,13 @@ class Terms:
         """Products (k, k) of what is left of the terms, over all blocks or in one."""
         chosen = slice(None) if block is None else slice(block, block + 1)
         H, C, G = (part[chosen].sum(axis=0) for part in (self.inside, self.across, self.terms))
-        H = H + ALIKE * np.eye(len(H))
+        H = H + CORRELATED_SAMPLES * np.eye(len(H))
         return np.asarray(G - C.T @ np.linalg.solve(H, C))
 
 
-def known_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
+def measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
     """The forces that are known throughout, with what no parameters explain of each kind as their noise."""
-    torque = np.zeros(robot.dofs, bool)
+    torque = np.zeros(robot.n_dofs, bool)
     wrench = np.zeros((len(contacts), 6), bool)
     size = 0.0
     if all(part.torque is not None for part in samples):
@@ -81,7 +81,7 @@ def known_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[C
     return SensorSet(torque, wrench, noise)
 
 
-def friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
+def missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
     """Coulomb [N m] and viscous [N m s/rad] friction that joints without a word in the URDF have, (n, 2)."""
     out = np.full((robot.n, 2), _TINY)
     if all(part.torque is not None for part in samples):
@@ -95,40 +95,40 @@ def friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
 
 def prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]) -> FloatArray:
     """Matrix (columns, P) from deviations of size 1 to the builder's columns."""
-    scale = OFF * parameter_scale(robot.nominal)
+    scale = URDF_ERROR * parameter_scale(robot.nominal)
     scale[:, parameters.FRICTION] = 0.0
-    friction = friction_scale(samples, robot)
+    friction = missing_friction_scale(samples, robot)
     for body, found in enumerate(robot.bodies):
         if found.joint is not None and found.joint.name in robot.joint_names:
             scale[body, parameters.FRICTION] = friction[robot.joint_names.index(found.joint.name)]
     massless = [body.massless for body in robot.bodies]
     scale[massless, parameters.INERTIAL] = 0.0
     kept = scale.flatten() > 0.0
-    return np.asarray((builder.columns.from_parameters() * scale.flatten())[:, kept])
+    return np.asarray((builder.columns.parameter_map() * scale.flatten())[:, kept])
 
 
 @torch.no_grad()
-def rows_of(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Whitened rows (N, nv, columns + 1), the bases W (N, nv, nv) that they stand in, and which rows are equations."""
-    nv = builder.tree.base_rows + len(builder.columns.joint_rows)
-    rows, W = np.zeros((len(samples), nv, builder.width + 1)), np.zeros((len(samples), nv, nv))
+def whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are equations."""
+    n_rows = builder.tree.n_rows
+    rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
     with one_thread():
-        for state, index in by_state(samples):
+        for state, index in chunks_by_state(samples):
             where = index if isinstance(index, slice) else index.numpy()
             found = builder.rows_by_sample(samples[index], state)
             rows[where], W[where] = (x.numpy() for x in found)
     return rows, W, np.asarray(np.abs(W).any(axis=1))
 
 
-def gathered(K: FloatArray, terms: FloatArray, equations: BoolArray) -> Terms:
-    """Products by blocks of samples (N, nv, P) and (N, nv, k)."""
+def accumulate_blocks(K: FloatArray, terms: FloatArray, equations: BoolArray) -> NormalEquations:
+    """Products by blocks of samples (N, n_rows, P) and (N, n_rows, k)."""
     inside, across, own = [], [], []
     for part in np.array_split(np.arange(len(K)), BLOCKS):
         A, Y = K[part].reshape(-1, K.shape[2]), terms[part].reshape(-1, terms.shape[2])
         inside.append(A.T @ A)
         across.append(A.T @ Y)
         own.append(Y.T @ Y)
-    return Terms(np.array(inside), np.array(across), np.array(own), int(equations.sum()))
+    return NormalEquations(np.array(inside), np.array(across), np.array(own), int(equations.sum()))
 
 
 #: Samples compared.
@@ -147,7 +147,7 @@ _GAIN, _POINT = 0.5, 0.3
 
 
 @dataclass(frozen=True)
-class Stretch:
+class TimeScale:
     """What time should be multiplied by, of all samples and of each block, and what stays unexplained.
 
     `mended`, `recorded`, `still`: rms of what no URDF near the given one explains, in `UNMODELLED` of the forces, with
@@ -161,12 +161,12 @@ class Stretch:
     still: float
 
 
-def stretched(log: Log, factor: float) -> Log:
+def scale_time(log: Log, factor: float) -> Log:
     """The log with its time multiplied by a factor."""
     return replace(log, time=log.time[0] + factor * (log.time - log.time[0]))
 
 
-def motion_cutoff(log: Log) -> float | None:
+def motion_cutoff_hz(log: Log) -> float | None:
     """A cutoff [Hz] by the log's own motion, whatever its time is worth; None where no joint moves."""
     position = log.joint_position[: 2 * (len(log) // 2)]
     power = np.square(np.abs(np.fft.rfft(position - position.mean(axis=0), axis=0))).sum(axis=1)
@@ -178,7 +178,7 @@ def motion_cutoff(log: Log) -> float | None:
     return float(min(max(_ABOVE * last, _PERIODS) / (step * len(position)), _OF_RATE / step))
 
 
-def stretch(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> Stretch:
+def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> TimeScale:
     """How time would have to be multiplied for gravity and inertia to make up the forces.
 
     Derived velocities and accelerations scale with the inverse of time and its square, gravity does not: three
@@ -189,16 +189,16 @@ def stretch(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
     """
 
     def at(factor: float) -> list[Samples]:
-        logs = filtered(stretched(log, factor), cutoff_hz / factor, DIFFERENTIATED_TO_TRY)
-        return bound(logs, robot, contacts, SAMPLES)
+        logs = preprocess_pieces(scale_time(log, factor), cutoff_hz / factor, DIFFERENTIATED_TO_TRY)
+        return bind_some_samples(logs, robot, contacts, SAMPLES)
 
     now, later, still = at(1.0), at(2.0), at(_STILL)
-    builder = RowBuilder(robot, contacts, known_sensors(now, robot, contacts))
+    builder = RowBuilder(robot, contacts, measured_sensors(now, robot, contacts))
     parts = []
     columns = prior_columns(builder, robot, now)
     phi = robot.nominal.flatten()[None]
     for one, two, rest in zip(now, later, still, strict=True):
-        rows, W, equations = rows_of(builder, rest)
+        rows, W, equations = whitened_rows(builder, rest)
         first, second, none = (force_series(builder, part, phi)[1][0] for part in (one, two, rest))
         quadratic = 2.0 * (first - none) - 4.0 * (second - none)
         terms = [none, first - none - quadratic, quadratic]
@@ -207,7 +207,7 @@ def stretch(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: floa
         loose = _of_joints(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
         K = np.concatenate([rows[..., :-1] @ columns, *loose], axis=2)
         parts.append((K, np.stack(projected, axis=2), equations))
-    found = gathered(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    found = accumulate_blocks(*(np.concatenate(part) for part in zip(*parts, strict=True)))
     return _best(found)
 
 
@@ -222,7 +222,7 @@ def _of_joints(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> lis
     return out
 
 
-def _best(found: Terms) -> Stretch:
+def _best(found: NormalEquations) -> TimeScale:
     u = np.stack([np.ones_like(_STRETCHES), -np.ones_like(_STRETCHES), -1 / _STRETCHES, -1 / _STRETCHES**2])
 
     def cost(block: int | None) -> FloatArray:
@@ -232,11 +232,11 @@ def _best(found: Terms) -> Stretch:
     blocks = np.array([_STRETCHES[np.argmin(cost(block))] for block in range(BLOCKS)])
     best, one = int(np.argmin(every)), int(np.argmin(np.abs(np.log(_STRETCHES))))
     left = np.sqrt(np.maximum(every, 0.0) / max(found.rows, 1))
-    return Stretch(float(_STRETCHES[best]), blocks, *(float(left[i]) for i in (best, one, -1)))
+    return TimeScale(float(_STRETCHES[best]), blocks, *(float(left[i]) for i in (best, one, -1)))
 
 
 @dataclass(frozen=True, eq=False)
-class Gains:
+class TorqueGains:
     """Factors of torques, and the point that wrenches are about, that a URDF near the given one needs.
 
     Attributes:
@@ -253,21 +253,21 @@ class Gains:
     blocks: FloatArray
 
 
-def gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> Gains | None:
+def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> TorqueGains | None:
     """Factors of single torques and the point of wrenches; None where neither was measured."""
-    sensors = known_sensors(samples, robot, contacts)
+    sensors = measured_sensors(samples, robot, contacts)
     joints = np.flatnonzero(sensors.torque[: robot.n])
     if not len(joints) and not _whole(sensors.wrench):
         return None
     builder = RowBuilder(robot, contacts, sensors)
     columns = prior_columns(builder, robot, samples)
-    nominal = builder.columns.from_parameters() @ robot.nominal.flatten()
+    nominal = builder.columns.parameter_map() @ robot.nominal.flatten()
     parts = []
     for part in samples:
-        rows, W, equations = rows_of(builder, part)
-        torque = np.zeros((len(part), builder.tree.base_rows + robot.dofs, len(joints)))
+        rows, W, equations = whitened_rows(builder, part)
+        torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
         for place, joint in enumerate(joints):
-            torque[:, builder.tree.base_rows + joint, place] = builder.torque(part)[:, joint].numpy()
+            torque[:, builder.tree.base_rows + joint, place] = builder.recorded_torque(part)[:, joint].numpy()
         moved = np.concatenate([torque, _about(builder, part, sensors.wrench)], axis=2)
         through = np.einsum("nvr,nvk->nrk", W, moved)
         without = rows[..., -1] - through[..., : len(joints)].sum(axis=2)
@@ -276,20 +276,20 @@ def gains(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact])
         loose = _of_joints(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
         K = np.concatenate([rows[..., :-1] @ columns, *loose], axis=2)
         parts.append((K, np.concatenate([target[..., None], through], axis=2), equations))
-    return _solved(gathered(*(np.concatenate(part) for part in zip(*parts, strict=True))), joints)
+    return _solved(accumulate_blocks(*(np.concatenate(part) for part in zip(*parts, strict=True))), joints)
 
 
 def _about(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> FloatArray:
-    """What wrenches about a point one unit off along each axis would add, (N, nv, 3)."""
-    nv = builder.tree.base_rows + len(builder.columns.joint_rows)
-    out = np.zeros((len(samples), nv, 3))
+    """What wrenches about a point one unit off along each axis would add, (N, n_rows, 3)."""
+    n_rows = builder.tree.n_rows
+    out = np.zeros((len(samples), n_rows, 3))
     if not _whole(measured):
         return out
     with torch.no_grad():
-        terms = builder.terms(samples)
+        terms = builder.dynamics(samples)
         J = builder.contact_jacobian(samples).numpy()
         for k in range(len(measured)):
-            force = builder.local_wrench(samples, k, terms)[:, :3].numpy()
+            force = builder.recorded_wrench(samples, k, terms)[:, :3].numpy()
             force = np.where(samples.active[:, k, None].numpy(), force, 0.0)
             for axis in range(3):
                 out[..., axis] += np.einsum("niv,ni->nv", J[:, k, 3:], np.cross(np.eye(3)[axis], force))
@@ -301,7 +301,7 @@ def _whole(measured: np.ndarray) -> bool:
     return bool(measured.size and measured.all())
 
 
-def _solved(found: Terms, joints: np.ndarray) -> Gains:
+def _solved(found: NormalEquations, joints: np.ndarray) -> TorqueGains:
     m = len(joints)
     start = np.append(np.ones(m), np.zeros(3))
     prior = np.append(np.full(m, _GAIN), np.full(3, _POINT)) ** -2.0
@@ -316,4 +316,4 @@ def _solved(found: Terms, joints: np.ndarray) -> Gains:
     x, variance, left = solve(None)
     size = max(1.0, left / max(found.rows, 1))
     blocks = np.array([solve(block)[0] for block in range(BLOCKS)])
-    return Gains(joints, x[:m], x[m:], np.sqrt(10.0 * size * variance), blocks)
+    return TorqueGains(joints, x[:m], x[m:], np.sqrt(10.0 * size * variance), blocks)

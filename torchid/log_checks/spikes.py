@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.log_checks.channels import NORMAL, Group, beside, block_spread, median_known, median_step, near
+from torchid.log_checks.channels import ChannelGroup, median_step
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
+from torchid.log_checks.statistics import NORMAL, block_spread, finite_median, neighbours_of, widen_mask
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
-from torchid.text import counted, listed
+from torchid.text import count_of, join_names
 
 #: Spreads that a step must exceed. Laplacian noise, whose tails are heavy, does so once in 10^7 samples.
 THRESHOLD = 12.0
@@ -46,7 +47,9 @@ class Jump:
     lasting: bool
 
 
-def jumps(values: FloatArray, elapsed: FloatArray, piece: NDArray[np.intp], longest: int = LONGEST_SPIKE) -> list[Jump]:
+def find_jumps(
+    values: FloatArray, elapsed: FloatArray, piece: NDArray[np.intp], longest: int = LONGEST_SPIKE
+) -> list[Jump]:
     """Excursions of at most `longest` samples, and lasting steps.
 
     Args:
@@ -91,10 +94,10 @@ def _excess(d: FloatArray, steps: FloatArray, at: NDArray[np.intp]) -> tuple[Flo
     away = np.arange(1.0, SIDE + 1.0)
     pairs = np.triu_indices(SIDE, 1)
     for direction in (-1, 1):
-        neighbours = beside(d, at, direction, SIDE)
-        slope = median_known((neighbours[:, pairs[1]] - neighbours[:, pairs[0]]) / (away[pairs[1]] - away[pairs[0]]))
-        level = median_known(neighbours - slope[:, None] * away)
-        spreads.append(NORMAL * median_known(np.abs(neighbours - level[:, None] - slope[:, None] * away)))
+        neighbours = neighbours_of(d, at, direction, SIDE)
+        slope = finite_median((neighbours[:, pairs[1]] - neighbours[:, pairs[0]]) / (away[pairs[1]] - away[pairs[0]]))
+        level = finite_median(neighbours - slope[:, None] * away)
+        spreads.append(NORMAL * finite_median(np.abs(neighbours - level[:, None] - slope[:, None] * away)))
         spanned += [level, level + slope * away.mean()]
     hull = np.stack([*spanned, *(one * steps[at] for one in spanned)])
     return d[at] - np.clip(d[at], hull.min(axis=0), hull.max(axis=0)), np.max(spreads, axis=0)
@@ -155,7 +158,7 @@ _WRAPPED = 0.01
 _Jumps = list[tuple[str, Jump]]
 
 
-def spikes(log: Log, groups: Iterable[Group]) -> Iterator[Finding]:
+def check_jumps(log: Log, groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
     """Findings about jumps in all channels."""
     given = [(group, [_raw(group, column) for column in range(len(group.names))]) for group in groups]
     impacts = _contact_changes(log) | _load_changes(log, given)
@@ -197,7 +200,7 @@ def _finding(
     text = f"{channel} by {size:.3g} {unit} {where}, {clearest.spreads:.3g} times the noise around it"
     if len(found) > 1:
         count = len({(jump.first, jump.last) for _, jump in found})
-        text = f"{counted(count, 'jump')} in {listed(channels)}; the clearest: {text}"
+        text = f"{count_of(count, 'jump')} in {join_names(channels)}; the clearest: {text}"
     if spans is None:
         spans = tuple(_span(channel, jump) for channel, jump in found)
     return Finding(name, severity, field, text, advice, channels, spans)
@@ -207,14 +210,14 @@ def _span(channel: str, jump: Jump, shift: float = 0.0) -> Span:
     return Span(jump.first, jump.last, channel, shift)
 
 
-def _raw(group: Group, column: int) -> list[Jump]:
+def _raw(group: ChannelGroup, column: int) -> list[Jump]:
     """All jumps of a channel, in numbers of the group's samples."""
     values = group.values[:, column]
     longest = max(LONGEST_SPIKE, int(SHORT_SIDE * len(values))) if group.field in POSES else LONGEST_SPIKE
-    return jumps(values, group.elapsed, group.piece, longest)
+    return find_jumps(values, group.elapsed, group.piece, longest)
 
 
-def _unexplained(log: Log, group: Group, column: int, found: list[Jump], impacts: BoolArray) -> list[Jump]:
+def _unexplained(log: Log, group: ChannelGroup, column: int, found: list[Jump], impacts: BoolArray) -> list[Jump]:
     """The jumps of a channel that neither motion nor contact explains."""
     values = group.values[:, column]
     if group.field in POSES:
@@ -242,7 +245,7 @@ def _reset(values: FloatArray, jump: Jump) -> bool:
     return bool(((after - before) * np.sign(jump.size) > _MOVED * abs(jump.size)).all())
 
 
-def _load_changes(log: Log, given: Iterable[tuple[Group, list[list[Jump]]]]) -> BoolArray:
+def _load_changes(log: Log, given: Iterable[tuple[ChannelGroup, list[list[Jump]]]]) -> BoolArray:
     """Samples close to where a force jumps and its sensor was not reset, (N,): something landed or lifted off."""
     where = np.zeros(len(log), bool)
     for group, by_column in given:
@@ -253,7 +256,7 @@ def _load_changes(log: Log, given: Iterable[tuple[Group, list[list[Jump]]]]) -> 
             span = np.ptp(np.percentile(values, (1.0, 99.0)))
             steps = [jump for jump in found if jump.lasting and abs(jump.size) > RESET * span]
             where[[group.samples[jump.first] for jump in steps if not _reset(values, jump)]] = True
-    return near(where, round(max(_IMPACT / median_step(log), LONGEST_SPIKE)))
+    return widen_mask(where, round(max(_IMPACT / median_step(log), LONGEST_SPIKE)))
 
 
 def _contact_changes(log: Log) -> BoolArray:
@@ -265,7 +268,7 @@ def _reversals(position: FloatArray) -> BoolArray:
     """Samples close to where a joint is about to reverse, (N,)."""
     speed = np.abs(np.gradient(position))
     smooth = np.convolve(speed, np.ones(_REVERSAL) / _REVERSAL, mode="same")
-    return near(smooth <= _SLOW * np.median(smooth), _REVERSAL)
+    return widen_mask(smooth <= _SLOW * np.median(smooth), _REVERSAL)
 
 
 def _position_steps(field: str, unit: str, lasting: _Jumps, samples: int) -> Iterator[Finding]:

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from torchid.log_checks.channels import LONG_STEP, NO_SIGNALS, channel_names
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, spans_of
+from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, find_spans
 from torchid.logs import Log
 from torchid.logs.log import NAN_ALLOWED, WRENCHES, BoolArray, FloatArray
-from torchid.logs.preprocess import differentiates
+from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_STEP
-from torchid.text import counted, listed
+from torchid.text import count_of, join_names
 
 #: Share of NaN above which a channel counts as one that was not recorded, and not as one with holes.
 MOSTLY_THERE = 0.2
@@ -20,7 +20,7 @@ MOSTLY_THERE = 0.2
 ABSURD = 1e12
 
 
-def absurd(log: Log) -> Iterator[Finding]:
+def check_magnitudes(log: Log) -> Iterator[Finding]:
     """Findings about values that nothing can have."""
     for field in log.arrays():
         if field in NO_SIGNALS:
@@ -34,13 +34,13 @@ def absurd(log: Log) -> Iterator[Finding]:
         names = channel_names(log, field)
         columns = np.flatnonzero(bad.any(axis=0))
         channels = tuple(names[column] for column in columns)
-        text = f"{listed(channels)}: beyond {ABSURD:g}, in {counted(int(bad.any(axis=1).sum()), 'sample')}"
+        text = f"{join_names(channels)}: beyond {ABSURD:g}, in {count_of(int(bad.any(axis=1).sum()), 'sample')}"
         rare = bad.any(axis=1).mean() <= MOSTLY_THERE
-        spans = tuple(span for column in columns for span in spans_of(bad[:, column], names[column])) if rare else ()
+        spans = tuple(span for column in columns for span in find_spans(bad[:, column], names[column])) if rare else ()
         yield Finding("absurd", CONDEMNED, field, text, "look for uninitialised memory or an overflow", channels, spans)
 
 
-def missing(log: Log) -> Iterator[Finding]:
+def check_missing_values(log: Log) -> Iterator[Finding]:
     """Findings about NaN; of a contact, while it is active. Motion has to be known throughout, a force has not."""
     for field in log.arrays():
         if field not in NO_SIGNALS:
@@ -65,10 +65,10 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
         (holes if share <= MOSTLY_THERE else gone)[names[column]] = (int(column), share)
     if holes:
         spans: tuple[Span, ...] = tuple(
-            span for name, (column, _) in holes.items() for span in spans_of(nan[:, column], name)
+            span for name, (column, _) in holes.items() for span in find_spans(nan[:, column], name)
         )
         shares = ", ".join(f"{name} {100 * share:.2g} %" for name, (_, share) in list(holes.items())[:4])
-        text = f"NaN in {counted(len(holes), 'channel')}, {counted(len(spans), 'time')}: {shares}"
+        text = f"NaN in {count_of(len(holes), 'channel')}, {count_of(len(spans), 'time')}: {shares}"
         if field in NAN_ALLOWED:
             advice = "leave these samples out; a filter would lose the channels throughout"
         else:
@@ -83,7 +83,7 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
         else:
             advice = "none, as long as it is not among the sensors" if entire else "leave it out of the sensors"
         severity = CONDEMNED if needed else NOTE
-        yield Finding("not measured", severity, field, f"{listed(list(gone))}: NaN {how}", advice, tuple(gone))
+        yield Finding("not measured", severity, field, f"{join_names(list(gone))}: NaN {how}", advice, tuple(gone))
 
 
 #: A median step [s] above which no acceleration can be seen: robots move at 0.5 to 5 Hz.
@@ -98,10 +98,10 @@ _STRONG = 3.0
 _BETTER = 0.5
 
 
-def stamps(log: Log) -> Iterator[Finding]:
+def check_time_stamps(log: Log) -> Iterator[Finding]:
     """Findings about `time`."""
-    if len(log) < FEWEST_DIFFERENTIATED and differentiates(log):
-        text = f"{counted(len(log), 'sample')}: velocities and accelerations cannot be derived"
+    if len(log) < FEWEST_DIFFERENTIATED and lacks_derivatives(log):
+        text = f"{count_of(len(log), 'sample')}: velocities and accelerations cannot be derived"
         advice = f"record {FEWEST_DIFFERENTIATED} samples or more, or give every velocity and acceleration"
         yield Finding("too short", CONDEMNED, "time", text, advice)
     if len(log) < 3:
@@ -120,7 +120,7 @@ def stamps(log: Log) -> Iterator[Finding]:
     if short.any():
         where = np.flatnonzero(short)
         first = int(where[0])
-        below = f"{counted(len(where), 'step')} below {SHORTEST_STEP:g} of the median"
+        below = f"{count_of(len(where), 'step')} below {SHORTEST_STEP:g} of the median"
         text = f"{below}, the first of {steps[first]:.3g} s after sample {first}: noise is multiplied there"
         spans = tuple(Span(int(i) + 1, int(i) + 1) for i in where)
         yield Finding("coincident stamps", CONDEMNED, "time", text, "drop one sample of each pair", spans=spans)
@@ -157,7 +157,7 @@ def _motion_ignores(log: Log, steps: FloatArray, strong: float, long: BoolArray)
 def _gaps(steps: FloatArray, median: float, long: BoolArray) -> Finding:
     where, longest = np.flatnonzero(long), int(np.argmax(steps))
     lost = int(np.round(steps[where] / median - 1.0).sum())
-    missing = f"{counted(len(where), 'gap')}, {counted(lost, 'sample')} missing"
+    missing = f"{count_of(len(where), 'gap')}, {count_of(lost, 'sample')} missing"
     found = f"{missing}; longest {steps[longest]:.4g} s after sample {longest}"
     if steps[longest] > LONGEST_STEP * median:
         advice = f"split the log after sample {longest}: no spline is drawn across more than {LONGEST_STEP:g} steps"

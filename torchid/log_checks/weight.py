@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import torch
 
-from torchid.log_checks.channels import median_step, near
+from torchid.log_checks.channels import median_step
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.model import link_poses
+from torchid.log_checks.statistics import widen_mask
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray
-from torchid.logs.quaternion import rotate
+from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.quaternion import rotate_to_world
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 
@@ -21,7 +22,7 @@ WINDOW = 0.5
 MOVED = 0.01
 
 
-def at_rest(log: Log) -> BoolArray:
+def find_rest(log: Log) -> BoolArray:
     """Which samples (N,) are inside a window in which neither base nor joints move."""
     still = np.zeros(len(log), bool)
     if len(log) < 3:
@@ -38,7 +39,7 @@ def at_rest(log: Log) -> BoolArray:
         turned = np.linalg.norm(log.imu_angular_velocity, axis=1)[half:-half] * WINDOW
         middle &= turned < 10.0 * MOVED  # a gyroscope has a bias
     still[half:-half] = middle
-    return near(still, half)
+    return widen_mask(still, half)
 
 
 def _poses(log: Log) -> list[FloatArray]:
@@ -64,11 +65,11 @@ _TILT = 5.0
 _NAME, _IMU = "weight at rest", "accelerometer at rest"
 
 
-def weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
+def check_weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about the sum of the contact forces."""
     if robot is not None and robot.fixed_base and not log.contact_names:
         return  # what it is bolted to carries it
-    still = at_rest(log)
+    still = find_rest(log)
     step = median_step(log)
     rests = still.sum() * step >= _REST
     if not rests and log.time[-1] - log.time[0] < _LONG:
@@ -81,7 +82,7 @@ def weight(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
         yield Skipped(_NAME, upward)
         return
     when = f"at rest ({still.sum() * step:.3g} s)" if rests else f"on average over {log.time[-1] - log.time[0]:.4g} s"
-    field = WRENCHES[0] if log.contact_wrench_world is None else WRENCHES[1]
+    field = log.contact_wrench_field
     yield from _judged(float(upward.mean()), when, field, robot)
 
 
@@ -114,7 +115,7 @@ def _judged(carried: float, when: str, field: str, robot: Robot | None) -> Itera
 
 def _upward(log: Log, robot: Robot | None) -> FloatArray | str:
     """Sum of the vertical contact forces (M,) [N] over samples where all active ones were measured, or why not."""
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     if wrench is None or log.contact_active is None:
         return "no contact forces"
     force = np.where(log.contact_active[..., None], wrench[..., :3], 0.0)
@@ -131,22 +132,21 @@ def _upward(log: Log, robot: Robot | None) -> FloatArray | str:
 
 
 def _in_world(log: Log, robot: Robot, force: FloatArray) -> FloatArray:
-    order = [log.joint_names.index(name) for name in robot.joint_names]
-    poses = robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+    poses = link_poses(log, robot)
     turned = [
         np.einsum("nij,nj->ni", poses[name][:, :3, :3].numpy(), force[:, index])
         for index, name in enumerate(log.contact_names)
     ]
     if log.base_quat_xyzw is not None:
-        turned = [rotate(log.base_quat_xyzw, one) for one in turned]
+        turned = [rotate_to_world(log.base_quat_xyzw, one) for one in turned]
     return np.stack(turned, axis=1)
 
 
-def accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
+def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Skipped]:
     """Findings about the IMU's specific force, at rest; its direction also on average over a long log."""
     if log.imu_specific_force is None:
         return
-    still = at_rest(log)
+    still = find_rest(log)
     rests = still.sum() >= 10
     if not rests:
         yield Skipped(_IMU, f"the robot never rests for {_REST:g} s")
@@ -176,7 +176,7 @@ def _tilt(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterato
         yield Skipped("gravity against orientation", "no robot that says where the IMU is on the base")
         return
     in_base = log.imu_specific_force[still] @ robot.links[log.imu_frame][1][:3, :3].T
-    up = rotate(log.base_quat_xyzw[still], in_base).mean(axis=0)
+    up = rotate_to_world(log.base_quat_xyzw[still], in_base).mean(axis=0)
     angle = float(np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1.0, 1.0))))
     name, text = "imu_specific_force", f"{angle:.3g} degrees from up {when}, by base_quat"
     if angle <= 90.0:
@@ -203,11 +203,8 @@ def _above_feet(log: Log, robot: Robot, upward: FloatArray) -> float | None:
         return None
     known = [index for index, name in enumerate(log.contact_names) if name in robot.links]
     some = np.linspace(0, len(log) - 1, min(_POSES, len(log))).astype(int)
-    order = [log.joint_names.index(name) for name in robot.joint_names]
-    poses = robot.link_poses(torch.from_numpy(log.joint_position[some][:, order]))
+    poses, active = link_poses(log.select(some), robot), log.contact_active[some]
     mean = upward.mean(axis=0)
-    heights = [
-        -(poses[log.contact_names[index]][:, :3, 3].numpy() @ mean)[log.contact_active[some, index]] for index in known
-    ]
+    heights = [-(poses[log.contact_names[k]][:, :3, 3].numpy() @ mean)[active[:, k]] for k in known]
     found = np.concatenate(heights) if heights else np.zeros(0)
     return float(found.mean() / np.linalg.norm(mean)) if len(found) else None

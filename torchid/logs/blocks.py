@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,11 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
-from torchid.logs.containers import Container, Kind, kind_to_read, open_container, translated
-from torchid.logs.log import NAMES, SHAPES, FloatArray, Log, as_names, as_real, check_shape, check_time, shape_of
-from torchid.logs.read import check_fields_given, checked_log
-from torchid.logs.spill import Sliced, Spill
+from torchid.errors import FieldError, LogError, about_file
+from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
+from torchid.logs.log import (
+    NAME_FIELDS,
+    SHAPES,
+    FloatArray,
+    Log,
+    check_shape,
+    check_time,
+    field_shape,
+    parse_names,
+    to_float64,
+)
+from torchid.logs.read import build_log, check_fields_given
+from torchid.logs.spill import LazyArray, Spill
 from torchid.logs.tables import table_blocks, table_size
 
 GIGABYTE = 1e9
@@ -27,30 +37,31 @@ _SAMPLE = re.compile(r"\bsample (\d+)")
 _SMALL = 4  # a cell of a table takes two characters at least, a number eight bytes
 
 
-def size_of(path: Path, limit: float) -> int:
+def log_bytes(path: Path, limit: float) -> int:
     """Bytes of a log's arrays, at most for a CSV file if that is below a limit, 0 for a bag, which is read whole.
 
     Raises:
         LogError: the file cannot be read.
     """
-    kind = kind_to_read(path)
-    if kind is Kind.TABLE:
-        most = _SMALL * path.stat().st_size
-        return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
-    if kind is Kind.BAG:
+    kind = existing_log_kind(path)
+    if kind is LogKind.BAG:
         return 0
-    with open_container(path, whole=False) as container:
-        return sum(container.sizes().values())
+    with about_file(path):
+        if kind is LogKind.TABLE:
+            most = _SMALL * path.stat().st_size
+            return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
+        with open_container(path, whole=False) as container:
+            return sum(container.sizes().values())
 
 
-def counted_from(start: int, error: LogError) -> LogError:
+def count_samples_from(start: int, error: LogError) -> LogError:
     """An error in a part of a log, with samples counted from the log's beginning."""
     found = _SAMPLE.sub(lambda match: f"sample {int(match[1]) + start}", error.found)
     return LogError(error.source, error.field, found.replace(" in all)", " near it)"), error.accepted)
 
 
 @dataclass
-class Blocks:
+class LogBlocks:
     """An open log, of which nothing but the stamps is in memory.
 
     Attributes:
@@ -63,7 +74,7 @@ class Blocks:
     source: str
     names: Mapping[str, NDArray[Any]]
     time: FloatArray
-    fields: Mapping[str, Sliced]
+    fields: Mapping[str, LazyArray]
     _last: tuple[int, FloatArray] | None = field(default=None, init=False)
 
     def __len__(self) -> int:
@@ -82,20 +93,26 @@ class Blocks:
         Raises:
             LogError: a value that is none; the message counts samples from the beginning.
         """
+        with about_file(self.source):
+            raw = self._raw(samples, only)
+            try:
+                log = build_log(raw)
+            except LogError as error:
+                raise count_samples_from(samples.start, error) from error
+        if log.base_quat_xyzw is not None:
+            self._continue_signs(log.base_quat_xyzw, samples)
+        return log
+
+    def _raw(self, samples: slice, only: tuple[str, ...] | None) -> dict[str, Any]:
+        """Fields of some samples as they are in the file."""
         raw: dict[str, Any] = dict(self.names) | {"time": self.time[samples]}
         if only is not None:
             raw["joint_position"] = np.zeros((len(raw["time"]), len(self.names["joint_names"])))
         for name, array in self.fields.items():
             if only is None or name in only:
-                with translated(self.source, name, _ACCEPTED):
+                with reader_errors_explained(name, _ACCEPTED):
                     raw[name] = np.asarray(array[samples])
-        try:
-            log = checked_log(self.source, raw)
-        except LogError as error:
-            raise counted_from(samples.start, error) from error
-        if log.base_quat_xyzw is not None:
-            self._continue_signs(log.base_quat_xyzw, samples)
-        return log
+        return raw
 
     def _continue_signs(self, quat: FloatArray, samples: slice) -> None:
         """Give quaternions (M, 4) of some samples the sign that goes with those before."""
@@ -107,7 +124,7 @@ class Blocks:
 
 
 @contextmanager
-def open_blocks(path: Path, folder: Path) -> Iterator[Blocks]:
+def open_log_blocks(path: Path, folder: Path) -> Iterator[LogBlocks]:
     """Open a log (.h5, .npz, .csv or .parquet).
 
     An .h5 file is read where it is; others are unpacked, to files without a name in `folder`.
@@ -116,22 +133,24 @@ def open_blocks(path: Path, folder: Path) -> Iterator[Blocks]:
         LogError: the file is not what it should be.
         SpillError: there is no room in the folder.
     """
-    source = str(path)
-    if kind_to_read(path) is Kind.TABLE:
-        yield _checked(source, *_of_table(path, folder))
-        return
-    with open_container(path, whole=False) as container:
-        yield _checked(source, *_of_container(source, container, folder))
+    with ExitStack() as stack:
+        with about_file(path):
+            if existing_log_kind(path) is LogKind.TABLE:
+                found = _of_table(path, folder)
+            else:
+                found = _of_container(stack.enter_context(open_container(path, whole=False)), folder)
+            blocks = _checked(str(path), *found)
+        yield blocks
 
 
-def _of_container(source: str, container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Sliced]]:
+def _of_container(container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a container."""
     given = list(container.sizes())
-    check_fields_given(source, given)
+    check_fields_given(given)
     names: dict[str, NDArray[Any]] = {}
-    fields: dict[str, Sliced] = {}
+    fields: dict[str, LazyArray] = {}
     for name in given:
-        with translated(source, name, _ACCEPTED):
+        with reader_errors_explained(name, _ACCEPTED):
             if _is_text(name):
                 names[name] = container.load(name)
             else:
@@ -139,44 +158,44 @@ def _of_container(source: str, container: Container, folder: Path) -> tuple[dict
     return names, fields
 
 
-def _of_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Sliced]]:
+def _of_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a table, which is read once, from its beginning to its end."""
     names: dict[str, NDArray[Any]] = {}
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
     for number, block in enumerate(table_blocks(path)):
         if not number:
-            check_fields_given(str(path), block)
+            check_fields_given(block)
             continue
         for name, array in block.items():
             if not _is_text(name):
                 spills[name].append(array)
             elif names.setdefault(name, array).tolist() != array.tolist():
                 found = f"'{names[name]}' and '{array}'"
-                raise LogError(path, f"column '{name}'", found, "one name, the same in every row")
+                raise FieldError(f"column '{name}'", found, "one name, the same in every row")
     if not spills:
-        raise LogError(path, "time", "no samples", "at least one sample")
+        raise FieldError("time", "no samples", "at least one sample")
     return names, {name: spill.array() for name, spill in spills.items()}
 
 
 def _is_text(name: str) -> bool:
-    return name in NAMES or SHAPES.get(name) == ()
+    return name in NAME_FIELDS or SHAPES.get(name) == ()
 
 
-def _checked(source: str, names: dict[str, NDArray[Any]], fields: dict[str, Sliced]) -> Blocks:
+def _checked(source: str, names: dict[str, NDArray[Any]], fields: dict[str, LazyArray]) -> LogBlocks:
     """The blocks, after checks of all that can be said before values are read."""
     time = fields.pop("time")
-    check_shape(source, "time", _empty(time), SHAPES["time"], {})
-    with translated(source, "time", _ACCEPTED):
-        stamps = as_real(source, "time", np.asarray(time[:]))
-    check_time(source, stamps)
+    check_shape("time", _empty(time), SHAPES["time"], {})
+    with reader_errors_explained("time", _ACCEPTED):
+        stamps = to_float64("time", np.asarray(time[:]))
+    check_time(stamps)
     sizes = {"N": len(stamps)}
-    for name, letter in NAMES.items():
-        sizes[letter] = len(as_names(source, name, names[name])) if name in names else 0
+    for name, letter in NAME_FIELDS.items():
+        sizes[letter] = len(parse_names(name, names[name])) if name in names else 0
     for name, array in fields.items():
-        check_shape(source, name, _empty(array), shape_of(name), sizes)
-    return Blocks(source, names, stamps, fields)
+        check_shape(name, _empty(array), field_shape(name), sizes)
+    return LogBlocks(source, names, stamps, fields)
 
 
-def _empty(array: Sliced) -> NDArray[Any]:
+def _empty(array: LazyArray) -> NDArray[Any]:
     """An array of the same shape that takes no memory."""
     return np.broadcast_to(np.zeros((), dtype=array.dtype if array.dtype.kind in "biuf" else bool), array.shape)

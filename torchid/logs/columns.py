@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError
+from torchid.errors import FieldError, current_file
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
-from torchid.logs.log import NAMES, SHAPES, VARIANTS, UnknownFieldError, is_quaternion, shape_of
-from torchid.parameters import COMPONENTS
-from torchid.text import is_plain, shown
+from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS, UnknownFieldError, field_shape, is_quaternion
+from torchid.parameters import WRENCH_COMPONENTS
+from torchid.text import excerpt, is_plain
 
 #: The one column of text: the same in every row.
-TEXT = "imu_frame"
-FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAMES)
+TEXT_COLUMN = "imu_frame"
+COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 #: Characters in the name of a column, which holds that of a joint.
 MAX_LETTERS = 2 * MAX_NAME
 
@@ -40,7 +40,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Layout:
+class TableLayout:
     """Which columns make up which field.
 
     Attributes:
@@ -55,19 +55,19 @@ class Layout:
         """The arrays of a log file: `take` gives the values (N,) of a column, once."""
         out: dict[str, NDArray[Any]] = {name: np.array(names, dtype=np.str_) for name, names in self.names.items()}
         for field, columns in self.columns.items():
-            if field == TEXT:
+            if field == TEXT_COLUMN:
                 out[field] = take(field)
                 continue
             flat = np.stack([take(column) for column in columns], axis=-1)
-            sizes = {letter: len(self.names.get(name, ())) for name, letter in NAMES.items()}
-            shape = [sizes[x] if isinstance(x, str) else x for x in shape_of(field)[1:]]
+            sizes = {letter: len(self.names.get(name, ())) for name, letter in NAME_FIELDS.items()}
+            shape = [sizes[x] if isinstance(x, str) else x for x in field_shape(field)[1:]]
             out[field] = flat.reshape(samples, *shape)
         if not out["joint_names"].size:  # a robot without joints
             out["joint_position"] = np.zeros((samples, 0))
         return out
 
 
-def layout_of(source: str, texts: Sequence[str]) -> Layout:
+def parse_header(texts: Sequence[str]) -> TableLayout:
     """Sort the columns of a table into fields.
 
     Joints, contacts and sensors are named by the columns of the first of their fields; the others have the same.
@@ -76,40 +76,40 @@ def layout_of(source: str, texts: Sequence[str]) -> Layout:
         LogError: a column that is unknown, given twice, missing or too many.
     """
     if len(texts) > MAX_COLUMNS:
-        raise LogError(source, "file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
+        raise FieldError("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
     given: dict[str, dict[str, Column]] = {}
     for text in texts:
         if len(text) > MAX_LETTERS or not is_plain(text):
-            found = f"a name of {len(text)} characters: {shown(text)}"
-            raise LogError(source, "header", found, f"names of one line and at most {MAX_LETTERS} characters")
-        column = parse_column(source, text)
+            found = f"a name of {len(text)} characters: {excerpt(text)}"
+            raise FieldError("header", found, f"names of one line and at most {MAX_LETTERS} characters")
+        column = parse_column(text)
         of_field = given.setdefault(column.field, {})
         if text in of_field:
-            raise LogError(source, f"column '{text}'", "given twice", "every column once")
+            raise FieldError(f"column '{text}'", "given twice", "every column once")
         of_field[text] = column
     names: dict[str, tuple[str, ...]] = {}
-    for field in FIELDS:
+    for field in COLUMN_FIELDS:
         of = _names_of(field)
         if of and of not in names and field in given:
             names[of] = tuple(dict.fromkeys(column.name for column in given[field].values()))
-    columns = {field: columns_of(field, names) for field in given}
+    columns = {field: column_names(field, names) for field in given}
     for field, expected in columns.items():
-        _check_complete(source, field, expected, given[field])
-    return Layout({"joint_names": (), **names}, columns)
+        _check_complete(field, expected, given[field])
+    return TableLayout({"joint_names": (), **names}, columns)
 
 
-def _check_complete(source: str, field: str, expected: Sequence[str], given: Mapping[str, Column]) -> None:
+def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, Column]) -> None:
     missing = [text for text in expected if text not in given]
     if missing:
-        accepted = f"every column of {spelled(field)}; a cell may be empty where nothing was measured"
-        raise LogError(source, f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
+        accepted = f"every column of {column_pattern(field)}; a cell may be empty where nothing was measured"
+        raise FieldError(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
     stray = list(given.keys() - set(expected))
     if stray:
         found = f"a {_KIND[_names_of(field)]} that the first field of its kind does not name"
-        raise LogError(source, f"column '{stray[0]}'", found, "the same names in all fields")
+        raise FieldError(f"column '{stray[0]}'", found, "the same names in all fields")
 
 
-def parse_column(source: str, text: str) -> Column:
+def parse_column(text: str) -> Column:
     """What the name of a column says: the field up to its first dot, a component after its last.
 
     Raises:
@@ -117,47 +117,47 @@ def parse_column(source: str, text: str) -> Column:
     """
     field, _, rest = text.partition(".")
     if _UNIT.search(text):
-        raise LogError(source, f"column '{text}'", "a unit in its name", "names without units, values in SI units")
-    if field not in FIELDS:
-        raise UnknownFieldError(source, f"column '{text}'", field, FIELDS)
-    components, of = components_of(field), _names_of(field)
+        raise FieldError(f"column '{text}'", "a unit in its name", "names without units, values in SI units")
+    if field not in COLUMN_FIELDS:
+        raise UnknownFieldError(current_file(), f"column '{text}'", field, COLUMN_FIELDS)
+    components, of = component_names(field), _names_of(field)
     if of and components:
         name, _, component = rest.rpartition(".")
     else:
         name, component = (rest, "") if of else ("", rest)
     column = Column(field, name, component)
     if str(column) != text or bool(name) != bool(of) or (component not in components if components else component):
-        raise LogError(source, f"column '{text}'", "no such part of this field", spelled(field))
+        raise FieldError(f"column '{text}'", "no such part of this field", column_pattern(field))
     return column
 
 
-def columns_of(field: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+def column_names(field: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     """The columns of a field in the order of its elements; `names` by field."""
     of = _names_of(field)
     return tuple(
         str(Column(field, name, component))
         for name in (names[of] if of else ("",))
-        for component in components_of(field) or ("",)
+        for component in component_names(field) or ("",)
     )
 
 
-def components_of(field: str) -> tuple[str, ...]:
+def component_names(field: str) -> tuple[str, ...]:
     """What the last part of a column's name may be, nothing for fields without components."""
-    size = shape_of(field)[-1] if len(shape_of(field)) > 1 else None
+    size = field_shape(field)[-1] if len(field_shape(field)) > 1 else None
     if size == 6:
-        return COMPONENTS
+        return WRENCH_COMPONENTS
     if is_quaternion(field):
         return tuple(field.rpartition("_")[2])
     return ("x", "y", "z") if size == 3 else ()
 
 
-def spelled(field: str) -> str:
+def column_pattern(field: str) -> str:
     """The names of a field's columns in general, such as `ft_wrench.<sensor>.{fx, fy, fz, mx, my, mz}`."""
-    of, components = _names_of(field), components_of(field)
+    of, components = _names_of(field), component_names(field)
     return str(Column(field, f"<{_KIND[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))
 
 
 def _names_of(field: str) -> str:
     """The field that names what a field has one of each for, or nothing."""
-    letter = next((x for x in shape_of(field)[1:2] if isinstance(x, str)), None)
-    return next((name for name, of in NAMES.items() if of == letter), "")
+    letter = next((x for x in field_shape(field)[1:2] if isinstance(x, str)), None)
+    return next((name for name, of in NAME_FIELDS.items() if of == letter), "")

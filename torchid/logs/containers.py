@@ -15,12 +15,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, TorchidError, during
-from torchid.guards import MAX_ARRAYS, check_fields, check_growth, check_names
+from torchid.errors import FieldError, LogError, TorchidError, during
+from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
-from torchid.logs.spill import Sliced, Spill
-from torchid.staging import whole_file
-from torchid.text import shown
+from torchid.logs.spill import LazyArray, Spill
+from torchid.staging import atomic_file
+from torchid.text import excerpt
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -60,7 +60,7 @@ class Npz:
                 array = np.lib.format.read_array(stream, allow_pickle=False)
         return array
 
-    def sliced(self, name: str, folder: Path) -> Sliced:
+    def sliced(self, name: str, folder: Path) -> LazyArray:
         """The array `name`, unpacked to a file in `folder`."""
         entry = self._entry(name)
         with self._archive.open(entry) as stream:
@@ -109,7 +109,7 @@ def _check_header(stream: Any, size: int) -> None:
         check_names(shape)
 
 
-SUFFIXES = (".npz", ".h5", ".hdf5")
+ARRAYS = (".npz", ".h5", ".hdf5")
 
 #: Characters of another package's message that a message of ours repeats.
 _LONGEST_TEXT = 200
@@ -124,26 +124,26 @@ class Container(Protocol):
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`; text is an array of str or of UTF-8 bytes."""
 
-    def sliced(self, name: str, folder: Path) -> Sliced:
+    def sliced(self, name: str, folder: Path) -> LazyArray:
         """The array `name`, not read before it is sliced; what has to be unpacked goes to a file in `folder`."""
 
 
 @contextlib.contextmanager
-def translated(source: str, field: str, accepted: str) -> Iterator[None]:
+def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
     """Turn whatever the readers raise on a damaged file, of which no list is ever complete, into one LogError."""
     try:
         yield
     except (TorchidError, Warning):
         raise
     except Exception as error:
-        text = shown(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
-        raise LogError(source, field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
+        text = excerpt(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
+        raise FieldError(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
 
 
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(SUFFIXES))
+    if suffix not in ARRAYS:
+        raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(ARRAYS))
     return suffix
 
 
@@ -158,10 +158,10 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
     suffix = _suffix(path)
     if not path.is_file():
         found = "a folder" if path.is_dir() else "no such file"
-        raise LogError(path, "file", found, f"an existing log ({', '.join(SUFFIXES)})")
+        raise LogError(path, "file", found, f"an existing log ({', '.join(ARRAYS)})")
     kind = "a complete .npz (zip) archive" if suffix == ".npz" else "a complete HDF5 file"
     with contextlib.ExitStack() as stack:
-        with translated(str(path), "file", kind):
+        with reader_errors_explained("file", kind):
             container: Container
             if suffix == ".npz":
                 container = Npz(stack.enter_context(open_archive(path)))
@@ -171,19 +171,19 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
             total = sum(container.sizes().values())
         if whole and total > MAX_ARRAYS:
             raise LogError(path, "file", f"arrays of {total} bytes", f"at most {MAX_ARRAYS} bytes in all")
-        check_growth(path, total)
+        check_unpacked_size(path, total)
         yield container
 
 
 @contextlib.contextmanager
-def appearing_whole(path: Path) -> Iterator[Path]:
+def atomic_output(path: Path) -> Iterator[Path]:
     """A temporary name that becomes `path` when the block ends without an error: no half-written file is left.
 
     Raises:
         LogError: the file cannot be written.
     """
     try:
-        with whole_file(path) as temporary, during("writing", path):
+        with atomic_file(path) as temporary, during("writing", path):
             yield temporary
     except OSError as error:
         raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error
@@ -192,7 +192,7 @@ def appearing_whole(path: Path) -> Iterator[Path]:
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays to a .npz, .h5 or .hdf5 file, which appears complete or not at all."""
     suffix = _suffix(path)
-    with appearing_whole(path) as temporary:
+    with atomic_output(path) as temporary:
         if suffix == ".npz":
             with temporary.open("xb") as stream:
                 named: dict[str, Any] = dict(arrays)
@@ -204,11 +204,11 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 TABLES = (".csv", ".parquet")
 #: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
 BAGS = (".bag", ".mcap", ".db3")
-WRITABLE = (*SUFFIXES, *TABLES)
+WRITABLE = (*ARRAYS, *TABLES)
 READABLE = (*WRITABLE, *BAGS)
 
 
-class Kind(Enum):
+class LogKind(Enum):
     """What a file holds: named arrays, one column per scalar, or messages."""
 
     ARRAYS = "arrays"
@@ -216,15 +216,15 @@ class Kind(Enum):
     BAG = "bag"
 
 
-def kind_to_read(path: Path) -> Kind:
+def existing_log_kind(path: Path) -> LogKind:
     """The kind of an existing log.
 
     Raises:
         LogError: there is none, or its extension is unknown.
     """
     if os.path.isdir(path):  # Path.is_dir raises where a name is too long
-        if bag_files(path):
-            return Kind.BAG
+        if list_bag_files(path):
+            return LogKind.BAG
         raise LogError(path, "file", "a folder", f"a log ({', '.join(READABLE)}), or a folder that ROS 2 recorded")
     kind = _kind(path, READABLE)
     if not os.path.isfile(path):
@@ -233,7 +233,7 @@ def kind_to_read(path: Path) -> Kind:
     return kind
 
 
-def kind_to_write(path: Path) -> Kind:
+def new_log_kind(path: Path) -> LogKind:
     """The kind of a log to be written.
 
     Raises:
@@ -242,15 +242,15 @@ def kind_to_write(path: Path) -> Kind:
     return _kind(path, WRITABLE)
 
 
-def bag_files(path: Path) -> list[Path]:
+def list_bag_files(path: Path) -> list[Path]:
     """The files of a bag: `path` itself, or those in the folder that ROS 2 recorded to."""
     if not os.path.isdir(path):
         return [path] if path.suffix.lower() in BAGS else []
     return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS[1:] and file.is_file())
 
 
-def _kind(path: Path, accepted: tuple[str, ...]) -> Kind:
+def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:
     suffix = path.suffix.lower()
     if suffix not in accepted:
         raise LogError(path, "file", f"extension '{path.suffix}'", ", ".join(accepted))
-    return Kind.ARRAYS if suffix in SUFFIXES else Kind.TABLE if suffix in TABLES else Kind.BAG
+    return LogKind.ARRAYS if suffix in ARRAYS else LogKind.TABLE if suffix in TABLES else LogKind.BAG

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError
 from torchid.guards import CHUNK_BYTES, MAX_CHUNKS, MAX_SMALL, check_fields, check_names
-from torchid.logs.spill import Sliced
+from torchid.logs.spill import LazyArray
 
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 _SUM = 4  # bytes that a checksum adds
@@ -38,7 +38,7 @@ def chunk_bytes(item: Any, file_size: int) -> int:
     return math.prod(item.chunks) * int(item.dtype.itemsize)
 
 
-class Measured:
+class MeasuredDataset:
     """A dataset of compressed chunks, each of which is measured before it is read for the first time."""
 
     def __init__(self, item: Any) -> None:
@@ -155,7 +155,7 @@ class Hdf5:
         """The array `name`; text is an array of UTF-8 bytes."""
         item = self._plain(name)
         if item.chunks:
-            Measured(item).measure(slice(None))
+            MeasuredDataset(item).measure(slice(None))
         text = self._h5py.check_string_dtype(item.dtype)
         if text is not None:
             check_names(item.shape, text.length or 0)
@@ -166,7 +166,7 @@ class Hdf5:
             return np.broadcast_to(np.array(None, dtype=object), item.shape)
         return np.asarray(item[()])
 
-    def sliced(self, name: str, folder: Path) -> Sliced:
+    def sliced(self, name: str, folder: Path) -> LazyArray:
         """The array `name`, read where it is sliced."""
         item = self._plain(name)
         chunk = chunk_bytes(item, self._file_size)
@@ -174,7 +174,7 @@ class Hdf5:
             raise ValueError(f"chunks of {chunk} bytes, more than the {MAX_SMALL} that are read at a time")
         if item.dtype.hasobject or not item.shape:
             return np.asarray(self.load(name))
-        return Measured(item) if item.chunks else item
+        return MeasuredDataset(item) if item.chunks else item
 
     def _plain(self, name: str) -> Any:
         """The dataset `name`; TypeError where it has no values in this file."""

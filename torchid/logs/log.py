@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, UnknownNameError
+from torchid.errors import FieldError, LogError, UnknownNameError, about_file
 from torchid.guards import MAX_LETTERS
-from torchid.parameters import COMPONENTS
-from torchid.text import is_plain, shown
+from torchid.parameters import WRENCH_COMPONENTS
+from torchid.text import excerpt, is_plain
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-Shape = tuple[str | int, ...]
+FieldShape = tuple[str | int, ...]
 
 #: Shape of every field that a `Log` holds, in the letters N samples, n joints, C contacts, F force/torque sensors.
-SHAPES: dict[str, Shape] = {
+SHAPES: dict[str, FieldShape] = {
     "time": ("N",),
     "joint_names": ("n",),
     "joint_position": ("N", "n"),
@@ -57,19 +57,19 @@ VARIANTS: dict[str, str] = {
 REQUIRED = ("time", "joint_names", "joint_position")
 
 #: Fields that name columns, and the letter of their number.
-NAMES = {"joint_names": "n", "contact_names": "C", "ft_names": "F"}
+NAME_FIELDS = {"joint_names": "n", "contact_names": "C", "ft_names": "F"}
 WRENCHES = ("contact_wrench_local", "contact_wrench_world")
 
 #: NaN marks "not measured here" in these fields and is an error in all others.
 NAN_ALLOWED = ("joint_torque", *WRENCHES, "ft_wrench")
 
-IMU = ("imu_frame", "imu_specific_force", "imu_angular_velocity")
+IMU_FIELDS = ("imu_frame", "imu_specific_force", "imu_angular_velocity")
 
 #: Fields that mean nothing without others.
-NEEDED: dict[str, tuple[str, ...]] = {
+REQUIRED_WITH: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("contact_active", *WRENCHES), ("contact_names", "contact_active")),
     "ft_wrench": ("ft_names",),
-    **dict.fromkeys((*IMU, "imu_angular_acceleration"), IMU),
+    **dict.fromkeys((*IMU_FIELDS, "imu_angular_acceleration"), IMU_FIELDS),
 }
 
 #: Pairs that say the same thing twice: a file gives at most one of each.
@@ -80,7 +80,7 @@ class UnknownFieldError(LogError, UnknownNameError):
     """A field of a log file that the log format does not know; the message lists the nearest that it knows."""
 
 
-def shape_of(name: str) -> Shape:
+def field_shape(name: str) -> FieldShape:
     """Shape of a field of a file, a `Log`'s own or one in its place."""
     return SHAPES[VARIANTS.get(name, name)]
 
@@ -90,15 +90,15 @@ def is_quaternion(name: str) -> bool:
     return name.startswith("base_quat")
 
 
-def labels_of(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+def column_labels(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     """The names of the columns of the field `name`, or nothing where they are plain components.
 
     Args:
         name: the field.
-        names: by `NAMES`.
+        names: by `NAME_FIELDS`.
     """
     of = f"{name.partition('_')[0]}_names"
-    return names[of] if of in NAMES else ()
+    return names[of] if of in NAME_FIELDS else ()
 
 
 #: How far a quaternion's norm may be from 1 before it is refused rather than renormalised.
@@ -109,7 +109,7 @@ ROUNDING = 4.0 * np.finfo(np.float64).eps
 LARGEST = 1e30
 
 
-def check_shape(source: str, name: str, array: NDArray[Any], letters: Shape, sizes: Mapping[str, int]) -> None:
+def check_shape(name: str, array: NDArray[Any], letters: FieldShape, sizes: Mapping[str, int]) -> None:
     """Raise LogError unless `array` has the shape `letters`, whose known sizes are `sizes`."""
     expected = [sizes.get(letter, letter) if isinstance(letter, str) else letter for letter in letters]
     fits = array.ndim == len(expected) and all(
@@ -118,18 +118,18 @@ def check_shape(source: str, name: str, array: NDArray[Any], letters: Shape, siz
     if not fits:
         named, sized = (f"({', '.join(map(str, shape))})" for shape in (letters, expected))
         accepted = named if named == sized else f"{named} = {sized}"
-        raise LogError(source, name, f"shape {array.shape}", f"shape {accepted}")
+        raise FieldError(name, f"shape {array.shape}", f"shape {accepted}")
 
 
-def as_real(source: str, name: str, array: NDArray[Any]) -> FloatArray:
+def to_float64(name: str, array: NDArray[Any]) -> FloatArray:
     """The array as float64 (itself where it is already), LogError unless it holds real numbers."""
     if array.dtype.kind not in "fiu":
-        raise LogError(source, name, f"values of type {array.dtype}", "real numbers")
+        raise FieldError(name, f"values of type {array.dtype}", "real numbers")
     with np.errstate(over="ignore"):  # a longdouble too large becomes inf, which check_finite reports
         return np.asarray(array, dtype=np.float64)
 
 
-def place(index: tuple[int, ...], labels: tuple[str, ...]) -> str:
+def describe_element(index: tuple[int, ...], labels: tuple[str, ...]) -> str:
     """An element's place in words: its sample and, where it has any, its channel.
 
     Args:
@@ -139,12 +139,10 @@ def place(index: tuple[int, ...], labels: tuple[str, ...]) -> str:
     words = f"sample {index[0]}"
     if len(index) > 1:
         words += f", {labels[index[1]] if labels else f'component {index[1]}'}"
-    return words + (f" {COMPONENTS[index[2]]}" if len(index) > 2 else "")
+    return words + (f" {WRENCH_COMPONENTS[index[2]]}" if len(index) > 2 else "")
 
 
-def check_finite(
-    source: str, name: str, values: FloatArray, *, allow_nan: bool = False, labels: tuple[str, ...] = ()
-) -> None:
+def check_finite(name: str, values: FloatArray, *, allow_nan: bool = False, labels: tuple[str, ...] = ()) -> None:
     """Raise LogError at the first value beyond `LARGEST`, infinite or, unless `allow_nan`, NaN."""
     bad = (values > LARGEST) | (values < -LARGEST)
     if not allow_nan:
@@ -153,75 +151,75 @@ def check_finite(
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
         accepted = f"numbers of at most {LARGEST:g}" if np.isfinite(values[index]) else "finite numbers"
         accepted += ", or NaN where nothing was measured" if allow_nan else ""
-        raise LogError(source, name, f"{values[index]} at {place(index, labels)}", accepted)
+        raise FieldError(name, f"{values[index]} at {describe_element(index, labels)}", accepted)
 
 
-def check_time(source: str, time: FloatArray) -> None:
+def check_time(time: FloatArray) -> None:
     """Raise LogError unless `time` (N,) [s] has samples, is finite and increases strictly."""
     if not len(time):
-        raise LogError(source, "time", "no samples", "at least one sample")
-    check_finite(source, "time", time)
+        raise FieldError("time", "no samples", "at least one sample")
+    check_finite("time", time)
     still = time[1:] <= time[:-1]
     if still.any():
         i = int(np.argmax(still))
         found = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
-        raise LogError(source, "time", found, "strictly increasing seconds")
+        raise FieldError("time", found, "strictly increasing seconds")
 
 
-def unit_quaternion(source: str, name: str, quat: FloatArray, allow_nan: bool = False) -> FloatArray:
+def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) -> FloatArray:
     """The quaternions (N, 4) with a norm of exactly one, LogError at the first whose norm is not one.
 
     With `allow_nan`, one that is NaN in part is NaN as a whole.
     """
-    check_finite(source, name, quat, allow_nan=allow_nan)
+    check_finite(name, quat, allow_nan=allow_nan)
     with np.errstate(over="ignore"):  # to a norm that is refused
         norm = np.linalg.norm(quat, axis=1)
     bad = ~((np.abs(norm - 1.0) <= QUATERNION_TOLERANCE) | np.isnan(norm))
     if bad.any():
         i = int(np.argmax(bad))
         found = f"norm {norm[i]:.6g} at sample {i}"
-        raise LogError(source, name, found, f"unit quaternions, to {QUATERNION_TOLERANCE:g}")
+        raise FieldError(name, found, f"unit quaternions, to {QUATERNION_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # what was normalised before stays as it is, to the last bit
     return np.asarray(quat / norm[:, None], dtype=np.float64)
 
 
-def as_names(source: str, name: str, array: NDArray[Any]) -> tuple[str, ...]:
+def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:
     """The names in a one-dimensional array of strings or UTF-8 bytes, LogError on anything else or a duplicate."""
-    check_shape(source, name, array, SHAPES[name] or (1,), {})
+    check_shape(name, array, SHAPES[name] or (1,), {})
     if array.size and array.dtype.kind not in "US":
-        raise LogError(source, name, f"values of type {array.dtype}", "strings")
+        raise FieldError(name, f"values of type {array.dtype}", "strings")
     try:
         names = tuple(item.decode() if isinstance(item, bytes) else str(item) for item in array.tolist())
     except UnicodeDecodeError as error:
-        raise LogError(source, name, f"bytes that are no text ({error})", "UTF-8 strings") from error
+        raise FieldError(name, f"bytes that are no text ({error})", "UTF-8 strings") from error
     seen: set[str] = set()
     for i, item in enumerate(names):
         if len(item) > MAX_LETTERS or not is_plain(item):
             accepted = f"printable names of at most {MAX_LETTERS} characters"
-            raise LogError(source, name, f"'{shown(item)}' at {i}", accepted)
+            raise FieldError(name, f"'{excerpt(item)}' at {i}", accepted)
         if not item or item in seen:
             found = f"'{item}' again at {i}" if item else f"an empty name at {i}"
-            raise LogError(source, name, found, "names that are all different")
+            raise FieldError(name, found, "names that are all different")
         seen.add(item)
     return names
 
 
-def as_frame(source: str, name: str, array: NDArray[Any]) -> str:
+def parse_frame(name: str, array: NDArray[Any]) -> str:
     """The one name in an array of strings or UTF-8 bytes of any shape, LogError on anything else."""
     if array.size != 1:
-        raise LogError(source, name, f"{array.size} values", "one name")
-    return as_names(source, name, array.reshape(1))[0]
+        raise FieldError(name, f"{array.size} values", "one name")
+    return parse_names(name, array.reshape(1))[0]
 
 
-def as_flags(source: str, name: str, array: NDArray[Any], labels: tuple[str, ...]) -> BoolArray:
+def parse_flags(name: str, array: NDArray[Any], labels: tuple[str, ...]) -> BoolArray:
     """The array as booleans, LogError unless it holds booleans or the numbers 0 and 1."""
     if array.dtype.kind == "b":
         return np.asarray(array, dtype=np.bool_)
-    values = as_real(source, name, array)
+    values = to_float64(name, array)
     bad = (values != 0.0) & (values != 1.0)
     if bad.any():
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
-        raise LogError(source, name, f"{values[index]:g} at {place(index, labels)}", "true and false, or 1 and 0")
+        raise FieldError(name, f"{values[index]:g} at {describe_element(index, labels)}", "true and false, or 1 and 0")
     return np.asarray(values, dtype=np.bool_)
 
 
@@ -297,15 +295,19 @@ class Log:
 
     def __post_init__(self) -> None:
         """Check shapes and types."""
-        check_shape(self.source, "time", self.time, SHAPES["time"], {})
-        sizes = {"N": len(self.time)} | {NAMES[name]: len(labels) for name, labels in self.names.items()}
+        with about_file(self.source):
+            self._check()
+
+    def _check(self) -> None:
+        check_shape("time", self.time, SHAPES["time"], {})
+        sizes = {"N": len(self.time)} | {NAME_FIELDS[name]: len(labels) for name, labels in self.names.items()}
         for name, array in self.arrays().items():
-            check_shape(self.source, name, array, SHAPES[name], sizes)
+            check_shape(name, array, SHAPES[name], sizes)
             wanted = np.dtype(np.bool_ if name == "contact_active" else np.float64)
             if array.dtype != wanted:
-                raise LogError(self.source, name, f"values of type {array.dtype}", str(wanted))
+                raise FieldError(name, f"values of type {array.dtype}", str(wanted))
         if all(getattr(self, name) is not None for name in WRENCHES):
-            raise LogError(self.source, WRENCHES[1], f"given together with {WRENCHES[0]}", "one of the two")
+            raise FieldError(WRENCHES[1], f"given together with {WRENCHES[0]}", "one of the two")
 
     def __len__(self) -> int:
         """Number of samples N."""
@@ -314,7 +316,17 @@ class Log:
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
         """Names of joints, contacts and force/torque sensors, by field."""
-        return {name: getattr(self, name) for name in NAMES}
+        return {name: getattr(self, name) for name in NAME_FIELDS}
+
+    @property
+    def contact_wrench_field(self) -> str:
+        """Name of the field that holds, or would hold, the contact wrenches."""
+        return WRENCHES[0] if self.contact_wrench_world is None else WRENCHES[1]
+
+    @property
+    def contact_wrench(self) -> FloatArray | None:
+        """Contact wrenches (N, C, 6) [N, N m] along whichever axes they were given; None if they were not."""
+        return self.contact_wrench_local if self.contact_wrench_world is None else self.contact_wrench_world
 
     def arrays(self) -> dict[str, FloatArray | BoolArray]:
         """Every array of the file format that is present and has the sample axis first, by field name."""

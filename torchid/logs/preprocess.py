@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,13 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import InputError, LogError, TorchidWarning
-from torchid.logs.log import NAN_ALLOWED, WRENCHES, BoolArray, FloatArray, Log, check_finite, labels_of, place
-from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, sign_continuous
-from torchid.logs.timeline import JITTER, Timeline, plan
+from torchid.errors import InputError, LogError, about_file, warn
+from torchid.logs.log import (
+    NAN_ALLOWED,
+    WRENCHES,
+    BoolArray,
+    FloatArray,
+    Log,
+    check_finite,
+    column_labels,
+    describe_element,
+)
+from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
+from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline
 
 #: Channels that are filtered together: as many as make the copies of a long log small against it.
-GROUP = 4
+CHANNELS_TOGETHER = 4
 
 
 @dataclass
@@ -65,24 +73,24 @@ class Coverage:
         return np.asarray((self.missing > 0) & (self.missing < self.measurable) & (self.values > 0))
 
 
-def check_coverage(log: Log, name: str, coverage: Coverage) -> None:
+def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
     """Warn of channels that become NaN throughout because they are NaN in some samples.
 
     Warns:
         TorchidWarning: names them.
     """
-    labels = labels_of(name, log.names)
+    labels = column_labels(name, log.names)
     broken = [
-        f"{place((0, *channel), labels).partition(', ')[2]}"
+        f"{describe_element((0, *channel), labels).partition(', ')[2]}"
         f" (samples {coverage.first[channel]} to {coverage.last[channel]})"
         for channel in map(tuple, np.argwhere(coverage.broken).tolist())
     ]
     if broken:
         message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
 
 
-def coverage_of(log: Log, name: str) -> Coverage:
+def measure_coverage(log: Log, name: str) -> Coverage:
     """Coverage of the field `name` of a log."""
     values: FloatArray = getattr(log, name)
     found = Coverage.of(values.shape[1:])
@@ -90,7 +98,7 @@ def coverage_of(log: Log, name: str) -> Coverage:
     return found
 
 
-def carry_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
+def resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
     """The field `name` (N, ...) at the output's stamps (K, ...), filtered like all others.
 
     A channel that is NaN throughout stays so. A wrench of an inactive contact is 0, whatever the log says. A channel
@@ -103,14 +111,14 @@ def carry_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage |
         coverage: of the field in the whole log; None where nothing is filtered or resampled.
     """
     values: FloatArray = getattr(log, name)
-    check_finite(log.source, name, values, allow_nan=True, labels=labels_of(name, log.names))
+    check_finite(name, values, allow_nan=True, labels=column_labels(name, log.names))
     if coverage is None:
         return values[timeline.kept]
     flags = log.contact_active if name in WRENCHES else None
     complete = np.argwhere(coverage.complete)
     out = np.full((len(timeline.at), *values.shape[1:]), np.nan)
-    for start in range(0, len(complete), GROUP):
-        columns = (slice(None), *complete[start : start + GROUP].T)
+    for start in range(0, len(complete), CHANNELS_TOGETHER):
+        columns = (slice(None), *complete[start : start + CHANNELS_TOGETHER].T)
         clean = values[columns]
         if flags is not None:
             clean[~flags[:, columns[1]]] = 0.0
@@ -157,7 +165,7 @@ def away_from_changes(log: Log, time: FloatArray, margin: float) -> BoolArray | 
     return ~near if near.any() else None
 
 
-def unloaded(time: FloatArray, active: BoolArray, margin: float = UNLOADED_MARGIN_S) -> BoolArray:
+def find_unloaded(time: FloatArray, active: BoolArray, margin: float = UNLOADED_MARGIN_S) -> BoolArray:
     """Which contacts are further than a margin from every sample in which they touch, (N, C).
 
     Args:
@@ -181,30 +189,30 @@ def unloaded_readings(log: Log, where: BoolArray | None = None) -> FloatArray | 
 
     Args:
         log: as recorded.
-        where: (N, C), from `unloaded`, of a part of a log; the result is an array then, whatever it holds.
+        where: (N, C), from `find_unloaded`, of a part of a log; the result is an array then, whatever it holds.
     """
     if log.contact_unloaded is not None:
         return log.contact_unloaded
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     if wrench is None or log.contact_active is None:
         return None
-    chosen = unloaded(log.time, log.contact_active) if where is None else where
+    chosen = find_unloaded(log.time, log.contact_active) if where is None else where
     if where is None and not chosen.any():
         return None
     return np.where(chosen[..., None], wrench, np.nan)
 
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
-CHAINS = (
+DERIVATIVE_CHAINS = (
     ("joint_position", "joint_velocity", "joint_acceleration"),
     ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world"),
     ("base_angular_velocity_base", "base_angular_acceleration_base"),
     ("imu_specific_force",),
     ("imu_angular_velocity", "imu_angular_acceleration"),
 )
-ANGULAR = CHAINS[2]
+ANGULAR = DERIVATIVE_CHAINS[2]
 #: A filtered quaternion whose norm falls below this turns faster than the filter lets pass.
-LEAST_NORM = 0.5
+MIN_QUATERNION_NORM = 0.5
 
 
 def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float | None = None) -> Log:
@@ -241,22 +249,23 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     Warns:
         TorchidWarning: a torque or wrench channel is NaN in some samples, or time stamps nearly coincide.
     """
-    timeline = timeline_of(log.source, log.time, differentiates(log), cutoff_hz, sample_rate_hz)
+    with about_file(log.source):
+        timeline = timeline_of(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
     if timeline is None:
         return log
-    coverage = {name: coverage_of(log, name) for name in gapless_fields(log, timeline)}
+    coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
-        check_coverage(log, name, found)
-    return on_timeline(log, timeline, coverage)
+        warn_of_gaps(log, name, found)
+    return move_to_timeline(log, timeline, coverage)
 
 
 def timeline_of(
-    source: str, time: FloatArray, differentiates: bool, cutoff_hz: float | None, sample_rate_hz: float | None
+    time: FloatArray, differentiates: bool, cutoff_hz: float | None, sample_rate_hz: float | None
 ) -> Timeline | None:
-    """How samples move in `preprocess`; None where nothing has to be done. Raises and warns as `plan`."""
+    """How samples move in `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
     if cutoff_hz is None and sample_rate_hz is None and not differentiates:
         return None
-    return plan(source, time, cutoff_hz, sample_rate_hz, differentiates)
+    return lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates)
 
 
 def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
@@ -266,7 +275,7 @@ def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
     return [name for name in NAN_ALLOWED if getattr(log, name) is not None]
 
 
-def on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> Log:
+def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> Log:
     """What `preprocess` makes of a log, or of a part of one.
 
     Args:
@@ -274,16 +283,22 @@ def on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) 
         timeline: stamps of it and of the result.
         coverage: by field, of those that have to be gapless.
     """
+    with about_file(log.source):
+        return dataclasses.replace(log, **_fields_on_timeline(log, timeline, coverage))
+
+
+def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:
+    """All that differs in the preprocessed log."""
     fields: dict[str, Any] = {
         "time": log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.at,
     }
-    for chain in CHAINS:
+    for chain in DERIVATIVE_CHAINS:
         fields |= _chain(log, chain, timeline)
     if log.base_quat_xyzw is not None:
-        fields |= _orientation(log, sign_continuous(log.base_quat_xyzw), timeline)
+        fields |= _orientation(log, make_sign_continuous(log.base_quat_xyzw), timeline)
     for name in NAN_ALLOWED:
         if getattr(log, name) is not None:
-            fields[name] = carry_measured(log, name, timeline, coverage.get(name))
+            fields[name] = resample_measured(log, name, timeline, coverage.get(name))
     if log.contact_active is not None:
         fields["contact_active"] = timeline.active(log.contact_active)
         if timeline.low_pass is not None or timeline.output is not None:
@@ -293,14 +308,14 @@ def on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) 
         fields["contact_unloaded"] = timeline.held(readings)
     if timeline.bandwidth_hz is not None:
         fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
-    return dataclasses.replace(log, **fields)
+    return fields
 
 
-def differentiates(log: Log) -> bool:
+def lacks_derivatives(log: Log) -> bool:
     """Whether any velocity or acceleration that can be derived is missing."""
     if log.base_quat_xyzw is not None and any(getattr(log, name) is None for name in ANGULAR):
         return True
-    for chain in CHAINS:
+    for chain in DERIVATIVE_CHAINS:
         given = [getattr(log, name) is not None for name in chain]
         if any(before and not after for before, after in zip(given, given[1:], strict=False)):
             return True
@@ -314,7 +329,7 @@ def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, Fl
         values = getattr(log, name)
         if values is None:
             continue
-        check_finite(log.source, name, values, labels=labels_of(name, log.names))
+        check_finite(name, values, labels=column_labels(name, log.names))
         missing = [name]
         while i + len(missing) < len(chain) and getattr(log, chain[i + len(missing)]) is None:
             missing.append(chain[i + len(missing)])
@@ -325,7 +340,7 @@ def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, Fl
 
 def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, FloatArray]:
     """The orientation at the output's stamps, and the angular rates that the log does not give."""
-    check_finite(log.source, "base_quat_xyzw", quat)
+    check_finite("base_quat_xyzw", quat)
     smoothed = timeline.smooth(quat)
     if log.base_angular_velocity_base is not None:
         orders = [0]
@@ -333,7 +348,7 @@ def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, Fl
         orders = [0, 1, 2] if log.base_angular_acceleration_base is None else [0, 1]
     q, *rates = timeline.evaluate(smoothed, orders)
     norm = np.linalg.norm(q, axis=1, keepdims=True)
-    if timeline.low_pass is not None and np.min(norm) < LEAST_NORM:
+    if timeline.low_pass is not None and np.min(norm) < MIN_QUATERNION_NORM:
         found = f"a cutoff that removes the base's rotation (norm of the filtered quaternion {np.min(norm):.2g})"
         raise InputError(log.source, "preprocessing.cutoff_hz", found, "a cutoff above the rate of that rotation")
     out = {"base_quat_xyzw": q / norm}

@@ -7,7 +7,7 @@ import numpy as np
 from torchid.logs.log import FloatArray
 
 
-def sign_continuous(quat: FloatArray) -> FloatArray:
+def make_sign_continuous(quat: FloatArray) -> FloatArray:
     """The same rotations without sign flips between neighbours, (N, 4) in any order; itself where it has none.
 
     q and -q are one rotation, but components that jump sign cannot be interpolated or filtered. Rows of NaN are passed
@@ -16,7 +16,7 @@ def sign_continuous(quat: FloatArray) -> FloatArray:
     known = ~np.isnan(quat).any(axis=1)
     if not known.all():
         out = quat.copy()
-        out[known] = sign_continuous(quat[known])
+        out[known] = make_sign_continuous(quat[known])
         return out
     flips = np.einsum("ni,ni->n", quat[1:], quat[:-1]) < 0.0
     if not flips.any():
@@ -26,7 +26,7 @@ def sign_continuous(quat: FloatArray) -> FloatArray:
     return quat * sign
 
 
-def rotate(quat_xyzw: FloatArray, vector_base: FloatArray) -> FloatArray:
+def rotate_to_world(quat_xyzw: FloatArray, vector_base: FloatArray) -> FloatArray:
     """Components (N, 3) in the world of vectors (N, 3) given in the base frame, for unit quaternions (N, 4)."""
     axis, w = quat_xyzw[:, :3], quat_xyzw[:, 3:]
     turn = 2.0 * np.cross(axis, vector_base)
@@ -45,9 +45,9 @@ def compose(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.concatenate([w * v2 + w2 * v + np.cross(v, v2), scalar], axis=-1)
 
 
-def rotate_back(quat_xyzw: FloatArray, vector_world: FloatArray) -> FloatArray:
+def rotate_to_base(quat_xyzw: FloatArray, vector_world: FloatArray) -> FloatArray:
     """Components (N, 3) in the base frame of vectors (N, 3) given in the world, for unit quaternions (N, 4)."""
-    return rotate(inverse(quat_xyzw), vector_world)
+    return rotate_to_world(inverse(quat_xyzw), vector_world)
 
 
 def _divide(quat: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -10,32 +10,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, during
-from torchid.logs.containers import Kind, kind_to_read, kind_to_write, open_container, save_arrays, translated
+from torchid.errors import FieldError, about_file, current_file, during
+from torchid.logs.containers import (
+    LogKind,
+    existing_log_kind,
+    new_log_kind,
+    open_container,
+    reader_errors_explained,
+    save_arrays,
+)
 from torchid.logs.log import (
     EXCLUSIVE,
-    NAMES,
+    NAME_FIELDS,
     NAN_ALLOWED,
-    NEEDED,
     REQUIRED,
+    REQUIRED_WITH,
     SHAPES,
     VARIANTS,
     FloatArray,
     Log,
     UnknownFieldError,
-    as_flags,
-    as_frame,
-    as_names,
-    as_real,
     check_finite,
     check_shape,
     check_time,
+    column_labels,
+    field_shape,
     is_quaternion,
-    labels_of,
-    shape_of,
-    unit_quaternion,
+    normalize_quaternions,
+    parse_flags,
+    parse_frame,
+    parse_names,
+    to_float64,
 )
-from torchid.logs.quaternion import rotate, rotate_back, sign_continuous
+from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.ros.read import read_bag
 from torchid.logs.ros.topics import Topics
 from torchid.logs.tables import read_table, save_table
@@ -65,102 +72,101 @@ def read_log(
     Warns:
         TorchidWarning: of a bag, that messages carry no time or come twice, or that a channel is NaN in some of them.
     """
-    source = os.fspath(path)
-    with during("reading", source):
-        kind = kind_to_read(Path(path))
-        if kind is Kind.ARRAYS:
-            raw = _arrays(source)
+    with during("reading", os.fspath(path)):
+        kind = existing_log_kind(Path(path))
+        if kind is LogKind.ARRAYS:
+            raw = _arrays(Path(path))
         else:
-            raw = read_table(Path(path)) if kind is Kind.TABLE else read_bag(Path(path), topics, progress)
-            check_fields_given(source, raw)
-        return checked_log(source, raw, allow_gaps)
+            raw = read_table(Path(path)) if kind is LogKind.TABLE else read_bag(Path(path), topics, progress)
+            check_fields_given(raw)
+        return build_log(raw, allow_gaps)
 
 
-def checked_log(source: str, raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
+def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
     """The log of the fields of a file, in canonical frames and orders, LogError where one is not what it should be."""
-    return _canonical(source, _checked(source, raw, allow_gaps))
+    return _canonical(_checked(raw, allow_gaps))
 
 
-def check_fields_given(source: str, names: Collection[str]) -> None:
+def check_fields_given(names: Collection[str]) -> None:
     """Raise LogError unless the names of a file's fields are known and go together."""
-    _check_names(source, names)
-    _check_combination(source, names)
+    _check_names(names)
+    _check_combination(names)
 
 
-def _arrays(source: str) -> dict[str, NDArray[Any]]:
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz or HDF5 file, none of them before all names are known to be right."""
-    with open_container(Path(source)) as container:
+    with open_container(path) as container:
         names = list(container.sizes())
-        check_fields_given(source, names)
+        check_fields_given(names)
         raw: dict[str, NDArray[Any]] = {}
         for name in names:
-            with translated(source, name, "a plain array of numbers, truth values or text"):
+            with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
                 raw[name] = container.load(name)
     return raw
 
 
-def _check_names(source: str, names: Collection[str]) -> None:
+def _check_names(names: Collection[str]) -> None:
     """Raise LogError on unknown or missing fields."""
     known = (*SHAPES, *VARIANTS)
     for name in names:
         if name not in known:
-            raise UnknownFieldError(source, "field", name, known)
+            raise UnknownFieldError(current_file(), "field", name, known)
     for name in REQUIRED:
         if name not in names:
-            raise LogError(source, name, "missing", f"a log with {', '.join(REQUIRED)}")
+            raise FieldError(name, "missing", f"a log with {', '.join(REQUIRED)}")
 
 
-def _check_combination(source: str, names: Collection[str]) -> None:
+def _check_combination(names: Collection[str]) -> None:
     """Raise LogError on fields that say the same thing twice or that need a field that is missing."""
     for one, other in EXCLUSIVE:
         if one in names and other in names:
-            raise LogError(source, one, f"given together with {other}", "one of the two")
-    for name, others in NEEDED.items():
+            raise FieldError(one, f"given together with {other}", "one of the two")
+    for name, others in REQUIRED_WITH.items():
         missing = [other for other in others if other not in names]
         if name in names and missing:
-            raise LogError(source, name, f"given without {missing[0]}", f"{name} together with {missing[0]}")
+            raise FieldError(name, f"given without {missing[0]}", f"{name} together with {missing[0]}")
     for name, canonical in VARIANTS.items():
         if name in names and not is_quaternion(name) and not any(map(is_quaternion, names)):
             accepted = f"with base_quat_wxyz or base_quat_xyzw, or as {canonical}"
-            raise LogError(source, name, "given without the base's orientation", accepted)
+            raise FieldError(name, "given without the base's orientation", accepted)
 
 
-def _checked(source: str, raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:
+def _checked(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:
     """Every field of the file in its canonical type, each checked by itself and against the sizes N, n, C."""
-    names = {name: as_names(source, name, raw[name]) if name in raw else () for name in NAMES}
-    check_shape(source, "time", raw["time"], SHAPES["time"], {})
-    sizes = {"N": len(raw["time"])} | {NAMES[name]: len(labels) for name, labels in names.items()}
-    time = as_real(source, "time", raw["time"])
-    check_time(source, time)
+    names = {name: parse_names(name, raw[name]) if name in raw else () for name in NAME_FIELDS}
+    check_shape("time", raw["time"], SHAPES["time"], {})
+    sizes = {"N": len(raw["time"])} | {NAME_FIELDS[name]: len(labels) for name, labels in names.items()}
+    time = to_float64("time", raw["time"])
+    check_time(time)
     fields: dict[str, Any] = {**names, "time": time}
     if "imu_frame" in raw:
-        fields["imu_frame"] = as_frame(source, "imu_frame", raw["imu_frame"])
+        fields["imu_frame"] = parse_frame("imu_frame", raw["imu_frame"])
     for name, array in raw.items():
         if name in fields:
             continue
-        check_shape(source, name, array, shape_of(name), sizes)
-        labels = labels_of(name, names)
+        check_shape(name, array, field_shape(name), sizes)
+        labels = column_labels(name, names)
         if name == "contact_active":
-            fields[name] = as_flags(source, name, array, labels)
+            fields[name] = parse_flags(name, array, labels)
             continue
-        values = as_real(source, name, array)
-        check_finite(source, name, values, allow_nan=allow_gaps or name in NAN_ALLOWED, labels=labels)
-        fields[name] = unit_quaternion(source, name, values, allow_gaps) if is_quaternion(name) else values
+        values = to_float64(name, array)
+        check_finite(name, values, allow_nan=allow_gaps or name in NAN_ALLOWED, labels=labels)
+        fields[name] = normalize_quaternions(name, values, allow_gaps) if is_quaternion(name) else values
     return fields
 
 
-def _canonical(source: str, fields: dict[str, Any]) -> Log:
+def _canonical(fields: dict[str, Any]) -> Log:
     """The log with the file's variants brought to canonical order and frames."""
     if "base_quat_wxyz" in fields:
         fields["base_quat_xyzw"] = np.roll(fields.pop("base_quat_wxyz"), -1, axis=1)
     if "base_quat_xyzw" in fields:
-        quat: FloatArray = sign_continuous(fields["base_quat_xyzw"])
+        quat: FloatArray = make_sign_continuous(fields["base_quat_xyzw"])
         fields["base_quat_xyzw"] = quat
         for name, canonical in VARIANTS.items():
             if name in fields:
-                turn = rotate if name.endswith("_base") else rotate_back
+                turn = rotate_to_world if name.endswith("_base") else rotate_to_base
                 fields[canonical] = turn(quat, fields.pop(name))
-    return Log(source=source, **fields)
+    return Log(source=current_file(), **fields)
 
 
 def write_log(log: Log, path: str | os.PathLike[str]) -> None:
@@ -171,7 +177,7 @@ def write_log(log: Log, path: str | os.PathLike[str]) -> None:
     Raises:
         LogError: the extension is unknown or the file cannot be written.
     """
-    save = save_table if kind_to_write(Path(path)) is Kind.TABLE else save_arrays
+    save = save_table if new_log_kind(Path(path)) is LogKind.TABLE else save_arrays
     arrays: dict[str, NDArray[Any]] = {
         name: array
         for name, array in log.arrays().items()
@@ -182,4 +188,5 @@ def write_log(log: Log, path: str | os.PathLike[str]) -> None:
             arrays[name] = np.array(names, dtype=np.str_)
     if log.imu_frame:
         arrays["imu_frame"] = np.array(log.imu_frame)
-    save(Path(path), arrays)
+    with about_file(os.fspath(path)):
+        save(Path(path), arrays)

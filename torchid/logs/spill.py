@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torchid.errors import InputError
 
 
-class Sliced(Protocol):
+class LazyArray(Protocol):
     """An array that is in memory only where it is sliced."""
 
     @property

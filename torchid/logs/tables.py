@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, install
-from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_growth, check_names
-from torchid.logs.columns import TEXT, Layout, columns_of, layout_of
-from torchid.logs.containers import appearing_whole, translated
-from torchid.logs.log import NAMES
-from torchid.text import shown
+from torchid.errors import FieldError, LogError, how_to_install
+from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_size
+from torchid.logs.columns import TEXT_COLUMN, TableLayout, column_names, parse_header
+from torchid.logs.containers import atomic_output, reader_errors_explained
+from torchid.logs.log import NAME_FIELDS
+from torchid.text import excerpt
 
 #: Bytes of a CSV file that are parsed at a time; no row may be longer.
 _BLOCK = 2**22
@@ -48,7 +48,7 @@ def read_table(path: Path) -> dict[str, NDArray[Any]]:
         (layout, _), *found = _batches(pa, path)
         batches = [batch for _, batch in found]
         del found
-        return _fields(pa, path, layout, batches)
+        return _fields(pa, layout, batches)
 
 
 def table_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
@@ -56,14 +56,14 @@ def table_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
     pa = _pyarrow(path)
     with _complete(path):
         for layout, batch in _batches(pa, path, whole=False):
-            yield _fields(pa, path, layout, [] if batch is None else [batch])
+            yield _fields(pa, layout, [] if batch is None else [batch])
 
 
 def _complete(path: Path) -> AbstractContextManager[None]:
-    return translated(str(path), "file", f"a complete {path.suffix.lower()} file")
+    return reader_errors_explained("file", f"a complete {path.suffix.lower()} file")
 
 
-def _fields(pa: Any, path: Path, layout: Layout, batches: list[Any]) -> dict[str, NDArray[Any]]:
+def _fields(pa: Any, layout: TableLayout, batches: list[Any]) -> dict[str, NDArray[Any]]:
     """The fields of some rows; forgets the batches."""
     table = pa.Table.from_batches(batches) if batches else None
     samples = 0 if table is None else table.num_rows
@@ -73,7 +73,7 @@ def _fields(pa: Any, path: Path, layout: Layout, batches: list[Any]) -> dict[str
 
     def take(column: str) -> NDArray[Any]:
         # popped, which frees the memory of what has been taken
-        return _values(pa, path, column, columns.pop(column)) if columns else np.zeros(0)
+        return _values(pa, column, columns.pop(column)) if columns else np.zeros(0)
 
     return layout.fields(samples, take)
 
@@ -85,13 +85,13 @@ def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         LogError: a name that no column can carry, or the file cannot be written.
     """
     pa = _pyarrow(path)
-    columns = _columns(path, arrays)
-    with appearing_whole(path) as temporary:
+    columns = _columns(arrays)
+    with atomic_output(path) as temporary:
         if path.suffix.lower() == ".parquet":
             import pyarrow.parquet
 
             table = pa.table({text: pa.array(np.ascontiguousarray(x)) for text, x in columns.items()})
-            pyarrow.parquet.write_table(table, temporary, use_dictionary=[TEXT], write_page_checksum=True)
+            pyarrow.parquet.write_table(table, temporary, use_dictionary=[TEXT_COLUMN], write_page_checksum=True)
         else:
             _save_csv(pa, temporary, columns)
 
@@ -102,20 +102,20 @@ def _pyarrow(path: Path) -> Any:
         import pyarrow
     except ImportError as error:
         found = f"a {path.suffix.lower()} file, but pyarrow is not installed"
-        raise LogError(path, "file", found, f"a .npz or .h5 file, or {install('tables')}") from error
+        raise LogError(path, "file", found, f"a .npz or .h5 file, or {how_to_install('tables')}") from error
     return pyarrow
 
 
-def _batches(pa: Any, path: Path, whole: bool = True) -> Iterator[tuple[Layout, Any]]:
+def _batches(pa: Any, path: Path, whole: bool = True) -> Iterator[tuple[TableLayout, Any]]:
     """The layout of a table, with None first, then with some of its rows after the other."""
     return (_read_csv if path.suffix.lower() == ".csv" else _read_parquet)(pa, path, whole)
 
 
-def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[Layout, Any]]:
+def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayout, Any]]:
     import pyarrow.csv
 
     texts, empty = _header(path)
-    layout = layout_of(str(path), texts)
+    layout = parse_header(texts)
     yield layout, None
     if empty:
         return
@@ -139,7 +139,7 @@ def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[Layout, Any]]:
                 raise
             column, row, found = bad.groups()
             where = "" if row is None else f" in row {row}"
-            text = f"'{shown(found.strip(_QUOTES))}'{where}"
+            text = f"'{excerpt(found.strip(_QUOTES))}'{where}"
             raise LogError(path, f"column '{texts[int(column)]}'", text, _NUMBERS) from error
 
 
@@ -158,23 +158,25 @@ def _header(path: Path) -> tuple[list[str], bool]:
     except csv.Error as error:
         raise LogError(path, "header", f"no line of names ({error})", "names separated by commas") from error
     if len(texts) == 1 and re.search("[;\t]", text):
-        raise LogError(path, "header", f"'{shown(text)}'", "names separated by commas")
+        raise LogError(path, "header", f"'{excerpt(text)}'", "names separated by commas")
     return texts, empty
 
 
-def _read_parquet(pa: Any, path: Path, whole: bool) -> Iterator[tuple[Layout, Any]]:
+def _read_parquet(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayout, Any]]:
     import pyarrow.parquet
 
     with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
         texts = file.schema_arrow.names
-        layout = layout_of(str(path), texts)
+        layout = parse_header(texts)
     # as a dictionary, else one long text could fill the memory by being repeated
-    with pyarrow.parquet.ParquetFile(path, read_dictionary=[TEXT] if TEXT in texts else None, **_PARQUET) as file:
+    with pyarrow.parquet.ParquetFile(
+        path, read_dictionary=[TEXT_COLUMN] if TEXT_COLUMN in texts else None, **_PARQUET
+    ) as file:
         for field in file.schema_arrow:
             number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type)
-            fits = pa.types.is_dictionary(field.type) if field.name == TEXT else number
+            fits = pa.types.is_dictionary(field.type) if field.name == TEXT_COLUMN else number
             if not fits and not (_is_text(field.name) and pa.types.is_boolean(field.type)):
-                accepted = "text" if field.name == TEXT else "real numbers"
+                accepted = "text" if field.name == TEXT_COLUMN else "real numbers"
                 raise LogError(path, f"column '{field.name}'", f"values of type {field.type}", accepted)
         _check_size(path, file.metadata.num_rows, len(texts), whole)
         yield layout, None
@@ -214,15 +216,15 @@ def _check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
     if whole and 8 * rows * columns > MAX_ARRAYS:
         accepted = f"at most {MAX_ARRAYS} bytes in all"
         raise LogError(path, "file", f"{rows} rows of {columns} columns", accepted)
-    check_growth(path, 8 * rows * columns)
+    check_unpacked_size(path, 8 * rows * columns)
 
 
 def _is_text(column: str) -> bool:
     """Whether a CSV file may hold words there: the IMU's frame, and `true` and `false`."""
-    return column == TEXT or column.startswith("contact_active.")
+    return column == TEXT_COLUMN or column.startswith("contact_active.")
 
 
-def _values(pa: Any, path: Path, column: str, values: Any) -> NDArray[Any]:
+def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
     """A column's values (N,), NaN where a cell is empty; of text the one word that all rows hold."""
     if not pa.types.is_dictionary(values.type):
         if pa.types.is_boolean(values.type) and values.null_count:
@@ -230,44 +232,44 @@ def _values(pa: Any, path: Path, column: str, values: Any) -> NDArray[Any]:
         return np.asarray(values.to_numpy())
     values = values.unify_dictionaries()
     words = values.unique().to_pylist()
-    if column == TEXT:
+    if column == TEXT_COLUMN:
         if len(words) != 1 or words[0] is None:
-            found = " and ".join("an empty cell" if word is None else f"'{shown(word)}'" for word in words[:2])
-            raise LogError(path, f"column '{column}'", found, "one name, the same in every row")
+            found = " and ".join("an empty cell" if word is None else f"'{excerpt(word)}'" for word in words[:2])
+            raise FieldError(f"column '{column}'", found, "one name, the same in every row")
         check_names([1], len(words[0]))
         return np.array(words[0].strip())
-    numbers = {word: np.nan if word is None else _number(path, column, word) for word in words}
+    numbers = {word: np.nan if word is None else _number(column, word) for word in words}
     coded = pa.array([numbers[word] for word in words])
     codes = pa.compute.index_in(values.cast(pa.string()), pa.array(words, pa.string()))
     return np.asarray(coded.take(codes.combine_chunks()).to_numpy(zero_copy_only=False))
 
 
-def _number(path: Path, column: str, word: str) -> float:
+def _number(column: str, word: str) -> float:
     try:
         return float(_FLAGS.get(word.strip().lower(), word))
     except ValueError as error:
-        raise LogError(path, f"column '{column}'", f"'{shown(word)}'", "true and false, or 1 and 0") from error
+        raise FieldError(f"column '{column}'", f"'{excerpt(word)}'", "true and false, or 1 and 0") from error
 
 
-def _columns(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """The columns of a log, by name."""
-    names = {name: tuple(map(str, arrays[name])) for name in NAMES if name in arrays}
+    names = {name: tuple(map(str, arrays[name])) for name in NAME_FIELDS if name in arrays}
     columns: dict[str, NDArray[Any]] = {}
     for field, array in arrays.items():
-        if field in NAMES:
+        if field in NAME_FIELDS:
             continue
-        if field == TEXT:
+        if field == TEXT_COLUMN:
             columns[field] = np.full(len(arrays["time"]), str(array))
             continue
         flat = array.reshape(len(array), -1)
-        for j, text in enumerate(columns_of(field, names)):
+        for j, text in enumerate(column_names(field, names)):
             if text != text.strip():
-                raise LogError(path, f"column '{text}'", "a space at its end", "names without")
+                raise FieldError(f"column '{text}'", "a space at its end", "names without")
             columns[text] = flat[:, j]
-    layout = layout_of(str(path), list(columns))
+    layout = parse_header(list(columns))
     for name, given in names.items():
         if given and layout.names.get(name) != given:
-            raise LogError(path, name, "names without any values", "a .npz or .h5 file, or a field of them")
+            raise FieldError(name, "names without any values", "a .npz or .h5 file, or a field of them")
     return columns
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import numbers
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,15 +11,15 @@ import numpy as np
 from scipy import signal
 from scipy.interpolate import make_interp_spline
 
-from torchid.errors import InputError, LogError, TorchidWarning
+from torchid.errors import FieldError, InputError, current_file, warn
 from torchid.logs.log import BoolArray, FloatArray, check_time
 
 #: Samples per spline. One spline through a long log needs 22 numbers a sample for its banded matrix alone; through
 #: blocks the temporaries stay small.
-BLOCK = 4096
+SPLINE_BLOCK = 4096
 #: Samples added on both sides of a block: on a uniform grid a sample's influence fades by 0.43 per step, so nothing
 #: is left of the cut after 128.
-OVERLAP = 128
+SPLINE_OVERLAP = 128
 
 
 def spline_degree(samples: int) -> int:
@@ -29,7 +28,7 @@ def spline_degree(samples: int) -> int:
 
 
 def spline_derivatives(
-    time: FloatArray, values: FloatArray, at: FloatArray, orders: Sequence[int], block: int = BLOCK
+    time: FloatArray, values: FloatArray, at: FloatArray, orders: Sequence[int], block: int = SPLINE_BLOCK
 ) -> list[FloatArray]:
     """Derivatives of the spline through `values` (with not-a-knot ends), one array (K, ...) per order.
 
@@ -48,7 +47,7 @@ def spline_derivatives(
         first = int(np.searchsorted(at, time[start])) if start else 0
         last = int(np.searchsorted(at, time[stop])) if stop < len(time) else len(at)
         if first < last:
-            near = slice(max(0, start - OVERLAP), stop + OVERLAP)
+            near = slice(max(0, start - SPLINE_OVERLAP), stop + SPLINE_OVERLAP)
             spline = make_interp_spline(time[near], flat[near], k=degree)
             for derivative, order in zip(out, orders, strict=True):
                 derivative[first:last] = spline(at[first:last], order)
@@ -132,9 +131,9 @@ class Timeline:
         reach into the neighbourhood, and the spline is drawn through the same blocks of samples.
         """
         at = self.at[first:last]
-        beyond = OVERLAP + (0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding)
+        beyond = SPLINE_OVERLAP + (0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding)
         grid = _around(self.grid, at, beyond)
-        samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], OVERLAP)
+        samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], SPLINE_OVERLAP)
         native = self.native[samples]
         start = self.kept.start - grid.start
         return samples, replace(
@@ -186,7 +185,10 @@ def _around(stamps: FloatArray, at: FloatArray, beyond: int) -> slice:
     """Samples up to some beyond the first and last of `at`, in whole blocks of the spline."""
     first = int(np.searchsorted(stamps, at[0], side="right")) - 1 - beyond
     last = int(np.searchsorted(stamps, at[-1])) + 1 + beyond
-    return slice(max(0, first // BLOCK * BLOCK), min(len(stamps), -(-last // BLOCK) * BLOCK + OVERLAP))
+    return slice(
+        max(0, first // SPLINE_BLOCK * SPLINE_BLOCK),
+        min(len(stamps), -(-last // SPLINE_BLOCK) * SPLINE_BLOCK + SPLINE_OVERLAP),
+    )
 
 
 #: Order of the Butterworth filter, which runs forward and backward: the gain at the cutoff is 1/2.
@@ -211,13 +213,12 @@ SHORTEST_STEP = 0.1
 FASTEST = 10.0
 
 
-def plan(
-    source: str, time: FloatArray, cutoff_hz: float | None, sample_rate_hz: float | None, differentiates: bool
+def lay_out_timeline(
+    time: FloatArray, cutoff_hz: float | None, sample_rate_hz: float | None, differentiates: bool
 ) -> Timeline:
     """Lay out the stamps of a log that is filtered, resampled or differentiated.
 
     Args:
-        source: the log's file name.
         time: (N,) [s].
         cutoff_hz: low-pass cutoff [Hz], None for no filter.
         sample_rate_hz: output's sample rate [Hz], None for the log's own.
@@ -227,44 +228,44 @@ def plan(
         InputError: the cutoff or the sample rate does not suit the log.
         LogError: the time stamps cannot be filtered, resampled or differentiated.
     """
-    check_time(source, time)
+    check_time(time)
     fewest = FEWEST_DIFFERENTIATED if differentiates else FEWEST_FILTERED
     if len(time) < fewest:
         accepted = f"at least {fewest} to filter, resample or differentiate"
-        raise LogError(source, "time", f"{len(time)} samples", accepted)
+        raise FieldError("time", f"{len(time)} samples", accepted)
     native = time - time[0]
-    step = _median_step(source, native)
+    step = _median_step(native)
     grid, low_pass = native, None
     dropped = DROPPED_SAMPLES if differentiates else 0
     kept = slice(dropped, len(native) - dropped)
     if cutoff_hz is not None:
-        _check_rate(source, "cutoff_hz", cutoff_hz, 0.5 / step, "half the log's median sample rate")
+        _check_rate("cutoff_hz", cutoff_hz, 0.5 / step, "half the log's median sample rate")
         if np.max(np.abs(np.diff(native) - step)) > JITTER * step:
             grid = step * np.arange(math.floor(native[-1] / step + JITTER) + 1)
         low_pass = LowPass(
             sections=signal.butter(FILTER_ORDER, cutoff_hz, fs=1.0 / step, output="sos"),
             padding=max(15, math.ceil(1.0 / (cutoff_hz * step))),
         )
-        kept = _unspoiled(source, grid, step, cutoff_hz, low_pass.padding)
+        kept = _unspoiled(grid, step, cutoff_hz, low_pass.padding)
     output = None
     if sample_rate_hz is not None:
         accepted = f"{FASTEST:g} times the log's median sample rate"
-        _check_rate(source, "sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
+        _check_rate("sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
         if cutoff_hz is not None and cutoff_hz >= 0.5 * sample_rate_hz:
             accepted = f"a rate above {2.0 * cutoff_hz:g} Hz, twice the cutoff, so that nothing aliases"
-            raise InputError(source, "preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
+            raise InputError(current_file(), "preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
         output = _uniform(grid[kept], sample_rate_hz)
         if len(output) < 2:
             found = f"{sample_rate_hz:g}, which leaves one sample"
             accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
-            raise InputError(source, "preprocessing.sample_rate_hz", found, accepted)
+            raise InputError(current_file(), "preprocessing.sample_rate_hz", found, accepted)
     if low_pass is None or cutoff_hz is None:
         return Timeline(native, grid, kept, output, None, 0.0, float(time[0]))
     passed = low_pass.noise_share * 0.5 / float(np.median(np.diff(grid)))
     return Timeline(native, grid, kept, output, low_pass, REACH_PERIODS / cutoff_hz, float(time[0]), passed)
 
 
-def _median_step(source: str, native: FloatArray) -> float:
+def _median_step(native: FloatArray) -> float:
     """The median step [s]; LogError on a step too long to draw a spline across, a warning on very short ones."""
     steps = np.diff(native)
     step = float(np.median(steps))
@@ -272,32 +273,32 @@ def _median_step(source: str, native: FloatArray) -> float:
     if steps[longest] > LONGEST_STEP * step:
         found = f"a step of {steps[longest]:.6g} s after sample {longest}"
         accepted = f"steps of at most {LONGEST_STEP:g} times the median of {step:.6g} s; split the log there"
-        raise LogError(source, "time", found, accepted)
+        raise FieldError("time", found, accepted)
     if steps[shortest] < SHORTEST_STEP * step:
         message = (
-            f"{source}: time: a step of {steps[shortest]:.6g} s after sample {shortest}, the median being {step:.6g} s:"
-            " interpolation multiplies the noise there"
+            f"{current_file()}: time: a step of {steps[shortest]:.6g} s after sample {shortest}, the median being"
+            f" {step:.6g} s: interpolation multiplies the noise there"
         )
-        warnings.warn(message, TorchidWarning, stacklevel=5)
+        warn(message)
     return step
 
 
-def _check_rate(source: str, field: str, value: object, limit: float, meaning: str) -> None:
+def _check_rate(field: str, value: object, limit: float, meaning: str) -> None:
     """Raise InputError unless `value` [Hz] is above 0 and below `limit`, which is `meaning`."""
     if isinstance(value, numbers.Real) and not isinstance(value, bool) and 0.0 < float(value) < limit:
         return
     accepted = f"a number above 0 and below {limit:.6g} Hz, {meaning}"
-    raise InputError(source, f"preprocessing.{field}", repr(value), accepted)
+    raise InputError(current_file(), f"preprocessing.{field}", repr(value), accepted)
 
 
-def _unspoiled(source: str, grid: FloatArray, step: float, cutoff_hz: float, padding: int) -> slice:
+def _unspoiled(grid: FloatArray, step: float, cutoff_hz: float, padding: int) -> slice:
     """The samples of the grid that are far enough from both ends, LogError where there are none."""
     margin = DROPPED_PERIODS / cutoff_hz - JITTER * step
     inside = np.flatnonzero((grid >= margin) & (grid <= grid[-1] - margin))
     if not len(inside) or len(grid) <= padding:
         shortest = max(2.0 * margin, padding * step)
         accepted = f"more than {shortest:.6g} s for a cutoff of {cutoff_hz:g} Hz, which spoils both ends of a log"
-        raise LogError(source, "time", f"{grid[-1]:.6g} s ({len(grid)} samples)", accepted)
+        raise FieldError("time", f"{grid[-1]:.6g} s ({len(grid)} samples)", accepted)
     return slice(int(inside[0]), int(inside[-1]) + 1)
 
 

@@ -7,7 +7,7 @@ from torchid.problem.extras import ExtraTerms
 from torchid.problem.linear import LinearProblem, TriangularFactor
 from torchid.problem.metrics import Evaluation, Metrics
 from torchid.problem.rows import RowBuilder
-from torchid.problem.samples import Samples, bind
+from torchid.problem.samples import Samples, bind_log
 
 __all__ = [
     "Batch",
@@ -20,7 +20,7 @@ __all__ = [
     "Samples",
     "TriangularFactor",
     "assemble",
-    "bind",
+    "bind_log",
     "compress",
     "compress_parts",
     "linear_problem",

@@ -47,14 +47,14 @@ class BaseMotion:
     angular_acceleration: Tensor | None = None
 
     @classmethod
-    def of(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
+    def from_coordinates(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
         """Of generalized coordinates as `Regressor` takes them; nothing of a bolted base."""
         if fixed_base:
             return cls()
         found = motion_from_state(q, v, a, q.shape[1] - 7)
         return cls(q[:, 3:7], found.base_specific_force, found.base_angular_velocity, found.base_angular_acceleration)
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> BaseMotion:
+    def map(self, change: Callable[[Tensor], Tensor]) -> BaseMotion:
         """With every tensor changed."""
         return BaseMotion(**{name: change(x) for name, x in vars(self).items() if x is not None})
 
@@ -64,7 +64,7 @@ class BaseMotion:
         return None if self.quat_xyzw is None else rotation_matrix(self.quat_xyzw)
 
 
-def levelled(rotation_world_base: Tensor) -> Tensor:
+def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
     """Axes of the levelled base in the base frame, (N, 3, 3), as columns.
 
     The base is turned by the smallest rotation that makes vertical the axis which is nearest to it: a base that tilts

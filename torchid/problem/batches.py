@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchid.parameters import Array
-from torchid.problem.chunks import by_state, one_thread
+from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.predict import predicted_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -23,9 +23,10 @@ class Batch:
     """Projected and whitened rows of B samples: `K @ (columns @ phi)` is to equal `f`.
 
     Attributes:
-        K: (B, nv, P'), `W^T K`, in the columns of the `MiniBatches` it came from; rows of zeros where there are fewer.
-        f: (B, nv), `W^T f`, in standard deviations of the sensor noise.
-        W: (B, nv, nv), takes any further generalized force (B, nv) [N, N m] to the rows: `W^T r`.
+        K: (B, n_rows, P'), `W^T K`, in the columns of the `MiniBatches` it came from; rows of zeros where a sample has
+            fewer.
+        f: (B, n_rows), `W^T f`, in standard deviations of the sensor noise.
+        W: (B, n_rows, n_rows), takes any further generalized force (B, n_rows) [N, N m] to the rows: `W^T r`.
         q, v, a: generalized coordinates as in `Samples.coordinates`.
     """
 
@@ -78,7 +79,7 @@ class MiniBatches:
         if builder.extras:
             raise ValueError("builder: found extra terms; accepted: one without")
         self.builder, self.batch_size, self.seed = builder, batch_size, seed
-        self.columns = torch.from_numpy(builder.columns.from_parameters()).to(builder.device)
+        self.columns = torch.from_numpy(builder.columns.parameter_map()).to(builder.device)
         self.samples = sum(map(len, logs))
         self._logs, self._memory = tuple(logs), memory
         self._starts = torch.tensor([0, *(len(log) for log in logs)]).cumsum(0).tolist()
@@ -87,26 +88,26 @@ class MiniBatches:
         self._kept: dict[int, Batch] = {}
         self._left = memory
 
-    def blocks(self, count: int) -> list[MiniBatches]:
+    def split_blocks(self, count: int) -> list[MiniBatches]:
         """About so many blocks of successive samples, none across two logs, at least one of each log."""
         pieces: list[Samples] = []
         for log in self._logs:
             parts = min(max(round(count * len(log) / max(self.samples, 1)), 1), max(len(log), 1))
             cuts = [round(k * len(log) / parts) for k in range(parts + 1)]
             pieces += [log[start:end] for start, end in zip(cuts, cuts[1:], strict=False)]
-        return [self.of(piece) for piece in pieces if len(piece)]
+        return [self.like(piece) for piece in pieces if len(piece)]
 
     def hold_out(self, count: int, every: int) -> tuple[MiniBatches, list[MiniBatches]]:
         """All samples but some of about `count` blocks, and these: of every so many, one that the seed draws."""
-        blocks, generator = self.blocks(count), self._generator(-1)
+        blocks, generator = self.split_blocks(count), self._generator(-1)
         held_out = [
             start + int(torch.randint(every, (), generator=generator))
             for start in range(0, len(blocks) - every + 1, every)
         ]
         kept = [block._logs[0] for number, block in enumerate(blocks) if number not in held_out]
-        return self.of(*kept), [blocks[number] for number in held_out]
+        return self.like(*kept), [blocks[number] for number in held_out]
 
-    def of(self, *logs: Samples) -> MiniBatches:
+    def like(self, *logs: Samples) -> MiniBatches:
         """Mini-batches like these of other samples."""
         return MiniBatches(logs, self.builder, self.batch_size, self.seed, self._memory)
 
@@ -125,12 +126,12 @@ class MiniBatches:
 
     @torch.no_grad()
     def generalized_forces(self, phi: Array) -> Iterator[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
-        """Coordinates (q, v, a) of samples, log by log, with K phi, (B, nv) [N, N m], of parameters (12 L,)."""
-        columns = self.builder.columns_of(phi[None])[0]
+        """Coordinates (q, v, a) of samples, log by log, with K phi, (B, n_rows) [N, N m], of parameters (12 L,)."""
+        columns = self.builder.to_columns(phi[None])[0]
         for log in self._logs:
             for start in range(0, len(log), _CHUNK):
                 samples = log[start : start + _CHUNK].to(self.builder.device)
-                yield samples.coordinates(), predicted_forces(self.builder, self.builder.terms(samples), columns).T
+                yield samples.coordinates(), predicted_forces(self.builder, self.builder.dynamics(samples), columns).T
 
     def _generator(self, number: int) -> torch.Generator:
         return torch.Generator().manual_seed((self.seed * 1_000_003 + number) % 2**63)
@@ -150,7 +151,7 @@ class MiniBatches:
         with one_thread():
             for log, start, end in zip(self._logs, self._starts, self._starts[1:], strict=False):
                 samples = log[index[(index >= start) & (index < end)] - start].to(self.builder.device)
-                for state, where in by_state(samples, len(index)):
+                for state, where in chunks_by_state(samples, len(index)):
                     chosen = samples[where]
                     rows, W = self.builder.rows_by_sample(chosen, state)
                     parts.append(Batch(rows[..., :-1], rows[..., -1], W, *chosen.coordinates()))

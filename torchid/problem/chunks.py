@@ -18,35 +18,83 @@ from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
 Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+ProgressCallback = Callable[[int], None]
+"""Called with the number of samples, or of other steps, done since the last call."""
+
+CHUNK = 2048
+"""Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run the block with one intra-op thread, of torch and of NumPy's linear algebra.
+def map_chunks(
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    fold: Callable[[Iterator[tuple[Samples, State]]], Result],
+    chunk: int = CHUNK,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> list[Result]:
+    """What `fold` makes of the chunks of some logs, one result per worker.
 
-    These arrays are too small to split: on a busy two-core machine two threads made evaluation eight times slower, and
-    a consistent estimate three times.
+    Args:
+        logs: bound logs; each is moved to the builder's device chunk by chunk.
+        builder: whose layouts and device are used.
+        fold: given an iterator over some of the chunks and their contact states.
+        chunk: samples per chunk.
+        threads: workers, each with one intra-op thread (small arrays do not profit from more); by default one per
+            intra-op thread torch would use, one if the builder is on a GPU.
+        progress: called with the number of samples done since the last call.
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with _pools().limit(limits=1, user_api="blas"):
-            yield
-    finally:
-        torch.set_num_threads(before)
+    tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, chunk)]
+    for _, state, _ in tasks:
+        builder.layout(state)
+    lock = threading.Lock()
+
+    def run(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Result:
+        return fold(pieces(part))
+
+    def pieces(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Iterator[tuple[Samples, State]]:
+        for samples, state, index in part:
+            piece = samples[index].to(builder.device)
+            yield piece, state
+            if progress is not None:
+                with lock:
+                    progress(len(piece))
+
+    return run_in_workers(tasks, run, threads or worker_count(builder.device))
 
 
-@cache
-def _pools() -> ThreadpoolController:
-    return ThreadpoolController()
+def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slice | torch.Tensor]]:
+    """Chunks of samples that share a contact state: the state and an index into the samples."""
+    active = samples.active.cpu().numpy()
+    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
+    keys = packed.view(f"V{packed.shape[1]}")[:, 0]
+    found, first = np.unique(keys, return_index=True)
+    for key, example in zip(found, first, strict=True):
+        if len(found) == 1:
+            pieces: Iterable[slice | torch.Tensor] = (slice(i, i + chunk) for i in range(0, len(active), chunk))
+        else:
+            pieces = torch.from_numpy(np.flatnonzero(keys == key)).split(chunk)
+        for piece in pieces:
+            yield tuple(active[example].tolist()), piece
 
 
-def worker_count(device: torch.device) -> int:
-    """Workers that suit a device: one per thread torch would use on a CPU, one for a GPU."""
-    return torch.get_num_threads() if device.type == "cpu" else 1
+def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
+    """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
+    found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
+    for samples in logs:
+        every = torch.arange(len(samples))
+        for state, index in chunks_by_state(samples):
+            found.setdefault(state, []).append((samples, every[index]))
+    for state, pieces in found.items():
+        total = sum(len(index) for _, index in pieces)
+        for samples, index in pieces:
+            share = min(len(index), max(1, round(count * len(index) / total)))
+            yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
 
 
-def share_out(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
+def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], workers: int) -> list[Result]:
     """Results of `run`, one per worker, each called without gradients on every n-th task.
 
     A failure or an interrupt stops all workers at their next task.
@@ -73,75 +121,27 @@ def share_out(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result], wo
             return list(pool.map(alone, range(workers)))
 
 
-CHUNK = 2048
-"""Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
-
-Progress = Callable[[int], None]
-Result = TypeVar("Result")
+def worker_count(device: torch.device) -> int:
+    """Workers that suit a device: one per thread torch would use on a CPU, one for a GPU."""
+    return torch.get_num_threads() if device.type == "cpu" else 1
 
 
-def by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[State, slice | torch.Tensor]]:
-    """Chunks of samples that share a contact state: the state and an index into the samples."""
-    active = samples.active.cpu().numpy()
-    packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
-    keys = packed.view(f"V{packed.shape[1]}")[:, 0]
-    found, first = np.unique(keys, return_index=True)
-    for key, example in zip(found, first, strict=True):
-        if len(found) == 1:
-            pieces: Iterable[slice | torch.Tensor] = (slice(i, i + chunk) for i in range(0, len(active), chunk))
-        else:
-            pieces = torch.from_numpy(np.flatnonzero(keys == key)).split(chunk)
-        for piece in pieces:
-            yield tuple(active[example].tolist()), piece
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Run the block with one intra-op thread, of torch and of NumPy's linear algebra.
 
-
-def spread_by_state(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, State, float]]:
-    """About `count` samples of every contact state, evenly spread over the logs, and how many each stands for."""
-    found: dict[State, list[tuple[Samples, torch.Tensor]]] = {}
-    for samples in logs:
-        every = torch.arange(len(samples))
-        for state, index in by_state(samples):
-            found.setdefault(state, []).append((samples, every[index]))
-    for state, pieces in found.items():
-        total = sum(len(index) for _, index in pieces)
-        for samples, index in pieces:
-            share = min(len(index), max(1, round(count * len(index) / total)))
-            yield samples[index[torch.linspace(0, len(index) - 1, share).long()]], state, len(index) / share
-
-
-def over_chunks(
-    logs: Sequence[Samples],
-    builder: RowBuilder,
-    fold: Callable[[Iterator[tuple[Samples, State]]], Result],
-    chunk: int = CHUNK,
-    threads: int | None = None,
-    progress: Progress | None = None,
-) -> list[Result]:
-    """What `fold` makes of the chunks of some logs, one result per worker.
-
-    Args:
-        logs: bound logs; each is moved to the builder's device chunk by chunk.
-        builder: whose plans and device are used.
-        fold: given an iterator over some of the chunks and their contact states.
-        chunk: samples per chunk.
-        threads: workers, each with one intra-op thread (small arrays do not profit from more); by default one per
-            intra-op thread torch would use, one if the builder is on a GPU.
-        progress: called with the number of samples done since the last call.
+    These arrays are too small to split: on a busy two-core machine two threads made evaluation eight times slower, and
+    a consistent estimate three times.
     """
-    tasks = [(samples, state, index) for samples in logs for state, index in by_state(samples, chunk)]
-    for _, state, _ in tasks:
-        builder.plan(state)
-    lock = threading.Lock()
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with _pools().limit(limits=1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)
 
-    def run(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Result:
-        return fold(pieces(part))
 
-    def pieces(part: Iterator[tuple[Samples, State, slice | torch.Tensor]]) -> Iterator[tuple[Samples, State]]:
-        for samples, state, index in part:
-            piece = samples[index].to(builder.device)
-            yield piece, state
-            if progress is not None:
-                with lock:
-                    progress(len(piece))
-
-    return share_out(tasks, run, threads or worker_count(builder.device))
+@cache
+def _pools() -> ThreadpoolController:
+    return ThreadpoolController()

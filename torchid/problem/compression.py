@@ -13,22 +13,245 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.problem.chunks import CHUNK, Progress, by_state, one_thread, over_chunks, worker_count
+from torchid.problem.chunks import CHUNK, ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import State
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder, Workspace
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
 
+FOLDS = 5
+"""Blocks that all training samples are cut into: each fit sees four fifths, and five fits are cheap."""
+
+_LEAST = 20  # independent samples a block: what neighbours share through a filter is a small part of that
+_MEMORY = 2**30  # bytes of factors
 _FEWEST, _BATCHES = 16, 8  # readings that make an equation, and in how many their slow changes show
 _ZEROS = 0.01  # share of readings that are exactly 0 from which on something else than a sensor has written them,
 _ONE_SIDED = 0.05  # unless both signs are at least this frequent: then 0 is one step of a coarse sensor among others
 _OUTLYING = 4.0  # standard deviations; of Gaussian readings 6e-5 are left out
 _NORMAL = 0.6745  # median of |x| of standard normal x
+RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
+_Key = tuple[str, State, int, bool]
+
+
+@dataclass
+class Part:
+    """What is kept of the samples of one log, by its source, in one contact state and one fold.
+
+    Equations of sensors whose contact is in the air are in a part of their own, `unloaded`, which counts no samples;
+    `gated`: numbers, among the extras, of the offsets that have none because the readings there are exactly 0.
+    """
+
+    source: str
+    state: State
+    factor: TriangularFactor
+    samples: int
+    fold: int = 0
+    unloaded: bool = False
+    gated: set[int] = field(default_factory=set)
+
+
+def compress(
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    chunk: int = CHUNK,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> TriangularFactor:
+    """Stream all samples of some logs into one triangular factor.
+
+    Args: as `map_chunks`.
+    """
+    return merge_factors(compress_by_state(logs, builder, chunk, threads, progress).values(), builder)
+
+
+def compress_by_state(
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    chunk: int = CHUNK,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> dict[State, TriangularFactor]:
+    """As `compress`, but with a factor for every contact state in the logs."""
+    found = map_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
+    return {part.state: part.factor for part in _merge_parts(found)}
+
+
+def compress_parts(
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    chunk: int = CHUNK,
+    threads: int | None = None,
+    progress: ProgressCallback | None = None,
+    weight_rows: RowWeighting | None = None,
+) -> list[Part]:
+    """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
+
+    Logs of one source count as one. Unknown offsets of contact sensors have further parts: readings in the air.
+    `weight_rows` may change other rows before they are added: called with the samples they come from, their columns and
+    themselves.
+    """
+    fold = partial(_fold, builder, by_log=True, weight_rows=weight_rows)
+    parts = _merge_parts(map_chunks(logs, builder, fold, chunk, threads, progress))
+    order = list(dict.fromkeys(samples.source for samples in logs))
+    return sorted(parts, key=lambda part: order.index(part.source))
+
+
+def _fold(
+    builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weight_rows: RowWeighting | None = None
+) -> list[Part]:
+    """Parts of some chunks, all logs together unless `by_log`."""
+    parts: dict[_Key, Part] = {}
+    workspace = Workspace()
+
+    def part(samples: Samples, state: State, unloaded: bool) -> Part:
+        key = (samples.source, state, samples.fold, unloaded) if by_log else ("", state, 0, False)
+        return parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
+
+    for samples, state in chunks:
+        own = part(samples, state, False)
+        own.samples += len(samples)
+        for support, rows in builder.rows(samples, state, workspace):
+            weighted = rows if weight_rows is None else weight_rows(samples, support, rows)
+            own.factor.add(support, weighted, samples.oversampling)
+        for channel in unloaded_offset_equations(builder, samples):
+            of_air = part(samples, state, True)
+            if channel.gated:
+                of_air.gated.add(channel.offset)
+            else:
+                of_air.factor.add(*channel.row(builder), samples.oversampling)
+    return list(parts.values())
+
+
+@one_thread()
+def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
+    """The parts that workers have made of their chunks."""
+    total: dict[_Key, Part] = {}
+    for part in chain.from_iterable(of_workers):
+        same = total.setdefault((part.source, part.state, part.fold, part.unloaded), part)
+        if same is not part:
+            same.samples += part.samples
+            same.gated |= part.gated
+            same.factor.merge(part.factor)
+    return list(total.values())
+
+
+@one_thread()
+def merge_factors(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
+    """The factor of all that some factors have seen."""
+    out = TriangularFactor(builder.width)
+    for factor in factors:
+        out.merge(factor)
+    return out
+
+
+@one_thread()
+def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
+    """The problem in all 12 L parameters from the factor of the regrouped columns.
+
+    What is free is said by `free_parameters`.
+
+    Raises:
+        ValueError: the builder has unknowns beside these parameters, which take `assemble`.
+    """
+    if builder.extras:
+        raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
+    return problem_from_triangle(factor.triangle().numpy(), factor.rows, factor.oversampling, builder, robot, friction)
+
+
+def problem_from_triangle(
+    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool = True
+) -> LinearProblem:
+    """The problem of a triangular factor in the regrouped columns, right-hand side last.
+
+    Args:
+        R: (M, columns + 1).
+        rows: that went into it.
+        oversampling: of them.
+        builder: of the rows.
+        robot: the robot.
+        friction: whether friction is free.
+    """
+    count = builder.columns.count
+    return LinearProblem(
+        A=R[:count, :-1] @ builder.columns.parameter_map(),
+        b=R[:count, -1],
+        residual=float(np.square(R[count:, -1]).sum()),
+        rows=rows,
+        nominal=robot.nominal.flatten(),
+        scale=parameter_scale(robot.nominal).flatten(),
+        free=free_parameters(robot, friction),
+        oversampling=oversampling,
+    )
+
+
+def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
+    """What can be fitted, (12 L,) bool: no inertia of massless bodies, no friction of welds, none if not `friction`."""
+    free = np.ones(robot.nominal.shape, dtype=bool)
+    free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
+    still = [body.joint is None or body.joint.kind == "fixed" for body in robot.bodies]
+    free[still if friction else slice(None), parameters.FRICTION] = False
+    return free.flatten()
+
+
+def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
+    """The logs in order, cut into blocks contiguous in time that know their fold.
+
+    Errors of successive samples are alike, so that samples drawn at random would judge a fit by what it has seen. A log
+    is cut as often as its share of all samples asks for; where there are many, whole logs are left out. Fewer folds, or
+    a single one, if the samples or the memory for their factors are too few.
+
+    Args:
+        logs: bound logs.
+        builder: of their rows.
+    """
+    total, count = sum(map(len, logs)), _count(logs, builder)
+    out, before = [], 0
+    for log in logs:
+        blocks = max(1, round(count * len(log) / max(total, 1)))
+        ends = [len(log) * k // blocks for k in range(blocks + 1)]
+        for start, end in zip(ends, ends[1:], strict=False):
+            middle = before + (start + end) / 2
+            fold = min(int(count * middle / max(total, 1)), count - 1)
+            out.append(replace(log if blocks == 1 else log[start:end], fold=fold))
+        before += len(log)
+    found = sorted({block.fold for block in out})  # rounding may have left one empty
+    return [replace(block, fold=found.index(block.fold)) for block in out]
+
+
+def _count(logs: Sequence[Samples], builder: RowBuilder) -> int:
+    independent = sum(len(log) / log.oversampling for log in logs)
+    states: set[tuple[str, State]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
+    size = 8 * (builder.width + 1) ** 2 * max(len(states), 1) * worker_count(builder.device)
+    return max(1, min(FOLDS, int(independent / _LEAST), _MEMORY // size))
+
+
+@one_thread()
+def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+    """One part for each log and fold, its contact states together; equations in the air stay apart."""
+    return _folded(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
+
+
+@one_thread()
+def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+    """One part for each log and contact state, its folds together; equations in the air stay apart."""
+    return _folded(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
+
+
+def _folded(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
+    """One part for each key, with the contact state and fold of the first."""
+    out: dict[tuple[object, ...], Part] = {}
+    for part, key in zip(parts, keys, strict=True):
+        if key not in out:
+            out[key] = replace(part, factor=TriangularFactor(builder.width), samples=0, gated=set())
+        out[key].factor.merge(part.factor)
+        out[key].gated |= part.gated
+        out[key].samples += part.samples
+    return list(out.values())
 
 
 @dataclass(frozen=True)
-class UnloadedChannel:
+class UnloadedOffsetEquation:
     """What some samples say of the unknown offset of a contact sensor's channel.
 
     Attributes:
@@ -59,12 +282,12 @@ class UnloadedChannel:
         return columns, torch.tensor([row], dtype=like.dtype, device=like.device) / self.deviation
 
 
-def unloaded_channels(builder: RowBuilder, samples: Samples) -> Iterator[UnloadedChannel]:
+def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator[UnloadedOffsetEquation]:
     """What the readings in the air among some samples of a log say of every offset that is unknown."""
     if samples.unloaded is None:
         return
     scales = {x.contact: number for number, x in enumerate(builder.extras) if x.what == "scale" and x.contact}
-    noise = builder.sensors.noise.wrench.tolist()
+    noise = builder.sensors.noise.wrench_std.tolist()
     for number, extra in enumerate(builder.extras):
         if extra.what != "offset" or extra.contact is None:
             continue
@@ -74,10 +297,10 @@ def unloaded_channels(builder: RowBuilder, samples: Samples) -> Iterator[Unloade
         if len(y) < _FEWEST:
             continue
         if _gated(y):
-            yield UnloadedChannel(number, None, gated=True)
+            yield UnloadedOffsetEquation(number, None, gated=True)
         else:
             mean, deviation = _mean(y, noise[axis], samples.oversampling)
-            yield UnloadedChannel(number, scales.get(extra.contact), False, mean, deviation)
+            yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)
 
 
 def _gated(y: Tensor) -> bool:
@@ -92,230 +315,3 @@ def _mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
     batches = y[: len(y) // _BATCHES * _BATCHES].view(_BATCHES, -1).mean(1)
     seen = max(float(y.var()) / len(y), float(batches.var()) / _BATCHES) / oversampling
     return float(y.mean()), max(noise**2 / len(y), seen) ** 0.5
-
-
-Weighing = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
-_Key = tuple[str, State, int, bool]
-
-
-@dataclass
-class Part:
-    """What is kept of the samples of one log, by its source, in one contact state and one fold (see `in_folds`).
-
-    Equations of sensors whose contact is in the air are in a part of their own, `unloaded`, which counts no samples;
-    `gated`: numbers, among the extras, of the offsets that have none because the readings there are exactly 0.
-    """
-
-    source: str
-    state: State
-    factor: TriangularFactor
-    samples: int
-    fold: int = 0
-    unloaded: bool = False
-    gated: set[int] = field(default_factory=set)
-
-
-def compress(
-    logs: Sequence[Samples],
-    builder: RowBuilder,
-    chunk: int = CHUNK,
-    threads: int | None = None,
-    progress: Progress | None = None,
-) -> TriangularFactor:
-    """Stream all samples of some logs into one triangular factor.
-
-    Args: as `over_chunks`.
-    """
-    return merged(compress_by_state(logs, builder, chunk, threads, progress).values(), builder)
-
-
-def compress_by_state(
-    logs: Sequence[Samples],
-    builder: RowBuilder,
-    chunk: int = CHUNK,
-    threads: int | None = None,
-    progress: Progress | None = None,
-) -> dict[State, TriangularFactor]:
-    """As `compress`, but with a factor for every contact state in the logs."""
-    found = over_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
-    return {part.state: part.factor for part in _together(found)}
-
-
-def compress_parts(
-    logs: Sequence[Samples],
-    builder: RowBuilder,
-    chunk: int = CHUNK,
-    threads: int | None = None,
-    progress: Progress | None = None,
-    weigh: Weighing | None = None,
-) -> list[Part]:
-    """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
-
-    Logs of one source count as one. Unknown offsets of contact sensors have further parts: readings in the air.
-    `weigh` may change other rows before they are added: called with the samples they come from, their columns and
-    themselves.
-    """
-    fold = partial(_fold, builder, by_log=True, weigh=weigh)
-    parts = _together(over_chunks(logs, builder, fold, chunk, threads, progress))
-    order = list(dict.fromkeys(samples.source for samples in logs))
-    return sorted(parts, key=lambda part: order.index(part.source))
-
-
-def _fold(
-    builder: RowBuilder, chunks: Iterator[tuple[Samples, State]], by_log: bool, weigh: Weighing | None = None
-) -> list[Part]:
-    """Parts of some chunks, all logs together unless `by_log`."""
-    parts: dict[_Key, Part] = {}
-    workspace = Workspace()
-
-    def part(samples: Samples, state: State, unloaded: bool) -> Part:
-        key = (samples.source, state, samples.fold, unloaded) if by_log else ("", state, 0, False)
-        return parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
-
-    for samples, state in chunks:
-        own = part(samples, state, False)
-        own.samples += len(samples)
-        for support, rows in builder.rows(samples, state, workspace):
-            weighed = rows if weigh is None else weigh(samples, support, rows)
-            own.factor.add(support, weighed, samples.oversampling)
-        for channel in unloaded_channels(builder, samples):
-            of_air = part(samples, state, True)
-            if channel.gated:
-                of_air.gated.add(channel.offset)
-            else:
-                of_air.factor.add(*channel.row(builder), samples.oversampling)
-    return list(parts.values())
-
-
-@one_thread()
-def _together(of_workers: Iterable[list[Part]]) -> list[Part]:
-    """The parts that workers have made of their chunks."""
-    total: dict[_Key, Part] = {}
-    for part in chain.from_iterable(of_workers):
-        same = total.setdefault((part.source, part.state, part.fold, part.unloaded), part)
-        if same is not part:
-            same.samples += part.samples
-            same.gated |= part.gated
-            same.factor.merge(part.factor)
-    return list(total.values())
-
-
-@one_thread()
-def merged(factors: Iterable[TriangularFactor], builder: RowBuilder) -> TriangularFactor:
-    """The factor of all that some factors have seen."""
-    out = TriangularFactor(builder.width)
-    for factor in factors:
-        out.merge(factor)
-    return out
-
-
-def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
-    """What can be fitted, (12 L,) bool: no inertia of massless bodies, no friction of welds, none if not `friction`."""
-    free = np.ones(robot.nominal.shape, dtype=bool)
-    free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
-    still = [body.joint is None or body.joint.kind == "fixed" for body in robot.bodies]
-    free[still if friction else slice(None), parameters.FRICTION] = False
-    return free.flatten()
-
-
-@one_thread()
-def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, friction: bool = True) -> LinearProblem:
-    """The problem in all 12 L parameters from the factor of the regrouped columns.
-
-    What is free is said by `free_parameters`.
-
-    Raises:
-        ValueError: the builder has unknowns beside these parameters, which take `assemble`.
-    """
-    if builder.extras:
-        raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
-    return posed(factor.triangle().numpy(), factor.rows, factor.oversampling, builder, robot, friction)
-
-
-def posed(
-    R: Array, rows: int, oversampling: float, builder: RowBuilder, robot: Robot, friction: bool = True
-) -> LinearProblem:
-    """The problem of a triangular factor in the regrouped columns, right-hand side last.
-
-    Args:
-        R: (M, columns + 1).
-        rows: that went into it.
-        oversampling: of them.
-        builder: of the rows.
-        robot: the robot.
-        friction: whether friction is free.
-    """
-    count = builder.columns.count
-    return LinearProblem(
-        A=R[:count, :-1] @ builder.columns.from_parameters(),
-        b=R[:count, -1],
-        residual=float(np.square(R[count:, -1]).sum()),
-        rows=rows,
-        nominal=robot.nominal.flatten(),
-        scale=parameter_scale(robot.nominal).flatten(),
-        free=free_parameters(robot, friction),
-        oversampling=oversampling,
-    )
-
-
-FOLDS = 5
-"""Blocks that all training samples are cut into: each fit sees four fifths, and five fits are cheap."""
-
-_LEAST = 20  # independent samples a block: what neighbours share through a filter is a small part of that
-_MEMORY = 2**30  # bytes of factors
-
-
-def in_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
-    """The logs in order, cut into blocks contiguous in time that know their fold.
-
-    Errors of successive samples are alike, so that samples drawn at random would judge a fit by what it has seen. A log
-    is cut as often as its share of all samples asks for; where there are many, whole logs are left out. Fewer folds, or
-    a single one, if the samples or the memory for their factors are too few.
-
-    Args:
-        logs: bound logs.
-        builder: of their rows.
-    """
-    total, count = sum(map(len, logs)), _count(logs, builder)
-    out, before = [], 0
-    for log in logs:
-        blocks = max(1, round(count * len(log) / max(total, 1)))
-        ends = [len(log) * k // blocks for k in range(blocks + 1)]
-        for start, end in zip(ends, ends[1:], strict=False):
-            middle = before + (start + end) / 2
-            fold = min(int(count * middle / max(total, 1)), count - 1)
-            out.append(replace(log if blocks == 1 else log[start:end], fold=fold))
-        before += len(log)
-    found = sorted({block.fold for block in out})  # rounding may have left one empty
-    return [replace(block, fold=found.index(block.fold)) for block in out]
-
-
-def _count(logs: Sequence[Samples], builder: RowBuilder) -> int:
-    independent = sum(len(log) / log.oversampling for log in logs)
-    states: set[tuple[str, State]] = {(log.source, state) for log in logs for state, _ in by_state(log)}
-    size = 8 * (builder.width + 1) ** 2 * max(len(states), 1) * worker_count(builder.device)
-    return max(1, min(FOLDS, int(independent / _LEAST), _MEMORY // size))
-
-
-@one_thread()
-def states_together(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    """One part for each log and fold, its contact states together; equations in the air stay apart."""
-    return _folded(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
-
-
-@one_thread()
-def folds_together(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    """One part for each log and contact state, its folds together; equations in the air stay apart."""
-    return _folded(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
-
-
-def _folded(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
-    """One part for each key, with the contact state and fold of the first."""
-    out: dict[tuple[object, ...], Part] = {}
-    for part, key in zip(parts, keys, strict=True):
-        if key not in out:
-            out[key] = replace(part, factor=TriangularFactor(builder.width), samples=0, gated=set())
-        out[key].factor.merge(part.factor)
-        out[key].gated |= part.gated
-        out[key].samples += part.samples
-    return list(out.values())

@@ -14,10 +14,11 @@ from torchid.parameters import Array
 from torchid.problem.extras import Extra, measured_components
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import reduced_layout, reduction_matrix
-from torchid.regressor.jacobian import wrench_map
+from torchid.regressor.jacobian import wrench_transform
 from torchid.regressor.regressor import JointRow, joint_rows
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
+from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
 from torchid.sensing import Contact, SensorSet
 
 State = tuple[bool, ...]
@@ -27,9 +28,6 @@ State = tuple[bool, ...]
 def state_name(contacts: Sequence[Contact], state: State) -> str:
     """Frames in contact, joined by "+"."""
     return " + ".join(contact.frame for contact, active in zip(contacts, state, strict=True) if active) or "none"
-
-
-_DEPENDENT = 1e-9  # singular values of constant unit wrenches below this share of the largest count as zero
 
 
 class Columns:
@@ -44,7 +42,7 @@ class Columns:
     @property
     def count(self) -> int:
         """Number of columns, without the right-hand side."""
-        return self.layout.count + 2 * (self.tree.bodies - 1)
+        return self.layout.count + 2 * (self.tree.n_nodes - 1)
 
     def friction(self, body: int) -> int:
         """The first of the two friction columns of a body's joint."""
@@ -59,7 +57,7 @@ class Columns:
         path = set(self.tree.path(body))
         return [j for j, row in enumerate(self.joint_rows) if any(moved in path for moved, _ in row.moved)]
 
-    def from_parameters(self) -> Array:
+    def parameter_map(self) -> Array:
         """Matrix M, (count, 12 L), that takes parameters to these columns: `K = K_columns @ M`."""
         nodes = self.tree.node_of
         matrix = np.zeros((self.count, len(nodes), parameters.PER_BODY))
@@ -77,7 +75,7 @@ class ContactBody:
 
     `unmeasured`, (k_x, 6): orthonormal rows that span the unmeasured wrench directions, `measured`, (k_m, 6): one row
     per measured component, both as wrenches at the body's joint frame, in its axes. `components`: contact and component
-    of each measured row. `joints`: places among the mixed joints of those that move the body.
+    of each measured row. `joints`: places among the coupled joints of those that move the body.
     """
 
     body: int
@@ -88,18 +86,18 @@ class ContactBody:
 
 
 @dataclass(frozen=True)
-class StatePlan:
+class ContactStateLayout:
     """A contact state: bodies in contact; measured joints that the projection mixes, and those it leaves alone.
 
-    `moved`: bodies that mixed joints move directly, ascending, with the joint's place among the mixed ones and the
-    ratio of its motion. `bodies`: on whose parameters mixed rows depend, by the columns `inertial` and `friction`.
+    `moved`: bodies that coupled joints move directly, ascending, with the joint's place among the coupled ones and the
+    ratio of its motion. `bodies`: on whose parameters coupled rows depend, by the columns `inertial` and `friction`.
     `extras`: columns of unknowns beside the bodies' parameters.
-    `row_std`: noise of the base rows and mixed joints; `wrench_std`: of the measured components, body by body.
+    `row_std`: noise of the base rows and coupled joints; `wrench_std`: of the measured components, body by body.
     """
 
     contact_bodies: tuple[ContactBody, ...]
-    mixed_joints: tuple[int, ...]
-    lone_joints: tuple[int, ...]
+    coupled_joints: tuple[int, ...]
+    uncoupled_joints: tuple[int, ...]
     moved: tuple[tuple[int, int, float], ...]
     bodies: range
     inertial: range
@@ -110,12 +108,12 @@ class StatePlan:
 
     @property
     def support(self) -> tuple[int, ...]:
-        """Columns of mixed rows."""
+        """Columns of coupled rows."""
         return (*self.inertial, *self.friction, *self.extras)
 
 
-class Planner:
-    """Makes the plans of one robot with its contacts and sensors."""
+class ContactStateLayouts:
+    """Makes the layouts of one robot with its contacts and sensors."""
 
     def __init__(
         self,
@@ -132,39 +130,49 @@ class Planner:
         self.sensors = sensors
         self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
-        self.dof_std = sensors.noise.dofs(robot.n, robot.dofs)
+        self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
+        self._made: dict[State, ContactStateLayout] = {}
 
-    def plan(self, state: State) -> StatePlan:
-        """The plan of a contact state."""
+    def layout(self, state: State) -> ContactStateLayout:
+        """The layout of a contact state, worked out when it is first needed."""
+        if state not in self._made:
+            self._made[state] = self._lay_out(state)
+        return self._made[state]
+
+    def forget(self) -> None:
+        """Drop all layouts: the robot's constants have moved to another device or precision."""
+        self._made.clear()
+
+    def _lay_out(self, state: State) -> ContactStateLayout:
         touching: dict[int, list[int]] = {}
         for contact, active in enumerate(state):
             if active:
                 touching.setdefault(self.frames[contact][0], []).append(contact)
         moving = {joint for body in touching for joint in self.columns.joints_above(body)}
         measured = np.flatnonzero(self.sensors.torque).tolist()
-        mixed = tuple(joint for joint in measured if joint in moving)
-        bodies = tuple(self._contact_body(body, members, mixed) for body, members in touching.items())
+        coupled = tuple(joint for joint in measured if joint in moving)
+        bodies = tuple(self._contact_body(body, members, coupled) for body, members in touching.items())
         moved = sorted(
             (body, place, ratio)
-            for place, joint in enumerate(mixed)
+            for place, joint in enumerate(coupled)
             for body, ratio in self.columns.joint_rows[joint].moved
         )
         bodies_below, starts = self._bodies_below([body for body, _, _ in moved]), self.columns.layout.starts
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
-        return StatePlan(
+        return ContactStateLayout(
             bodies,
-            mixed,
+            coupled,
             tuple(joint for joint in measured if joint not in moving),
             tuple(moved),
             bodies_below,
             range(starts[bodies_below.start], starts[bodies_below.stop]),
             tuple(self.columns.friction(body) + k for body, _, _ in moved for k in (0, 1)),
-            self._tensor(np.append(noise.base[:base_rows], self.dof_std[list(mixed)])),
-            self._tensor(noise.wrench[[k for body in bodies for _, k in body.components]]),
+            self._tensor(np.append(noise.base_std[:base_rows], self.dof_std[list(coupled)])),
+            self._tensor(noise.wrench_std[[k for body in bodies for _, k in body.components]]),
             tuple(
                 self.columns.count + number
                 for number, extra in enumerate(self.extras)
-                if extra.dof in mixed or (extra.contact is not None and state[extra.contact[0]])
+                if extra.dof in coupled or (extra.contact is not None and state[extra.contact[0]])
             ),
         )
 
@@ -172,13 +180,13 @@ class Planner:
         """Hull of the subtrees of some bodies; with a floating base, all bodies."""
         tree = self.columns.tree
         if tree.base_rows:
-            return range(tree.bodies)
+            return range(tree.n_nodes)
         return range(min(moved, default=0), max((tree.subtree_end[body] for body in moved), default=0))
 
-    def _contact_body(self, body: int, contacts: list[int], mixed: tuple[int, ...]) -> ContactBody:
+    def _contact_body(self, body: int, contacts: list[int], coupled: tuple[int, ...]) -> ContactBody:
         unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []
         for contact in contacts:
-            at_body = wrench_map(self.frames[contact][1]).T
+            at_body = wrench_transform(self.frames[contact][1]).T
             for k in self.contacts[contact].components:
                 if self._measured[contact, k]:
                     measured.append(at_body[k][None])
@@ -186,9 +194,9 @@ class Planner:
                 else:
                     unmeasured.append(at_body[k][None])
         _, values, Vh = np.linalg.svd(np.concatenate(unmeasured), full_matrices=False)
-        span = Vh[values > _DEPENDENT * max(values, default=0.0)]
+        span = Vh[is_significant(values, KINEMATIC_TOLERANCE)]
         above = set(self.columns.joints_above(body))
-        joints = tuple(place for place, joint in enumerate(mixed) if joint in above)
+        joints = tuple(place for place, joint in enumerate(coupled) if joint in above)
         return ContactBody(body, self._tensor(span), self._tensor(np.concatenate(measured)), tuple(components), joints)
 
     def _tensor(self, values: Array) -> Tensor:
@@ -196,7 +204,7 @@ class Planner:
         return torch.tensor(values, dtype=ancestors.dtype, device=ancestors.device)
 
 
-def dof_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
+def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
     """What one unit of an unknown of a degree of freedom adds to its row, (B,)."""
     if extra.dof is None:
         raise ValueError(f"extra: found {extra.label}; accepted: one of a degree of freedom")
@@ -210,7 +218,7 @@ def dof_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
     return torch.ones_like(samples.time)
 
 
-def reading_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
+def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
     """What one unit of a contact sensor's unknown takes from its reading along a recorded axis, (B,)."""
     if extra.what == "offset":
         return samples.active[:, contact].to(samples.time) if samples.share is None else samples.share[:, contact]
@@ -218,35 +226,35 @@ def reading_column(extra: Extra, samples: Samples, contact: int, axis: int) -> T
     return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, contact, axis]
 
 
-def mixed_columns(
+def extra_columns(
     extras: Sequence[Extra],
     samples: Samples,
-    plan: StatePlan,
+    layout: ContactStateLayout,
     tree: KinematicTree,
     measured: Tensor,
     W: Tensor,
     rotations: dict[int, Tensor],
 ) -> Iterator[Tensor]:
-    """Columns of some unknowns in mixed rows, (r, B) each.
+    """Columns of some unknowns in coupled rows, (r, B) each.
 
     Args:
         extras: which.
         samples: B of one contact state and rank.
-        plan: of that state.
+        layout: of that state.
         tree: of the robot.
-        measured: (B, k_m, base rows + mixed joints), rows of the contact Jacobian of the measured components.
-        W: (B, base rows + mixed joints, r), the basis.
+        measured: (B, k_m, base rows + coupled joints), rows of the contact Jacobian of the measured components.
+        W: (B, base rows + coupled joints, r), the basis.
         rotations: by contact, (B, 3, 3) from its frame to the recorded axes where these are the world's.
     """
     through = (measured @ W).permute(1, 2, 0)  # how each measured component enters the rows
-    places = [place for body in plan.contact_bodies for place in body.components]
+    places = [place for body in layout.contact_bodies for place in body.components]
     for extra in extras:
         if extra.dof is not None:
-            row = W[:, tree.base_rows + plan.mixed_joints.index(extra.dof)]
-            yield row.T * dof_column(extra, samples, tree)
+            row = W[:, tree.base_rows + layout.coupled_joints.index(extra.dof)]
+            yield row.T * dof_extra_column(extra, samples, tree)
             continue
         contact, axis = extra.contact or (0, 0)
-        column, reading = W.new_zeros(W.shape[2], len(samples)), reading_column(extra, samples, contact, axis)
+        column, reading = W.new_zeros(W.shape[2], len(samples)), contact_extra_column(extra, samples, contact, axis)
         vector = range(3) if axis < 3 else range(3, 6)
         for k in vector if contact in rotations else [axis]:
             if (contact, k) in places:

@@ -9,14 +9,12 @@ import numpy as np
 
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
-from torchid.problem.compression import Part, linear_problem, merged, posed
+from torchid.problem.compression import Part, linear_problem, merge_factors, problem_from_triangle
 from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
 from torchid.problem.rows import RowBuilder
 from torchid.robot import Robot
-
-_DEPENDENT = 1e-10  # a singular value of the unknowns' unit columns below this share of the largest is rounding
-_HIDDEN = 1e-6  # as in `LeastSquares`
+from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Elimination:
     @property
     def determined(self) -> np.ndarray:
         """Unknowns that the rows give if the bodies' parameters are known, (M,) bool."""
-        return np.asarray(np.isfinite(self.alone) & (np.linalg.norm(self.hidden, axis=1) < _HIDDEN))
+        return np.asarray(np.isfinite(self.alone) & (np.linalg.norm(self.hidden, axis=1) < UNOBSERVABLE_SHARE))
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class Assembly:
     eliminations: tuple[Elimination, ...]
     if_known: LinearProblem
 
-    def unknowns(self, phi: Array) -> list[Array]:
+    def extras_at(self, phi: Array) -> list[Array]:
         """What fits the rows best at parameters (12 L,), for each elimination."""
         of_all = [found.inverse @ (found.z - found.C @ phi) for found in self.eliminations if not found.log]
         left = np.concatenate([phi, *of_all])
@@ -73,7 +71,7 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     solution, and the noise of the rows, as they are.
     """
     factors = {source: [part.factor for part in parts if part.source == source] for source in _sources(parts)}
-    everything = merged((part.factor for part in parts), builder)
+    everything = merge_factors((part.factor for part in parts), builder)
     if not builder.extras:
         problem = linear_problem(everything, builder, robot, friction)
         return Assembly(problem, (), problem)
@@ -81,7 +79,7 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
     found, left = [], []
     for source, own in factors.items():
-        R = merged(own, builder).triangle().numpy()
+        R = merge_factors(own, builder).triangle().numpy()
         rest = np.delete(R, [count + number for number in per_log], axis=1)
         if per_log:
             extras = tuple(builder.extras[number] for number in per_log)
@@ -99,10 +97,10 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in found)
     rows_left = max(everything.rows - round(spent), 1)
-    problem = posed(rows, rows_left, everything.oversampling, builder, robot, friction)
+    problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction)
     known = np.delete(everything.triangle().numpy(), np.s_[count:-1], axis=1)
     known = np.asarray(np.linalg.qr(known, mode="r"))
-    if_known = posed(known, everything.rows, everything.oversampling, builder, robot, friction)
+    if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction)
     return Assembly(problem, tuple(found), if_known)
 
 
@@ -117,18 +115,18 @@ def _eliminate(
 
     `sizes`: (M,), norms of the columns before anything was eliminated.
     """
-    seen = sizes > _DEPENDENT * sizes.max(initial=0.0)
+    seen = is_significant(sizes)
     scale = np.where(seen, sizes, 1.0)
     U, values, V, left = _split(np.where(seen, columns / scale, 0.0), rest)
     top, count = U.T @ rest, builder.columns.count
-    C = np.hstack([top[:, :count] @ builder.columns.from_parameters(), top[:, count:-1]])
+    C = np.hstack([top[:, :count] @ builder.columns.parameter_map(), top[:, count:-1]])
     alone = np.where(seen, 1.0 / scale, np.inf)
     hidden = np.eye(len(extras)) - V @ V.T
     found = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], alone, hidden)
     return found, left
 
 
-def without(X: Array, unknown: Sequence[int]) -> Array:
+def eliminate_columns(X: Array, unknown: Sequence[int]) -> Array:
     """Rows of the other columns that say the same of them as X, (R, N), does where some columns are unknown."""
     if not unknown:
         return X
@@ -140,7 +138,7 @@ def without(X: Array, unknown: Sequence[int]) -> Array:
 def _split(columns: Array, rest: Array) -> tuple[Array, Array, Array, Array]:
     """U, singular values and V of what columns of norm 1 or 0 span, and the rows of the rest that they do not reach."""
     U, values, Vt = np.linalg.svd(columns, full_matrices=True)
-    rank = int((values > _DEPENDENT).sum())
+    rank = int((values > RANK_TOLERANCE).sum())
     left = U[:, rank:].T @ rest
-    left[:, np.linalg.norm(left, axis=0) < _DEPENDENT * np.linalg.norm(rest, axis=0)] = 0.0  # nothing but rounding
+    left[:, np.linalg.norm(left, axis=0) < RANK_TOLERANCE * np.linalg.norm(rest, axis=0)] = 0.0  # nothing but rounding
     return U[:, :rank], values[:rank], Vt[:rank].T, left

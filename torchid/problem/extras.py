@@ -7,27 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
-
-
-def read_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
-    """Recorded components (C, 6) that the measured ones are computed from: along world axes, whole vectors."""
-    measured = measured_components(contacts, sensors)
-    if not in_world:
-        return measured
-    whole = measured.reshape(-1, 2, 3).any(axis=2)
-    return np.repeat(whole, 3, axis=1)
-
-
-def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
-    """Measured components (C, 6) that the contacts can exert, along the frames' axes."""
-    possible = np.zeros((len(contacts), 6), dtype=bool)
-    for index, contact in enumerate(contacts):
-        possible[index, list(contact.components)] = True
-    return possible & sensors.wrench
-
 
 CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment")
 """Kinds of sensor channels, as `SensorNoise` has them."""
@@ -90,7 +72,7 @@ class Extra:
         return f"{self.what.replace('_', ' ').replace('coulomb', 'Coulomb friction')} of {channel}"
 
 
-def extras_of(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms) -> tuple[Extra, ...]:
+def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms) -> tuple[Extra, ...]:
     """All unknowns of a robot with its sensors, those of sensors first.
 
     Where a log has wrenches along world axes, an offset is constant along these, so that every axis has one as soon as
@@ -125,6 +107,23 @@ def _channels(
         )
         kind = "joint_torque" if dof < robot.n else "ft_force" if component.startswith("f") else "ft_moment"
         yield kind, name, component, dof, None
-    for place, k in np.argwhere(read_components(contacts, sensors, in_world=True)).tolist():
+    for place, k in np.argwhere(recorded_components(contacts, sensors, in_world=True)).tolist():
         kind = "contact_force" if k < 3 else "contact_moment"
-        yield kind, contacts[place].frame, COMPONENTS[k], None, (place, k)
+        yield kind, contacts[place].frame, WRENCH_COMPONENTS[k], None, (place, k)
+
+
+def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
+    """Measured components (C, 6) that the contacts can exert, along the frames' axes."""
+    possible = np.zeros((len(contacts), 6), dtype=bool)
+    for index, contact in enumerate(contacts):
+        possible[index, list(contact.components)] = True
+    return possible & sensors.wrench
+
+
+def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
+    """Recorded components (C, 6) that the measured ones are computed from: along world axes, whole vectors."""
+    measured = measured_components(contacts, sensors)
+    if not in_world:
+        return measured
+    whole = measured.reshape(-1, 2, 3).any(axis=2)
+    return np.repeat(whole, 3, axis=1)

@@ -68,13 +68,13 @@ class LinearProblem:
         misfit = self.A @ phi - self.b
         return float(misfit @ misfit + self.residual)
 
-    def share(self, of: float) -> LinearProblem:
+    def fraction(self, of: float) -> LinearProblem:
         """The problem as if of this share of its rows, which say the same as all: an estimate of that of a part."""
         root = float(np.sqrt(of))
         rows = max(round(of * self.rows), 1)
         return replace(self, A=root * self.A, b=root * self.b, residual=of * self.residual, rows=rows)
 
-    def distance(self, phi: Array, other: Array) -> float:
+    def prediction_distance(self, phi: Array, other: Array) -> float:
         """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""
         away = self.A @ (phi - other)
         return float(np.sqrt(away @ away / max(self.rows, 1)))
@@ -145,7 +145,7 @@ class TriangularFactor:
         for support, block in other._blocks.items():
             self._absorb(support, block)
 
-    def times(self, factor: float) -> TriangularFactor:
+    def scaled(self, factor: float) -> TriangularFactor:
         """The factor of the same rows, larger by a factor."""
         out = TriangularFactor(self.columns)
         out.rows, out.independent_rows = self.rows, self.independent_rows

@@ -2,25 +2,262 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
 from torchid.parameters import Array
-from torchid.problem.chunks import over_chunks
+from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import State
 from torchid.problem.extras import ExtraTerms
-from torchid.problem.predict import forces
+from torchid.problem.predict import measured_and_predicted
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
-from torchid.text import listed
+from torchid.text import join_names
 
 WHITENED = "projected_residual"
 """The group of the rows that a fit sees: whitened, and projected so that nothing unmeasured is in them."""
+
+ROW_GROUPS = {
+    "joint_torque": "joint torque [N m]",
+    "base_force": "base force [N]",
+    "base_moment": "base moment [N m]",
+    "nullspace": "projected [N, N m]",
+}
+"""Groups of rows that errors are given for, with a name and unit to show."""
+
+ERROR_GROUPS = ROW_GROUPS | {WHITENED: "whitened [x noise]"}
+"""Those, and the whitened projected residual of a fit's own rows, which there is with any sensors."""
+
+LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
+"""Readings of force/torque sensors in limbs, of robots that have some."""
+
+SETS = ("train", "test")
+"""Sets of logs that errors are given for."""
+
+BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")
+"""Names of the six base rows."""
+
+DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", WHITENED)
+"""Groups of rows that decide; what is projected without whitening repeats them."""
+
+ADVICE = (
+    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge (auto "
+    "chooses one), or record more and other motion"
+)
+"""What to do about it."""
+
+_CLEARLY = 1.05  # ratio of errors: what is closer is as good
+_MATTERS = 1e-3  # share of the measured: two models that leave less, as on data without noise, are equally good
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
+
+    `rms` and `relative` by group of `ERROR_GROUPS`, the last in units of the stated noise; `by_joint_rms` and
+    `by_joint_relative` by joint. Relative means rms of the error over
+    rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
+    the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
+    mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
+    """
+
+    rms: dict[str, float | None]
+    relative: dict[str, float | None]
+    by_joint_rms: dict[str, float | None]
+    by_joint_relative: dict[str, float | None]
+    base_force_of_variation: float | None
+    limb_rms: dict[str, float | None] = field(default_factory=dict)
+    limb_relative: dict[str, float | None] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, object]:
+        """As `metrics.json` has it."""
+        out: dict[str, object] = {}
+        for suffix, groups, joints, limbs in (
+            ("rms", self.rms, self.by_joint_rms, self.limb_rms),
+            ("rms_relative", self.relative, self.by_joint_relative, self.limb_relative),
+        ):
+            out |= {f"{group}_{suffix}": x for group, x in limbs.items()}
+            for group in ROW_GROUPS:
+                out[f"{group}_{suffix}"] = groups[group]
+                if group == "joint_torque":
+                    out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
+        return out | {WHITENED: self.rms.get(WHITENED), f"{WHITENED}_relative": self.relative.get(WHITENED)}
+
+
+class Evaluation:
+    """Evaluates several parameter vectors at once, in one pass over the logs."""
+
+    def __init__(
+        self, robot: Robot, contacts: Sequence[Contact], device: str = "cpu", terms: ExtraTerms | None = None
+    ) -> None:
+        """Fix robot, contacts and what actuators add; sensors do not matter, whatever a log has is used."""
+        actuators = replace(terms or ExtraTerms(), offsets={}, scales={})
+        self.robot = robot
+        sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
+        self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
+
+    def metrics(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[Metrics]:
+        """One `Metrics` per row of `phi`, as `RowBuilder.to_columns`, over all samples of the logs together.
+
+        Without the whitened projected residual, which depends on sensors.
+        """
+        measured, *errors = self.sums(logs, phi, progress)
+        return [self.summary(measured, error) for error in errors]
+
+    def sums(self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None) -> list[ForceSums]:
+        """Of the measured forces, then of the errors of each row of `phi`."""
+        builder = self.builder
+        columns = builder.to_columns(phi)
+
+        def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
+            sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
+            for samples, state in chunks:
+                found = measured_and_predicted(builder, samples, state, columns)
+                for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
+                    total.rows.add(predicted - found.measured)
+                vectors = torch.cat([found.torque[None], found.predicted - found.torque])
+                for group in null_space_components(builder, samples, state, vectors):
+                    for total, inside in zip(sums, group, strict=True):
+                        total.projected.add(inside.flatten()[:, None])
+            return sums
+
+        parts = map_chunks(logs, builder, fold, progress=progress)
+        return [ForceSums.total(same) for same in zip(*parts, strict=True)]
+
+    def summary(self, measured: ForceSums, errors: ForceSums) -> Metrics:
+        """What sums say."""
+        base = self.robot.base_rows
+        rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
+        joints = slice(base, base + self.robot.n)
+        by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
+        groups = ERROR_GROUPS if errors.whitened.count.any() else ROW_GROUPS
+        names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
+        return Metrics(
+            {group: finite_or_none(rms[group]) for group in groups},
+            {group: _ratio(rms[group], size[group]) for group in groups},
+            {name: finite_or_none(x) for name, x in zip(names, by_joint, strict=True)},
+            {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
+            _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
+            {group: finite_or_none(rms[group]) for group in limbs},
+            {group: _ratio(rms[group], size[group]) for group in limbs},
+        )
+
+
+def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[WorseThanNominal]:
+    """Groups of rows where identified parameters are clearly worse than nominal ones.
+
+    Args:
+        sets: nominal and identified metrics by name of the logs.
+    """
+    found = []
+    for logs, (nominal, identified) in sets.items():
+        for group in DECISIVE_GROUPS:
+            before, after = nominal.rms.get(group), identified.rms.get(group)
+            if before is None or after is None:
+                continue
+            share = identified.relative.get(group)
+            measured = after / share if share else 0.0
+            if after > _CLEARLY * before and after - before > _MATTERS * measured:
+                found.append(WorseThanNominal(logs, group, before, after))
+    return found
+
+
+@dataclass(frozen=True)
+class WorseThanNominal:
+    """A group of rows on a set of logs in which the URDF's parameters predict better, with both errors."""
+
+    logs: str
+    group: str
+    nominal: float
+    identified: float
+
+    def __str__(self) -> str:
+        return describe_errors(self.group, self.identified, self.nominal) or self.group
+
+
+def describe_worse(found: list[WorseThanNominal]) -> str | None:
+    """One line of what is worse, None if nothing is."""
+    if not found:
+        return None
+    by_logs = {one.logs: [str(other) for other in found if other.logs == one.logs] for one in found}
+    told = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
+    return f"the identified parameters predict worse than the URDF's, {told}"
+
+
+def describe_errors(group: str, identified: float | None, nominal: float | None) -> str | None:
+    """Both errors of a group of rows in words, None where it has none."""
+    if identified is None or nominal is None:
+        return None
+    unit = ERROR_GROUPS[group].split("[")[1].rstrip("]")
+    name = "whitened projected residual" if group == WHITENED else group_name(group)
+    return f"{name} {identified:.3g} against {nominal:.3g} {unit}"
+
+
+def group_name(group: str) -> str:
+    """Name of a group of rows, without its unit."""
+    return ERROR_GROUPS[group].split(" [")[0]
+
+
+def null_space_components(
+    builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor
+) -> Iterator[torch.Tensor]:
+    """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
+
+    Joints away from contacts pass unchanged.
+    """
+    layout, base = builder.layout(state), builder.tree.base_rows
+    coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
+    uncoupled = [base + joint for joint in layout.uncoupled_joints]
+    for index, V in builder.null_space_bases(samples, state):
+        these = vectors[:, index]
+        yield torch.cat([(V.mT @ these[..., coupled, None])[..., 0], these[..., uncoupled]], dim=2)
+
+
+class ForceSums:
+    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space.
+
+    `whitened`: of the rows that a fit sees, V_x^T f of its sensors in units of their noise.
+    """
+
+    def __init__(self, n_rows: int) -> None:
+        """Start empty."""
+        self.rows, self.projected, self.whitened = Squares(n_rows), Squares(1), Squares(1)
+
+    @classmethod
+    def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
+        """Of all parts together."""
+        out = cls(len(parts[0].rows.sum))
+        for part in parts:
+            out.rows.merge(part.rows)
+            out.projected.merge(part.projected)
+            out.whitened.merge(part.whitened)
+        return out
+
+    def rms(self, base_rows: int, n: int) -> dict[str, float]:
+        """By group of rows, NaN where there are none, of a robot with so many base rows and joints."""
+        joints = self.rows.rms(slice(base_rows, base_rows + n))
+        force, moment = self._in_limbs(base_rows + n)
+        return {
+            "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
+            "base_force": self.rows.pooled(slice(0, 3)) if base_rows else np.nan,
+            "base_moment": self.rows.pooled(slice(3, 6)) if base_rows else np.nan,
+            "ft_force": force,
+            "ft_moment": moment,
+            "nullspace": self.projected.pooled(slice(None)),
+            WHITENED: self.whitened.pooled(slice(None)),
+        }
+
+    def _in_limbs(self, first: int) -> tuple[float, float]:
+        """Of forces and of moments of the sensors in limbs."""
+        squares, count = (x[first:].reshape(-1, 2, 3).sum((0, 2)) for x in (self.rows.sum, self.rows.count))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            force, moment = np.sqrt(squares / count)
+        return float(force), float(moment)
 
 
 class Squares:
@@ -69,252 +306,10 @@ class Squares:
         self.count += other.count
 
 
-class ForceSums:
-    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space.
-
-    `whitened`: of the rows that a fit sees, V_x^T f of its sensors in units of their noise.
-    """
-
-    def __init__(self, nv: int) -> None:
-        """Start empty."""
-        self.rows, self.projected, self.whitened = Squares(nv), Squares(1), Squares(1)
-
-    @classmethod
-    def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
-        """Of all parts together."""
-        out = cls(len(parts[0].rows.sum))
-        for part in parts:
-            out.rows.merge(part.rows)
-            out.projected.merge(part.projected)
-            out.whitened.merge(part.whitened)
-        return out
-
-    def rms(self, base_rows: int, n: int) -> dict[str, float]:
-        """By group of rows, NaN where there are none, of a robot with so many base rows and joints."""
-        joints = self.rows.rms(slice(base_rows, base_rows + n))
-        force, moment = self._in_limbs(base_rows + n)
-        return {
-            "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
-            "base_force": self.rows.pooled(slice(0, 3)) if base_rows else np.nan,
-            "base_moment": self.rows.pooled(slice(3, 6)) if base_rows else np.nan,
-            "ft_force": force,
-            "ft_moment": moment,
-            "nullspace": self.projected.pooled(slice(None)),
-            WHITENED: self.whitened.pooled(slice(None)),
-        }
-
-    def _in_limbs(self, first: int) -> tuple[float, float]:
-        """Of forces and of moments of the sensors in limbs."""
-        squares, count = (x[first:].reshape(-1, 2, 3).sum((0, 2)) for x in (self.rows.sum, self.rows.count))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            force, moment = np.sqrt(squares / count)
-        return float(force), float(moment)
-
-
-def projected(builder: RowBuilder, samples: Samples, state: State, vectors: torch.Tensor) -> Iterator[torch.Tensor]:
-    """V_x^T of generalized forces (M, B, nv), V_x the contacts' null space, in groups of one rank, (M, B', r).
-
-    Joints away from contacts pass unchanged.
-    """
-    plan, base = builder.plan(state), builder.tree.base_rows
-    mixed = [*range(base), *(base + joint for joint in plan.mixed_joints)]
-    lone = [base + joint for joint in plan.lone_joints]
-    for index, V in builder.bases(samples, state):
-        these = vectors[:, index]
-        yield torch.cat([(V.mT @ these[..., mixed, None])[..., 0], these[..., lone]], dim=2)
-
-
-def figure(x: float) -> float | None:
+def finite_or_none(x: float) -> float | None:
     """A number, or None where there is none."""
     return float(x) if np.isfinite(x) else None
 
 
-GROUPS = {
-    "joint_torque": "joint torque [N m]",
-    "base_force": "base force [N]",
-    "base_moment": "base moment [N m]",
-    "nullspace": "projected [N, N m]",
-}
-"""Groups of rows that errors are given for, with a name and unit to show."""
-
-SHOWN = GROUPS | {WHITENED: "whitened [x noise]"}
-"""Those, and the whitened projected residual of a fit's own rows, which there is with any sensors."""
-
-LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
-"""Readings of force/torque sensors in limbs, of robots that have some."""
-
-SETS = ("train", "test")
-"""Sets of logs that errors are given for."""
-
-BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis in "xyz")
-"""Names of the six base rows."""
-
-
-def group_name(group: str) -> str:
-    """Name of a group of rows, without its unit."""
-    return SHOWN[group].split(" [")[0]
-
-
-@dataclass(frozen=True)
-class Metrics:
-    """Errors of one parameter vector on some logs; None where the logs cannot give a figure.
-
-    `rms` and `relative` by group of `SHOWN`, the last in units of the stated noise; `by_joint_rms` and
-    `by_joint_relative` by joint. Relative means rms of the error over
-    rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
-    the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
-    mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
-    """
-
-    rms: dict[str, float | None]
-    relative: dict[str, float | None]
-    by_joint_rms: dict[str, float | None]
-    by_joint_relative: dict[str, float | None]
-    base_force_of_variation: float | None
-    limb_rms: dict[str, float | None] = field(default_factory=dict)
-    limb_relative: dict[str, float | None] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, object]:
-        """As `metrics.json` has it."""
-        out: dict[str, object] = {}
-        for suffix, groups, joints, limbs in (
-            ("rms", self.rms, self.by_joint_rms, self.limb_rms),
-            ("rms_relative", self.relative, self.by_joint_relative, self.limb_relative),
-        ):
-            out |= {f"{group}_{suffix}": x for group, x in limbs.items()}
-            for group in GROUPS:
-                out[f"{group}_{suffix}"] = groups[group]
-                if group == "joint_torque":
-                    out[f"joint_torque_{suffix.replace('rms', 'rms_by_joint')}"] = joints
-        return out | {WHITENED: self.rms.get(WHITENED), f"{WHITENED}_relative": self.relative.get(WHITENED)}
-
-
-class Evaluation:
-    """Evaluates several parameter vectors at once, in one pass over the logs."""
-
-    def __init__(
-        self, robot: Robot, contacts: Sequence[Contact], device: str = "cpu", terms: ExtraTerms | None = None
-    ) -> None:
-        """Fix robot, contacts and what actuators add; sensors do not matter, whatever a log has is used."""
-        actuators = replace(terms or ExtraTerms(), offsets={}, scales={})
-        self.robot = robot
-        sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
-        self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
-
-    def metrics(
-        self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
-    ) -> list[Metrics]:
-        """One `Metrics` per row of `phi`, as `RowBuilder.columns_of`, over all samples of the logs together.
-
-        Without the whitened projected residual, which depends on sensors.
-        """
-        measured, *errors = self.sums(logs, phi, progress)
-        return [self.summary(measured, error) for error in errors]
-
-    def sums(
-        self, logs: Sequence[Samples], phi: Array, progress: Callable[[int], None] | None = None
-    ) -> list[ForceSums]:
-        """Of the measured forces, then of the errors of each row of `phi`."""
-        builder = self.builder
-        columns = builder.columns_of(phi)
-
-        def fold(chunks: Iterator[tuple[Samples, State]]) -> list[ForceSums]:
-            sums = [ForceSums(self.robot.base_rows + self.robot.dofs) for _ in range(len(phi) + 1)]
-            for samples, state in chunks:
-                found = forces(builder, samples, state, columns)
-                for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
-                    total.rows.add(predicted - found.measured)
-                vectors = torch.cat([found.torque[None], found.predicted - found.torque])
-                for group in projected(builder, samples, state, vectors):
-                    for total, inside in zip(sums, group, strict=True):
-                        total.projected.add(inside.flatten()[:, None])
-            return sums
-
-        parts = over_chunks(logs, builder, fold, progress=progress)
-        return [ForceSums.total(same) for same in zip(*parts, strict=True)]
-
-    def summary(self, measured: ForceSums, errors: ForceSums) -> Metrics:
-        """What sums say."""
-        base = self.robot.base_rows
-        rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
-        joints = slice(base, base + self.robot.n)
-        by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
-        groups = SHOWN if errors.whitened.count.any() else GROUPS
-        names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
-        return Metrics(
-            {group: figure(rms[group]) for group in groups},
-            {group: _ratio(rms[group], size[group]) for group in groups},
-            {name: figure(x) for name, x in zip(names, by_joint, strict=True)},
-            {name: _ratio(x, y) for name, x, y in zip(names, by_joint, joint_size, strict=True)},
-            _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
-            {group: figure(rms[group]) for group in limbs},
-            {group: _ratio(rms[group], size[group]) for group in limbs},
-        )
-
-
 def _ratio(x: float, y: float) -> float | None:
     return float(x / y) if np.isfinite(x) and y > 0.0 else None
-
-
-JUDGED = ("joint_torque", "base_force", "base_moment", WHITENED)
-"""Groups of rows that decide; what is projected without whitening repeats them."""
-
-_CLEARLY = 1.05  # ratio of errors: what is closer is as good
-_MATTERS = 1e-3  # share of the measured: two models that leave less, as on data without noise, are equally good
-
-
-@dataclass(frozen=True)
-class Worse:
-    """A group of rows on a set of logs in which the URDF's parameters predict better, with both errors."""
-
-    logs: str
-    group: str
-    nominal: float
-    identified: float
-
-    def __str__(self) -> str:
-        return described(self.group, self.identified, self.nominal) or self.group
-
-
-def described(group: str, identified: float | None, nominal: float | None) -> str | None:
-    """Both errors of a group of rows in words, None where it has none."""
-    if identified is None or nominal is None:
-        return None
-    unit = SHOWN[group].split("[")[1].rstrip("]")
-    name = "whitened projected residual" if group == WHITENED else group_name(group)
-    return f"{name} {identified:.3g} against {nominal:.3g} {unit}"
-
-
-def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Worse]:
-    """Groups of rows where identified parameters are clearly worse than nominal ones.
-
-    Args:
-        sets: nominal and identified metrics by name of the logs.
-    """
-    found = []
-    for logs, (nominal, identified) in sets.items():
-        for group in JUDGED:
-            before, after = nominal.rms.get(group), identified.rms.get(group)
-            if before is None or after is None:
-                continue
-            share = identified.relative.get(group)
-            measured = after / share if share else 0.0
-            if after > _CLEARLY * before and after - before > _MATTERS * measured:
-                found.append(Worse(logs, group, before, after))
-    return found
-
-
-def verdict(found: list[Worse]) -> str | None:
-    """One line of what is worse, None if nothing is."""
-    if not found:
-        return None
-    by_logs = {one.logs: [str(other) for other in found if other.logs == one.logs] for one in found}
-    told = "; ".join(f"on {logs}: {listed(texts)}" for logs, texts in by_logs.items())
-    return f"the identified parameters predict worse than the URDF's, {told}"
-
-
-ADVICE = (
-    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge (auto "
-    "chooses one), or record more and other motion"
-)
-"""What to do about it."""

@@ -18,17 +18,18 @@ import torch
 from torch import Tensor
 
 from torchid.parameters import Array
-from torchid.problem.chunks import by_state, one_thread
+from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.compression import Part
 from torchid.problem.contact_state import State
 from torchid.problem.extras import measured_components
 from torchid.problem.linear import LinearProblem, TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.rounding import is_significant
 from torchid.sensing import SensorNoise
 
-BASE = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
-GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE, "ft_force", "ft_moment")
+BASE_GROUPS = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
+NOISE_GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE_GROUPS, "ft_force", "ft_moment")
 """Groups of one standard deviation each; base rows along the axes of the levelled base."""
 
 _SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # whose rows are kept: 1000 show a standard deviation to 2 to 3 %
@@ -39,7 +40,7 @@ _CLIPPED = 0.99501  # E[min(x^2, 9)] of standard normal x
 _HELD = 0.005  # weight of the variances so far against what residuals say: settles what these cannot tell apart
 _LEAST_STEP = 0.05  # of a variance, by which factor it may fall in one step
 _SHARE = 0.01  # least share of a group in the variance along its own directions: a tenth of the deviation there
-_SMALLEST = 1e-3  # of the guess, least standard deviation: what is left of exact logs is rounding
+_SMALLEST = 1e-3  # of the stated noise, least standard deviation: what is left of exact logs is rounding
 _LEFT = 0.1  # least share of the residual's degrees of freedom that a group is taken to have
 _FEW = 20.0  # independent readings, fewer of which say nothing: a standard deviation to 16 %
 _UNSEEN = 1e-9  # share of a source's variance in the rows below which it is projected out
@@ -47,17 +48,19 @@ _STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions 
 _CONFOUNDED = 0.5  # relative standard error of a standard deviation
 
 
-def by_group(noise: SensorNoise) -> dict[str, float]:
+def std_by_group(noise: SensorNoise) -> dict[str, float]:
     """Standard deviation of every group."""
-    limb = noise.limb
+    limb = noise.limb_std
     sensors = (noise.joint_torque, noise.contact_force, noise.contact_moment)
-    return dict(zip(GROUPS, [*sensors, *noise.base.tolist(), *limb], strict=True))
+    return dict(zip(NOISE_GROUPS, [*sensors, *noise.base_std.tolist(), *limb], strict=True))
 
 
-def of_groups(values: Mapping[str, float]) -> SensorNoise:
+def noise_of_groups(values: Mapping[str, float]) -> SensorNoise:
     """The noise of standard deviations by group."""
-    force, moment = ((values[names[0]], values[names[1]], values[names[2]]) for names in (BASE[:3], BASE[3:]))
-    plain = {name: values[name] for name in GROUPS if name not in BASE}
+    force, moment = (
+        (values[names[0]], values[names[1]], values[names[2]]) for names in (BASE_GROUPS[:3], BASE_GROUPS[3:])
+    )
+    plain = {name: values[name] for name in NOISE_GROUPS if name not in BASE_GROUPS}
     return SensorNoise(**plain, base_force=force, base_moment=moment)
 
 
@@ -65,8 +68,8 @@ def of_groups(values: Mapping[str, float]) -> SensorNoise:
 class _Chunk:
     """Samples of one log in one contact state.
 
-    `rows`, (B, nv, width + 1), whitened with the noise of the builder; `sources`, (B, E, nv), one standard deviation of
-    each source of noise in these rows.
+    `rows`, (B, n_rows, width + 1), whitened with the noise of the builder; `sources`, (B, E, n_rows), one standard
+    deviation of each source of noise in these rows.
     """
 
     log: str
@@ -80,8 +83,8 @@ class SampledRows:
     """Rows of some thousand samples of the logs, kept to be whitened again with other noise.
 
     Attributes:
-        builder: of the rows; its sensors' noise is the guess that variances are relative to.
-        groups: those that the sensors have, by place in `GROUPS`' order.
+        builder: of the rows; its sensors' noise is the stated one, which variances are relative to.
+        groups: those that the sensors have, by place in `NOISE_GROUPS`' order.
         group_of: (E,), place among `groups` of every source of noise.
     """
 
@@ -91,19 +94,19 @@ class SampledRows:
         """Compute the rows, of samples at random but always the same."""
         self.builder = builder
         names = _source_names(builder)
-        self.groups = tuple(name for name in GROUPS if name in names)
+        self.groups = tuple(name for name in NOISE_GROUPS if name in names)
         self.group_of = np.array([self.groups.index(name) for name in names], dtype=int)
-        guess = by_group(builder.sensors.noise)
-        self._std = torch.tensor([guess[name] for name in names], dtype=torch.float64)
-        nv = builder.tree.base_rows + len(builder.columns.joint_rows)
-        most = min(_SAMPLES, _BYTES // (8 * max(nv, 1) * (builder.width + 1 + len(names))))
+        stated = std_by_group(builder.sensors.noise)
+        self._std = torch.tensor([stated[name] for name in names], dtype=torch.float64)
+        n_rows = builder.tree.n_rows
+        most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
         self.chunks = [self._chunk(part, state) for part, state in _some(logs, max(most, 1))]
 
     @property
-    def guess(self) -> Array:
-        """Standard deviation of each group that variances are relative to, (G,)."""
-        found = by_group(self.builder.sensors.noise)
-        return np.array([found[name] for name in self.groups])
+    def reference_std(self) -> Array:
+        """Stated standard deviation of each group, which variances are relative to, (G,) [N m, N]."""
+        stated = std_by_group(self.builder.sensors.noise)
+        return np.array([stated[name] for name in self.groups])
 
     @property
     def oversampling(self) -> float:
@@ -117,10 +120,10 @@ class SampledRows:
         return _Chunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
 
     def _ways(self, samples: Samples) -> Tensor:
-        """Generalized force that a unit of each source makes, (B, E, nv)."""
+        """Generalized force that a unit of each source makes, (B, E, n_rows)."""
         builder, base = self.builder, self.builder.tree.base_rows
-        nv = base + len(builder.columns.joint_rows)
-        unit = torch.eye(nv, dtype=samples.time.dtype, device=samples.time.device)
+        n_rows = builder.tree.n_rows
+        unit = torch.eye(n_rows, dtype=samples.time.dtype, device=samples.time.device)
         ways = [unit[:base].expand(len(samples), -1, -1)]
         if base and (axes := builder.noise_axes(samples.rotation_world_base)) is not None:
             turned = ways[0].clone()
@@ -134,7 +137,7 @@ class SampledRows:
         return torch.cat(ways, dim=1)
 
     def whitened(self, variance: Array) -> Iterator[_Chunk]:
-        """The chunks, whitened with variances of the groups relative to the guess, (G,)."""
+        """The chunks, whitened with variances of the groups relative to the stated ones, (G,)."""
         if (variance == 1.0).all():
             yield from self.chunks
             return
@@ -149,7 +152,7 @@ class SampledRows:
             yield replace(chunk, rows=rows, sources=sources)
 
     @one_thread()
-    def parts(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
+    def compress(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
         """The rows, whitened anew and compressed.
 
         With parameters of an earlier fit in the builder's columns, by log, rows that are far off count less, as in
@@ -176,7 +179,7 @@ def _source_names(builder: RowBuilder) -> list[str]:
     dofs = ["joint_torque" if dof < n else limbs[(dof - n) % 6] for dof in np.flatnonzero(builder.sensors.torque)]
     components = np.argwhere(measured_components(builder.contacts, builder.sensors))[:, 1]
     contacts = ["contact_force" if k < 3 else "contact_moment" for k in components]
-    return [*BASE[: builder.tree.base_rows], *dofs, *contacts]
+    return [*BASE_GROUPS[: builder.tree.base_rows], *dofs, *contacts]
 
 
 def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State]]:
@@ -189,45 +192,45 @@ def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, State]]
         count = min(len(log), max(round(min(share, 4.0 / log.oversampling) * len(log)), 1))
         index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
         some = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
-        for state, where in by_state(some, _CHUNK):
+        for state, where in chunks_by_state(some, _CHUNK):
             yield some[where], state
 
 
 @dataclass(frozen=True)
-class Components:
-    """Variances of the groups relative to the guess of `SampledRows`.
+class GroupVariances:
+    """Variances of the groups relative to the stated ones, those of the builder of `SampledRows`.
 
     Attributes:
         variance: (G,).
         share: (G,), of the variance along a group's own directions that is its own, between 0 and 1.
-        told: (G,) bool, whether there are readings enough; where not, the variance stays what it was.
+        estimated: (G,) bool, whether there are readings enough; where not, the variance stays what it was.
         error: (G,), relative standard error of the standard deviation, large where groups are confounded.
         change: largest relative change, since the start, of the noise along the directions of a group, whosever it is.
     """
 
     variance: Array
     share: Array
-    told: np.ndarray
+    estimated: np.ndarray
     error: Array
     change: float
 
     @property
-    def at_most(self) -> np.ndarray:
+    def upper_bound(self) -> np.ndarray:
         """Groups whose noise drowns in that of others, of which only an upper bound is known, (G,) bool."""
-        return self.told & (self.share <= 1.5 * _SHARE)
+        return self.estimated & (self.share <= 1.5 * _SHARE)
 
     @property
     def confounded(self) -> np.ndarray:
         """Groups of which residuals show little but their sum with others, (G,) bool."""
-        return self.told & ~self.at_most & (self.error > _CONFOUNDED)
+        return self.estimated & ~self.upper_bound & (self.error > _CONFOUNDED)
 
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Rows' residuals r and sources U of the guess, by chunk, and what the fit took of each group.
+    """Rows' residuals r and sources U of the stated noise, by chunk, and what the fit took of each group.
 
-    `r`: (B, nv), `U`: (B, E, nv); `left`, (G,), share of the degrees of freedom that the fit left; `independent`, (G,),
-    number of independent readings.
+    `r`: (B, n_rows), `U`: (B, E, n_rows); `left`, (G,), share of the degrees of freedom that the fit left;
+    `independent`, (G,), number of independent readings.
     """
 
     r: list[Tensor]
@@ -236,7 +239,7 @@ class _Residuals:
     independent: Array
 
 
-class VarianceComponents:
+class VarianceComponentEstimator:
     """Estimates variances of groups from residuals at fitted parameters."""
 
     def __init__(self, rows: SampledRows, tied: Collection[str] = ()) -> None:
@@ -252,12 +255,12 @@ class VarianceComponents:
 
     @one_thread()
     @torch.no_grad()
-    def estimate(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> Components:
+    def estimate(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> GroupVariances:
         """Variances that make the covariance of the residuals the one found.
 
         Residuals are clipped; those of fitted parameters are small, for which each group is corrected by the leverage
         of its own directions. A group is never less than a tenth of the standard deviation along these, nor than a
-        thousandth of the guess.
+        thousandth of the stated noise.
 
         Args:
             variance: (G,), to start from, with which the parameters were fitted.
@@ -265,29 +268,29 @@ class VarianceComponents:
             problem: of the fit.
         """
         found, start = self._residuals(variance, columns, problem), variance
-        told = (found.independent > _FEW) @ self._blocks > 0.0
+        estimated = (found.independent > _FEW) @ self._blocks > 0.0
         first, *_ = M, q, t, count = self._moments(found, variance)
         for _ in range(_STEPS):
             share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
-            step = self._step(M, q, told)
+            step = self._step(M, q, estimated)
             least = np.maximum(_SHARE / np.maximum(share, 1e-12), _SMALLEST**2 / variance)
-            step = np.where(told, np.maximum(step, _block_max(least, self._blocks)), 1.0)
+            step = np.where(estimated, np.maximum(step, _block_max(least, self._blocks)), 1.0)
             factor = self._blocks @ step
             variance = variance * factor
             if _change(M, factor) < _STEADY:
                 break
             M, q, t, count = self._moments(found, variance)
         error = _relative_errors(M * np.sqrt(np.outer(found.left, found.left)) / self.rows.oversampling)
-        return Components(variance, share, self._blocks @ told > 0.0, error, _change(first, variance / start))
+        return GroupVariances(variance, share, self._blocks @ estimated > 0.0, error, _change(first, variance / start))
 
-    def _step(self, M: Array, q: Array, told: np.ndarray) -> Array:
+    def _step(self, M: Array, q: Array, estimated: np.ndarray) -> Array:
         """Factors of the unknown variances, so that the squares are those expected; where M cannot tell, near 1."""
         B = self._blocks
         M, q = B.T @ M @ B, B.T @ q
-        free, held = np.flatnonzero(told), _HELD * np.diag(M)
+        free, held = np.flatnonzero(estimated), _HELD * np.diag(M)
         if not len(free):
             return np.ones(len(q))
-        rest = (q - M[:, ~told].sum(1) + held)[free]
+        rest = (q - M[:, ~estimated].sum(1) + held)[free]
         kept = M[np.ix_(free, free)] + np.diag(held[free])
         size = 1.0 / np.sqrt(np.diag(kept))
         L = np.linalg.cholesky(kept * size * size[:, None])
@@ -308,7 +311,7 @@ class VarianceComponents:
             S = sources.mT @ sources
             S = S + torch.diag_embed((S.diagonal(dim1=1, dim2=2) == 0.0).to(S))
             L = torch.linalg.cholesky(S)
-            white = torch.linalg.solve_triangular(L, sources.mT, upper=False)  # (B, nv, E)
+            white = torch.linalg.solve_triangular(L, sources.mT, upper=False)  # (B, n_rows, E)
             y = torch.linalg.solve_triangular(L, r[..., None], upper=False)
             M += member.T @ (white.mT @ white).square().sum(0) @ member
             sizes.append(white.square().sum(1))
@@ -340,7 +343,7 @@ class VarianceComponents:
 
 
 def _relative_errors(M: Array) -> Array:
-    """Of the standard deviations, (G,), of normal noise whose variances are told by the equations of M / 2."""
+    """Of the standard deviations, (G,), of normal noise whose variances are determined by the equations of M / 2."""
     seen = np.diag(M) > 0.0
     size = np.where(seen, np.diag(M), 1.0) ** -0.5
     values, V = np.linalg.eigh(M * size * size[:, None])
@@ -363,10 +366,10 @@ def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
     """G, (width, rank), so that `|x G|^2` is the leverage of a whitened row x; offsets and the like are few."""
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=False, lapack_driver="gesvd")
-    kept = values > 1e-10 * values.max(initial=0.0)
+    kept = is_significant(values)
     G = np.zeros((builder.width, int(kept.sum())))
     basis = scale[:, None] * Vh[kept].T / values[kept]
-    G[: builder.columns.count] = builder.columns.from_parameters()[:, problem.free] @ basis
+    G[: builder.columns.count] = builder.columns.parameter_map()[:, problem.free] @ basis
     return torch.from_numpy(G)
 
 

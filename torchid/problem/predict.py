@@ -14,18 +14,18 @@ from torch import Tensor
 
 from torchid.logs.spill import Spill
 from torchid.parameters import Array
-from torchid.problem.chunks import by_state, one_thread
-from torchid.problem.contact_state import State, dof_column, reading_column
+from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.contact_state import State, contact_extra_column, dof_extra_column
 from torchid.problem.extras import ACTUATORS, Extra
-from torchid.problem.rows import ChunkTerms, RowBuilder
+from torchid.problem.rows import ChunkDynamics, RowBuilder
 from torchid.problem.samples import Samples
-from torchid.regressor.jacobian import generalized_forces, wrench_map, wrenches_at_base
+from torchid.regressor.jacobian import generalized_forces, wrench_transform, wrenches_at_base
 from torchid.regressor.tree import KinematicTree
 
 _ROWS = 2**16  # of a log on the disk that are in memory at a time
 
 
-def calibrated(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
+def calibrate_readings(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
     """Samples whose readings are the forces they stand for: s y - o for an offset o and a scale s of the reading y.
 
     Readings without unknowns are shared with `samples`; those that change lie on the disk if `samples` do.
@@ -61,10 +61,10 @@ def _readings(samples: Samples, known: Sequence[tuple[Extra, float]], tree: Kine
         if name not in copies:
             copies[name] = recorded.clone()
         if extra.contact is None:
-            copies[name][:, extra.dof] -= value * dof_column(extra, samples, tree)
+            copies[name][:, extra.dof] -= value * dof_extra_column(extra, samples, tree)
         else:
             contact, axis = extra.contact
-            copies[name][:, contact, axis] -= value * reading_column(extra, samples, contact, axis)
+            copies[name][:, contact, axis] -= value * contact_extra_column(extra, samples, contact, axis)
     return copies
 
 
@@ -72,8 +72,8 @@ def _readings(samples: Samples, known: Sequence[tuple[Extra, float]], tree: Kine
 class Forces:
     """Generalized forces of some samples, rows as in K: base force, base moment, joints.
 
-    `measured`, (B, nv): S^T tau + J_C^T lambda, NaN where a force that enters was not measured. `torque`, (B, nv): the
-    part S^T tau. `predicted`, (M, B, nv): K phi for M parameter vectors.
+    `measured`, (B, n_rows): S^T tau + J_C^T lambda [N, N m], NaN where a force that enters was not measured. `torque`,
+    (B, n_rows): the part S^T tau. `predicted`, (M, B, n_rows): K phi for M parameter vectors.
     """
 
     measured: Tensor
@@ -81,84 +81,84 @@ class Forces:
     predicted: Tensor
 
 
-def predicted_forces(builder: RowBuilder, terms: ChunkTerms, phi: Tensor) -> Tensor:
-    """K phi, (nv, B), for parameters in the builder's columns, (columns,), without extras.
+def predicted_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
+    """K phi, (n_rows, B), for parameters in the builder's columns, (columns,), without extras.
 
     Bodies' wrenches, summed over subtrees, work along screw axes: the rows of K are never formed.
     """
     tree, layout = builder.tree, builder.columns.layout
-    by_body = phi.new_zeros(tree.bodies, layout.count)
+    by_body = phi.new_zeros(tree.n_nodes, layout.count)
     for body, start in enumerate(layout.starts[:-1]):
         end = layout.starts[body + 1]
         by_body[body, start:end] = phi[start:end]
-    wrench = by_body @ terms.wrenches  # (6, L, B)
+    wrench = by_body @ dynamics.wrenches  # (6, L, B)
     below = tree.ancestors.T @ wrench
-    torque = (terms.directions * below).sum(0)
+    torque = (dynamics.directions * below).sum(0)
     coulomb, viscous = phi[layout.count : builder.columns.count].unflatten(0, (-1, 2)).unbind(1)
-    velocity = terms.joints.velocity[1:]
+    velocity = dynamics.joints.velocity[1:]
     torque[1:] += coulomb[:, None] * tree.coulomb_sign(velocity) + viscous[:, None] * velocity
     joints = tree.joint_map.T @ torque
     return torch.cat([wrench.sum(1), joints]) if tree.base_rows else joints
 
 
-def contact_forces(builder: RowBuilder, samples: Samples, state: State, terms: ChunkTerms) -> Tensor:
-    """J_C^T lambda, (nv, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
+def contact_forces(builder: RowBuilder, samples: Samples, state: State, dynamics: ChunkDynamics) -> Tensor:
+    """J_C^T lambda, (n_rows, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
     tree = builder.tree
-    total = samples.time.new_zeros(tree.base_rows + len(builder.columns.joint_rows), len(samples))
+    total = samples.time.new_zeros(tree.n_rows, len(samples))
     for contact, active in enumerate(state):
         if active:
             body, T_joint_frame = builder.frames[contact]
             possible = list(builder.contacts[contact].components)
-            units = total.new_tensor(wrench_map(T_joint_frame).T[possible])
-            components = builder.local_wrench(samples, contact, terms)[:, possible].T
-            wrench = (wrenches_at_base(terms.states, body, units) * components).sum(1, keepdim=True)
+            units = total.new_tensor(wrench_transform(T_joint_frame).T[possible])
+            components = builder.recorded_wrench(samples, contact, dynamics)[:, possible].T
+            wrench = (wrenches_at_base(dynamics.states, body, units) * components).sum(1, keepdim=True)
             joints = builder.columns.joints_above(body)  # and no others, where an unmeasured force would be NaN
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
-            total[rows] += generalized_forces(tree, terms.directions, body, wrench, joints)[0]
+            total[rows] += generalized_forces(tree, dynamics.directions, body, wrench, joints)[0]
     return total
 
 
-def forces(builder: RowBuilder, samples: Samples, state: State, phi: Tensor) -> Forces:
+def measured_and_predicted(builder: RowBuilder, samples: Samples, state: State, phi: Tensor) -> Forces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
 
     Sensors count as calibrated: of the extras, those of actuators alone enter.
     """
-    terms = builder.terms(samples)
+    dynamics = builder.dynamics(samples)
     base_rows = builder.tree.base_rows
-    torque = torch.nn.functional.pad(builder.torque(samples), (base_rows, 0))
-    measured = torque + contact_forces(builder, samples, state, terms).T
-    predicted = torch.stack([predicted_forces(builder, terms, p).T for p in phi])
+    torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
+    measured = torque + contact_forces(builder, samples, state, dynamics).T
+    predicted = torch.stack([predicted_forces(builder, dynamics, p).T for p in phi])
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
         if extra.dof is not None and extra.what in ACTUATORS:
-            column = dof_column(extra, samples, builder.tree)
+            column = dof_extra_column(extra, samples, builder.tree)
             predicted[..., base_rows + extra.dof] += phi[:, number, None] * column
     return Forces(measured, torque, predicted)
 
 
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:
-    """Measured (N, nv) and predicted (M, N, nv) forces of a whole log in its own order, parameters as `columns_of`."""
-    columns = builder.columns_of(phi)
-    nv = builder.tree.base_rows + len(builder.columns.joint_rows)
-    measured, predicted = np.empty((len(samples), nv)), np.empty((len(phi), len(samples), nv))
+    """Measured (N, n_rows) and predicted (M, N, n_rows) forces of a log in its order, `phi` as for `to_columns`."""
+    columns = builder.to_columns(phi)
+    n_rows = builder.tree.n_rows
+    measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
     with torch.no_grad(), one_thread():
-        for state, index in by_state(samples):
-            found = forces(builder, samples[index].to(builder.device), state, columns)
+        for state, index in chunks_by_state(samples):
+            found = measured_and_predicted(builder, samples[index].to(builder.device), state, columns)
             where = index if isinstance(index, slice) else index.numpy()
             measured[where] = found.measured.cpu().numpy()
             predicted[:, where] = found.predicted.cpu().numpy()
     return measured, predicted
 
 
-def in_null_space(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
-    """V_x V_x^T f of generalized forces (M, N, nv): what is left of each row inside the builder's null space."""
+def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Array:
+    """V_x V_x^T f of generalized forces (M, N, n_rows): what is left of each row inside the builder's null space."""
     out, base = forces.copy(), builder.tree.base_rows
     with torch.no_grad(), one_thread():
-        for state, index in by_state(samples):
+        for state, index in chunks_by_state(samples):
             where = np.arange(len(samples))[index if isinstance(index, slice) else index.numpy()]
-            mixed = [*range(base), *(base + joint for joint in builder.plan(state).mixed_joints)]
-            for part, V in builder.bases(samples[index].to(builder.device), state):
+            coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
+            for part, V in builder.null_space_bases(samples[index].to(builder.device), state):
                 chosen = where[part if isinstance(part, slice) else part.cpu().numpy()]
-                place = np.ix_(np.arange(len(forces)), chosen, mixed)
+                place = np.ix_(np.arange(len(forces)), chosen, coupled)
                 inside = V @ (V.mT @ torch.from_numpy(forces[place]).to(V)[..., None])
                 out[place] = inside[..., 0].cpu().numpy()
     return out

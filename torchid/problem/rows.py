@@ -11,17 +11,24 @@ from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.problem.base_motion import levelled
-from torchid.problem.contact_state import Columns, Planner, State, StatePlan, dof_column, mixed_columns
-from torchid.problem.extras import ExtraTerms, extras_of
+from torchid.problem.base_motion import levelled_base_axes
+from torchid.problem.contact_state import (
+    Columns,
+    ContactStateLayout,
+    ContactStateLayouts,
+    State,
+    dof_extra_column,
+    extra_columns,
+)
+from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.samples import Samples
-from torchid.regressor.jacobian import generalized_forces, wrench_map, wrenches_at_base
-from torchid.regressor.kinematics import BodyStates, JointStates, body_states, joint_states
-from torchid.regressor.regressor import all_wrench_columns, friction_columns, joint_directions, joint_row
+from torchid.regressor.jacobian import generalized_forces, wrench_transform, wrenches_at_base
+from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion
+from torchid.regressor.regressor import all_wrench_columns, friction_columns, joint_row, joint_screw_axes
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
-from torchid.sensing.projection import levelled_null_space, null_space
+from torchid.sensing.projection import null_space, whitened_null_space
 
 
 class Workspace:
@@ -40,25 +47,25 @@ class Workspace:
 
 
 @dataclass(frozen=True)
-class ChunkTerms:
+class ChunkDynamics:
     """Dynamics of a chunk of samples: everything that rows and predictions are made of."""
 
-    joints: JointStates
+    joints: JointMotion
     states: BodyStates
     directions: Tensor
     wrenches: Tensor
     rotation_world_base: Tensor | None
 
-    def select(self, index: Tensor | slice) -> ChunkTerms:
-        """The terms of some samples."""
+    def select(self, index: Tensor | slice) -> ChunkDynamics:
+        """The dynamics of some samples."""
         if isinstance(index, slice):  # all of them
             return self
 
         def pick(x: Tensor) -> Tensor:
             return x[..., index]
 
-        return ChunkTerms(
-            JointStates(*map(pick, vars(self.joints).values())),
+        return ChunkDynamics(
+            JointMotion(*map(pick, vars(self.joints).values())),
             BodyStates(*map(pick, vars(self.states).values())),
             pick(self.directions),
             pick(self.wrenches),
@@ -67,7 +74,14 @@ class ChunkTerms:
 
 
 class RowBuilder(nn.Module):
-    """Rows of `W^T [K_columns | f]`: W a basis of V_x's span under which the projected sensor noise is white."""
+    """Rows of `W^T [K_columns | f]`: W a basis of V_x's span under which the projected sensor noise is white.
+
+    The fast path to the equations that `torchid.Projection` makes of `torchid.Regressor` and `torchid.FrameJacobian`:
+    the same but for a rotation of each sample's rows, in fewer columns (see `Columns`). It shares their kernels, the
+    functions of `torchid.regressor` and the null spaces of `torchid.sensing.projection`, but takes samples one contact
+    state at a time, where all shapes are constant, and multiplies W^T into the bodies' wrenches without forming K.
+    `tests/test_rows_two_ways.py` compares both ways; read the other first.
+    """
 
     def __init__(
         self, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms | None = None
@@ -75,32 +89,31 @@ class RowBuilder(nn.Module):
         """Fix robot, contacts, sensors, and which unknowns there are beside the bodies' parameters."""
         super().__init__()
         terms = terms or ExtraTerms()
-        self.extras = extras_of(robot, contacts, sensors, terms)
+        self.extras = list_extras(robot, contacts, sensors, terms)
         self.tree = KinematicTree(robot, terms.sign_width)
         self.columns = Columns(self.tree)
         self.contacts = tuple(contacts)
         self.sensors = sensors
-        self._planner = Planner(robot, self.columns, contacts, sensors, self.extras)
-        self._plans: dict[State, StatePlan] = {}
+        self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
-        self._plans.clear()  # their tensors are where the module was
+        self._layouts.forget()  # their tensors are where the module was
         super()._apply(fn, recurse)
         return self
 
     @property
     def frames(self) -> list[tuple[int, Array]]:
         """Body of each contact, and the pose (4, 4) of the contact frame in the body's joint frame."""
-        return self._planner.frames
+        return self._layouts.frames
 
     @property
     def width(self) -> int:
         """Number of all columns: those of the bodies' parameters, then one for each of `extras`."""
         return self.columns.count + len(self.extras)
 
-    def columns_of(self, phi: Array) -> Tensor:
+    def to_columns(self, phi: Array) -> Tensor:
         """Parameters (M, 12 L), or (M, 12 L + E) with values of the `extras`, in these columns: (M, width)."""
-        rigid = self.columns.from_parameters()
+        rigid = self.columns.parameter_map()
         extra = phi[:, rigid.shape[1] :] if phi.shape[1] > rigid.shape[1] else np.zeros((len(phi), len(self.extras)))
         return torch.from_numpy(np.hstack([phi[:, : rigid.shape[1]] @ rigid.T, extra])).to(self.device)
 
@@ -109,23 +122,21 @@ class RowBuilder(nn.Module):
         """Where the rows are computed."""
         return self.tree.ancestors.device
 
-    def plan(self, state: State) -> StatePlan:
-        """The plan of a contact state, made once."""
-        if state not in self._plans:
-            self._plans[state] = self._planner.plan(state)
-        return self._plans[state]
+    def layout(self, state: State) -> ContactStateLayout:
+        """What is constant in a contact state: columns, joints and wrench directions that take part."""
+        return self._layouts.layout(state)
 
-    def terms(self, samples: Samples, workspace: Workspace | None = None) -> ChunkTerms:
+    def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
         """Dynamics of some samples; with a workspace, valid until the next call with the same."""
         motion = samples.motion()
-        joints = joint_states(self.tree, motion)
+        joints = joint_motion(self.tree, motion)
         states = body_states(self.tree, motion, joints)
-        directions = joint_directions(self.tree, states)
-        layout, out = self.columns.layout, None
+        directions = joint_screw_axes(self.tree, states)
+        column_layout, out = self.columns.layout, None
         if workspace is not None:
-            out = workspace.zeros("wrenches", states.position, 6, layout.count, len(samples))
-        wrenches = all_wrench_columns(states, layout, out)
-        return ChunkTerms(joints, states, directions, wrenches, samples.base.rotation)
+            out = workspace.zeros("wrenches", states.position, 6, column_layout.count, len(samples))
+        wrenches = all_wrench_columns(states, column_layout, out)
+        return ChunkDynamics(joints, states, directions, wrenches, samples.base.rotation)
 
     def rows(
         self, samples: Samples, state: State, workspace: Workspace | None = None
@@ -137,152 +148,159 @@ class RowBuilder(nn.Module):
                 is asked for.
         """
         workspace = workspace or Workspace()
-        plan, terms = self.plan(state), self.terms(samples, workspace)
-        for _, _, rows in self._mixed_rows(samples, plan, terms, workspace):
-            yield plan.support, rows.flatten(1).T
-        for joint in plan.lone_joints:
-            columns, rows = self._lone_row(joint, samples, terms)
+        layout, dynamics = self.layout(state), self.dynamics(samples, workspace)
+        for _, _, rows in self._coupled_rows(samples, layout, dynamics, workspace):
+            yield layout.support, rows.flatten(1).T
+        for joint in layout.uncoupled_joints:
+            columns, rows = self._uncoupled_row(joint, samples, dynamics)
             yield columns, rows.T
 
     def rows_by_sample(self, samples: Samples, state: State) -> tuple[Tensor, Tensor]:
         """The same rows sample by sample, for samples that share a contact state.
 
         Returns:
-            (B, nv, width + 1), `W^T [K | f]` with rows of zeros where there are fewer than nv, and W, (B, nv, nv).
+            (B, n_rows, width + 1), `W^T [K | f]` with rows of zeros where a sample has fewer than n_rows, and W,
+            (B, n_rows, n_rows).
         """
-        plan, terms = self.plan(state), self.terms(samples)
-        base, mixed = self.tree.base_rows, self.tree.base_rows + len(plan.mixed_joints)
-        nv = base + len(self.columns.joint_rows)
-        rows = samples.time.new_zeros(len(samples), nv, self.width + 1)
-        W = samples.time.new_zeros(len(samples), nv, nv)
-        moved = self._index([*range(base), *(base + joint for joint in plan.mixed_joints)])
-        support = self._index([*plan.support, self.width])
-        for index, basis, found in self._mixed_rows(samples, plan, terms, Workspace()):
+        layout, dynamics = self.layout(state), self.dynamics(samples)
+        base, coupled = self.tree.base_rows, self.tree.base_rows + len(layout.coupled_joints)
+        n_rows = self.tree.n_rows
+        rows = samples.time.new_zeros(len(samples), n_rows, self.width + 1)
+        W = samples.time.new_zeros(len(samples), n_rows, n_rows)
+        moved = self._index([*range(base), *(base + joint for joint in layout.coupled_joints)])
+        support = self._index([*layout.support, self.width])
+        for index, basis, found in self._coupled_rows(samples, layout, dynamics, Workspace()):
             here = torch.arange(len(samples), device=self.device)[index][:, None, None]
             slots = torch.arange(found.shape[1], device=self.device)
             rows[here, slots[:, None], support] = found.permute(2, 1, 0)
             W[here, moved[:, None], slots] = basis
-        for slot, joint in enumerate(plan.lone_joints, start=mixed):
-            columns, found = self._lone_row(joint, samples, terms)
+        for slot, joint in enumerate(layout.uncoupled_joints, start=coupled):
+            columns, found = self._uncoupled_row(joint, samples, dynamics)
             rows[:, slot, self._index([*columns, self.width])] = found.T
-            W[:, base + joint, slot] = 1.0 / self._planner.dof_std[joint]
+            W[:, base + joint, slot] = 1.0 / self._layouts.dof_std[joint]
         return rows, W
 
-    def bases(self, samples: Samples, state: State) -> Iterator[tuple[Tensor | slice, Tensor]]:
-        """Orthonormal V_x, (B', base rows + mixed joints, r), with the samples it belongs to, grouped by rank."""
-        plan, terms = self.plan(state), self.terms(samples)
-        yield from null_space(self._contact_rows(plan, terms)[0])
+    def null_space_bases(self, samples: Samples, state: State) -> Iterator[tuple[Tensor | slice, Tensor]]:
+        """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
+        layout, dynamics = self.layout(state), self.dynamics(samples)
+        yield from null_space(self._contact_rows(layout, dynamics)[0])
 
     def contact_jacobian(self, samples: Samples) -> Tensor:
-        """Jacobian of every contact frame along its own axes, active or not, (B, C, 6, nv)."""
+        """Jacobian of every contact frame along its own axes, active or not, (B, C, 6, n_rows)."""
         motion = samples.motion()
-        states = body_states(self.tree, motion, joint_states(self.tree, motion))
-        directions, joints = joint_directions(self.tree, states), range(len(self.columns.joint_rows))
-        J = motion.joint_position.new_zeros(len(samples), len(self.frames), 6, self.tree.base_rows + len(joints))
+        states = body_states(self.tree, motion, joint_motion(self.tree, motion))
+        directions, joints = joint_screw_axes(self.tree, states), range(self.tree.n_dofs)
+        J = motion.joint_position.new_zeros(len(samples), len(self.frames), 6, self.tree.n_rows)
         for contact, (body, T_joint_frame) in enumerate(self.frames):
-            units = J.new_tensor(wrench_map(T_joint_frame).T.copy())
+            units = J.new_tensor(wrench_transform(T_joint_frame).T.copy())
             at_base = wrenches_at_base(states, body, units)
             J[:, contact] = generalized_forces(self.tree, directions, body, at_base, joints).permute(2, 0, 1)
         return J
 
     def noise_axes(self, rotation_world_base: Tensor | None) -> Tensor | None:
-        """Axes of the floors of the base rows, (B, 3, 3), as `levelled`; None without attitude: the base's own."""
-        return None if rotation_world_base is None or not self.tree.base_rows else levelled(rotation_world_base)
+        """Axes that the noise of the base rows is stated along, (B, 3, 3); None, the base's own, without attitude."""
+        return (
+            None if rotation_world_base is None or not self.tree.base_rows else levelled_base_axes(rotation_world_base)
+        )
 
-    def local_wrench(self, samples: Samples, contact: int, terms: ChunkTerms) -> Tensor:
+    def recorded_wrench(self, samples: Samples, contact: int, dynamics: ChunkDynamics) -> Tensor:
         """Recorded wrench of a contact along its frame's axes, (B, 6)."""
         if samples.wrench is None:
             return samples.time.new_full((len(samples), 6), torch.nan)
         wrench = samples.wrench[:, contact]
         if not samples.wrench_in_world:
             return wrench
-        return (self._rotation(contact, terms).mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
+        return (self._rotation(contact, dynamics).mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
 
-    def _rotation(self, contact: int, terms: ChunkTerms) -> Tensor:
+    def _rotation(self, contact: int, dynamics: ChunkDynamics) -> Tensor:
         """Rotation contact frame to world, (B, 3, 3); to a bolted base whose mounting is not known."""
         body, T_joint_frame = self.frames[contact]
-        in_body = terms.wrenches.new_tensor(T_joint_frame[:3, :3])
-        rotation = terms.states.rotation[:, :, body].permute(2, 0, 1) @ in_body
-        return rotation if terms.rotation_world_base is None else terms.rotation_world_base @ rotation
+        in_body = dynamics.wrenches.new_tensor(T_joint_frame[:3, :3])
+        rotation = dynamics.states.rotation[:, :, body].permute(2, 0, 1) @ in_body
+        return rotation if dynamics.rotation_world_base is None else dynamics.rotation_world_base @ rotation
 
-    def torque(self, samples: Samples) -> Tensor:
+    def recorded_torque(self, samples: Samples) -> Tensor:
         """Recorded torques and wrenches in limbs, (B, n + 6 F), NaN where there are none."""
         if samples.torque is None:
-            return samples.time.new_full((len(samples), len(self.columns.joint_rows)), torch.nan)
+            return samples.time.new_full((len(samples), self.tree.n_dofs), torch.nan)
         return samples.torque
 
-    def _lone_row(self, joint: int, samples: Samples, terms: ChunkTerms) -> tuple[tuple[int, ...], Tensor]:
+    def _uncoupled_row(self, joint: int, samples: Samples, dynamics: ChunkDynamics) -> tuple[tuple[int, ...], Tensor]:
         row = self.columns.joint_rows[joint]
-        inertial = joint_row(row, self.tree, self.columns.layout, terms.directions, terms.wrenches)
-        friction = [x for _, *pair in friction_columns(row, self.tree, terms.joints) for x in pair]
+        inertial = joint_row(row, self.tree, self.columns.layout, dynamics.directions, dynamics.wrenches)
+        friction = [x for _, *pair in friction_columns(row, self.tree, dynamics.joints) for x in pair]
         own = {self.columns.count + number: extra for number, extra in enumerate(self.extras) if extra.dof == joint}
-        extra = [dof_column(extra, samples, self.tree) for extra in own.values()]
-        block = torch.cat([inertial, torch.stack([*friction, *extra, self.torque(samples)[:, joint]])])
+        extra = [dof_extra_column(extra, samples, self.tree) for extra in own.values()]
+        block = torch.cat([inertial, torch.stack([*friction, *extra, self.recorded_torque(samples)[:, joint]])])
         columns = (*range(row.start, row.end), *self.columns.friction_of(joint), *own)
-        return columns, block / self._planner.dof_std[joint]
+        return columns, block / self._layouts.dof_std[joint]
 
-    def _mixed_rows(
-        self, samples: Samples, plan: StatePlan, terms: ChunkTerms, workspace: Workspace
+    def _coupled_rows(
+        self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
     ) -> Iterator[tuple[Tensor | slice, Tensor, Tensor]]:
-        """Samples of one rank, their W (B', base rows + mixed joints, r) and their rows (columns + 1, r, B')."""
-        if not (self.tree.base_rows or plan.mixed_joints):
+        """Samples of one rank, their W (B', base rows + coupled joints, r) and their rows (columns + 1, r, B')."""
+        if not (self.tree.base_rows or layout.coupled_joints):
             return
-        unmeasured, measured = self._contact_rows(plan, terms)
-        torque = self.torque(samples)[:, list(plan.mixed_joints)]
+        unmeasured, measured = self._contact_rows(layout, dynamics)
+        torque = self.recorded_torque(samples)[:, list(layout.coupled_joints)]
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
-        if len(plan.wrench_std):
-            f = f + (measured.mT @ self._measured_wrench(samples, plan, terms)[..., None])[..., 0]
-        axes = self.noise_axes(terms.rotation_world_base) if self.sensors.noise.by_axis else None
-        for index, W in levelled_null_space(unmeasured, plan.row_std, measured, plan.wrench_std, axes):
-            chosen = terms.select(index)
-            rows = self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, plan, chosen, workspace)
-            if plan.extras:
-                rows[-1 - len(plan.extras) : -1] = self._mixed_extras(samples[index], plan, chosen, measured[index], W)
+        if len(layout.wrench_std):
+            f = f + (measured.mT @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
+        axes = self.noise_axes(dynamics.rotation_world_base) if self.sensors.noise.base_axes_differ else None
+        for index, W in whitened_null_space(unmeasured, layout.row_std, measured, layout.wrench_std, axes):
+            chosen = dynamics.select(index)
+            rows = self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, layout, chosen, workspace)
+            if layout.extras:
+                rows[-1 - len(layout.extras) : -1] = self._extra_columns(
+                    samples[index], layout, chosen, measured[index], W
+                )
             yield index, W, rows
 
-    def _mixed_extras(
-        self, samples: Samples, plan: StatePlan, terms: ChunkTerms, measured: Tensor, W: Tensor
+    def _extra_columns(
+        self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, measured: Tensor, W: Tensor
     ) -> Tensor:
-        """Columns of the unknowns beside the bodies' parameters, (extras of the plan, r, B)."""
-        extras = [self.extras[column - self.columns.count] for column in plan.extras]
+        """Columns of the unknowns beside the bodies' parameters, (extras of the layout, r, B)."""
+        extras = [self.extras[column - self.columns.count] for column in layout.extras]
         touching = {extra.contact[0] for extra in extras if extra.contact is not None}
-        rotations = {k: self._rotation(k, terms) for k in touching} if samples.wrench_in_world else {}
-        return torch.stack(list(mixed_columns(extras, samples, plan, self.tree, measured, W, rotations)))
+        rotations = {k: self._rotation(k, dynamics) for k in touching} if samples.wrench_in_world else {}
+        return torch.stack(list(extra_columns(extras, samples, layout, self.tree, measured, W, rotations)))
 
-    def _projected(self, W: Tensor, f: Tensor, plan: StatePlan, terms: ChunkTerms, workspace: Workspace) -> Tensor:
-        """Rows W^T [K | f], (columns + 1, r, B), for a basis W, (base rows + mixed joints, r, B), and f, (..., B).
+    def _projected(
+        self, W: Tensor, f: Tensor, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
+    ) -> Tensor:
+        """Rows W^T [K | f], (columns + 1, r, B), for a basis W, (base rows + coupled joints, r, B), and f, (..., B).
 
         A wrench on body i does work on the base and on the joints above it only, so that body i's columns of W^T K are
         A_i^T times its wrench columns, with A_i the sum of W's rows along i's path, each carried by its screw axis. No
         joint row is ever formed. Columns are contiguous, as the factorization wants them.
         """
-        tree, layout, inertial = self.tree, self.columns.layout, plan.inertial
-        X = workspace.zeros("projected", W, len(plan.support) + 1, *W.shape[1:])
+        tree, column_layout, inertial = self.tree, self.columns.layout, layout.inertial
+        X = workspace.zeros("projected", W, len(layout.support) + 1, *W.shape[1:])
         torch.sum(W * f[:, None], dim=0, out=X[-1])
-        moved = {body: index for index, (body, _, _) in enumerate(plan.moved)}
-        own = W[self._index(tree.base_rows + place for _, place, _ in plan.moved)]
-        own *= own.new_tensor([ratio for _, _, ratio in plan.moved])[:, None, None]
-        velocity = terms.joints.velocity[self._index(moved)][:, None]
+        moved = {body: index for index, (body, _, _) in enumerate(layout.moved)}
+        own = W[self._index(tree.base_rows + place for _, place, _ in layout.moved)]
+        own *= own.new_tensor([ratio for _, _, ratio in layout.moved])[:, None, None]
+        velocity = dynamics.joints.velocity[self._index(moved)][:, None]
         friction = X[len(inertial) : len(inertial) + 2 * len(moved)].unflatten(0, (len(moved), 2))
         torch.mul(own, tree.coulomb_sign(velocity), out=friction[:, 0])
         torch.mul(own, velocity, out=friction[:, 1])
 
-        carried = workspace.zeros("carried", W, 6, tree.bodies, *W.shape[1:])
+        carried = workspace.zeros("carried", W, 6, tree.n_nodes, *W.shape[1:])
         if tree.base_rows:
             carried[:, 0] = W[:6]
-        for body in range(1, tree.bodies):
+        for body in range(1, tree.n_nodes):
             above = carried[:, tree.parents[body]]
             if body in moved:
-                torch.addcmul(above, terms.directions[:, body, None], own[moved[body]], out=carried[:, body])
+                torch.addcmul(above, dynamics.directions[:, body, None], own[moved[body]], out=carried[:, body])
             else:
                 carried[:, body] = above
-        for kept, bodies in layout.runs(plan.bodies):
+        for kept, bodies in column_layout.runs(layout.bodies):
             if kept:
-                start, end = layout.starts[bodies.start], layout.starts[bodies.stop]
+                start, end = column_layout.starts[bodies.start], column_layout.starts[bodies.stop]
                 shape = (len(bodies), len(kept))
                 pulling = sum(column < parameters.INERTIA.start for column in kept)
                 columns = X[start - inertial.start : end - inertial.start].unflatten(0, shape)
-                wrenches = terms.wrenches[:, start:end].unflatten(1, shape)
+                wrenches = dynamics.wrenches[:, start:end].unflatten(1, shape)
                 self._carry(wrenches, carried[:, bodies.start : bodies.stop], pulling, columns)
         return X
 
@@ -295,19 +313,19 @@ class RowBuilder(nn.Module):
         for k in (0, 1, 2):
             out[:, :pulling].addcmul_(wrenches[k, :, :pulling].unsqueeze(2), carried[k].unsqueeze(1))
 
-    def _contact_rows(self, plan: StatePlan, terms: ChunkTerms) -> tuple[Tensor, Tensor]:
-        """Unmeasured and measured contact rows on the base and the mixed joints, (B, k, base rows + mixed joints)."""
-        samples, base_rows = terms.wrenches.shape[-1], self.tree.base_rows
-        sizes = [sum(len(getattr(body, kind)) for body in plan.contact_bodies) for kind in ("unmeasured", "measured")]
-        both = terms.wrenches.new_zeros(sum(sizes), len(plan.row_std), samples)
+    def _contact_rows(self, layout: ContactStateLayout, dynamics: ChunkDynamics) -> tuple[Tensor, Tensor]:
+        """Rows of J_C, unmeasured and measured, in base and coupled joints, (B, k, base rows + coupled joints)."""
+        samples, base_rows = dynamics.wrenches.shape[-1], self.tree.base_rows
+        sizes = [sum(len(getattr(body, kind)) for body in layout.contact_bodies) for kind in ("unmeasured", "measured")]
+        both = dynamics.wrenches.new_zeros(sum(sizes), len(layout.row_std), samples)
         starts = [0, sizes[0]]
-        for contact in plan.contact_bodies:
-            joints = [plan.mixed_joints[place] for place in contact.joints]
+        for contact in layout.contact_bodies:
+            joints = [layout.coupled_joints[place] for place in contact.joints]
             columns = [*range(base_rows), *(base_rows + place for place in contact.joints)]
             for kind, wrenches in enumerate((contact.unmeasured, contact.measured)):
                 if len(wrenches):
-                    at_base = wrenches_at_base(terms.states, contact.body, wrenches)
-                    rows = generalized_forces(self.tree, terms.directions, contact.body, at_base, joints)
+                    at_base = wrenches_at_base(dynamics.states, contact.body, wrenches)
+                    rows = generalized_forces(self.tree, dynamics.directions, contact.body, at_base, joints)
                     target = both[starts[kind] : starts[kind] + len(wrenches)]
                     target.index_copy_(1, self._index(columns), rows)
                     starts[kind] += len(wrenches)
@@ -316,8 +334,10 @@ class RowBuilder(nn.Module):
     def _index(self, places: Iterable[int]) -> Tensor:
         return torch.tensor(list(places), dtype=torch.int64, device=self.device)
 
-    def _measured_wrench(self, samples: Samples, plan: StatePlan, terms: ChunkTerms) -> Tensor:
+    def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""
-        places = [place for body in plan.contact_bodies for place in body.components]
-        local = {contact: self.local_wrench(samples, contact, terms) for contact in {contact for contact, _ in places}}
+        places = [place for body in layout.contact_bodies for place in body.components]
+        local = {
+            contact: self.recorded_wrench(samples, contact, dynamics) for contact in {contact for contact, _ in places}
+        }
         return torch.stack([local[contact][:, k] for contact, k in places], dim=1)

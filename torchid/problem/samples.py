@@ -15,9 +15,9 @@ from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import unloaded_readings
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem.base_motion import BaseMotion, base_motion
-from torchid.problem.extras import read_components
+from torchid.problem.extras import recorded_components
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.robot import Robot
@@ -45,7 +45,7 @@ class Samples:
         unloaded: (N, C, 6), what the contacts' sensors read in the air, NaN elsewhere, as `Log.contact_unloaded`; None
             where there is no such reading.
         folder: on whose disk the tensors of a log larger than memory lie, None for one in memory.
-        fold: number of the block of all logs that these samples are in, see `in_folds`.
+        fold: number of the block of all logs that these samples are in, see `split_into_folds`.
     """
 
     source: str
@@ -76,7 +76,7 @@ class Samples:
     def _each(self, change: Callable[[Tensor], Tensor]) -> Samples:
         """The samples with every tensor changed."""
         changed: dict[str, Any] = {name: change(x) for name, x in vars(self).items() if isinstance(x, Tensor)}
-        return replace(self, base=self.base.each(change), **changed)
+        return replace(self, base=self.base.map(change), **changed)
 
     def __getitem__(self, index: slice | Tensor) -> Samples:
         """Some of the samples."""
@@ -127,7 +127,7 @@ class Samples:
         return q, v, a
 
 
-def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSet | None = None) -> Samples:
+def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSet | None = None) -> Samples:
     """Order a preprocessed log by the robot's joints and the contacts, and check it.
 
     Args:
@@ -147,7 +147,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
     if log.contact_wrench_world is not None and contacts and base.quat_xyzw is None and not robot.fixed_base:
         accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
         raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
-    wrench = log.contact_wrench_local if log.contact_wrench_world is None else log.contact_wrench_world
+    wrench = log.contact_wrench
     in_the_air = unloaded_readings(log) if contacts else None
     samples = Samples(
         log.source,
@@ -166,7 +166,7 @@ def bind(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSe
     )
     if required is not None:
         _check_limbs(log, robot, required)
-        check_forces(samples, robot, contacts, required)
+        require_forces(samples, robot, contacts, required)
     return samples
 
 
@@ -245,7 +245,7 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
     return order, active
 
 
-def check_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], required: SensorSet) -> None:
+def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], required: SensorSet) -> None:
     """Make sure that every value of some sensors was recorded.
 
     Raises:
@@ -262,14 +262,14 @@ def check_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], re
             found = f"not a finite number at sample {sample} ({int(bad[:, dof].sum())} in all)"
             field = "ft_wrench" if dof >= robot.n else "joint_torque"
             raise LogError(samples.source, f"{field} '{robot.dof_names[dof]}'", found, "a value: it is a sensor")
-    needed = read_components(contacts, required, samples.wrench_in_world)
+    needed = recorded_components(contacts, required, samples.wrench_in_world)
     if needed.any() and samples.active.any():
         if samples.wrench is None:
             raise LogError(samples.source, "contact_wrench", "missing", "contact_wrench_local or contact_wrench_world")
         bad = ~torch.isfinite(samples.wrench) & torch.from_numpy(needed) & samples.active[..., None]
         if bad.any():
             sample, contact, k = torch.nonzero(bad)[0].tolist()
-            found = f"{COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
+            found = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
             raise LogError(
                 samples.source, f"contact_wrench '{contacts[contact].frame}'", found, "a value: it is a sensor"
             )

@@ -13,80 +13,10 @@ from torch import Tensor
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.regressor.kinematics import BodyStates, cross, rotate
+from torchid.regressor.kinematics import BodyStates, cross_product, rotate_vectors
 from torchid.regressor.tree import KinematicTree
 
 ALL_INERTIAL = tuple(range(parameters.INERTIAL.stop))
-
-
-def _inertia_moments(omega: Tensor, alpha: Tensor) -> dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]:
-    """Moment E alpha + omega x (E omega) of a unit of each inertia number, about and in the frame; by inertia axes."""
-    x, y, z = omega
-    ax, ay, az = alpha
-    xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
-    return {
-        (0, 0): (ax, xz, -xy),
-        (0, 1): (ay - xz, ax + yz, xx - yy),
-        (0, 2): (az + xy, zz - xx, ax - yz),
-        (1, 1): (-yz, ay, xy),
-        (1, 2): (yy - zz, az - xy, ay + xz),
-        (2, 2): (yz, -xz, az),
-    }
-
-
-def _first_moment_wrenches(
-    omega: Tensor, alpha: Tensor, force: Tensor
-) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-    """Force ([alpha]x + [omega]x^2) e_k and moment e_k x specific force, for k = x, y, z, in the frame."""
-    x, y, z = omega
-    ax, ay, az = alpha
-    xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
-    forces = [[-yy - zz, az + xy, xz - ay], [xy - az, -xx - zz, yz + ax], [xz + ay, yz - ax, -xx - yy]]
-    zero = torch.zeros_like(x)
-    fx, fy, fz = force
-    moments = [[zero, -fz, fy], [fz, zero, -fx], [-fy, fx, zero]]
-    return forces, moments
-
-
-def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) -> None:
-    """Write the wrenches of some inertial parameters of all given bodies.
-
-    Args:
-        states: of the frames the parameters are expressed in, k of them.
-        columns: places in the order of `torchid.parameters`, ascending, below 10.
-        out: (6, k, len(columns), B), zero in the force rows of inertia columns; receives force [N], then moment about
-            the base origin [N m], per unit of the parameter.
-
-    Source: the Newton-Euler equations of a body about its frame's origin, sorted by parameter.
-    """
-    inverse = states.rotation.transpose(0, 1)
-    omega, alpha, force = (
-        rotate(inverse, x) for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
-    )
-    spinning = [column for column in columns if column >= parameters.INERTIA.start]
-    pulling = len(columns) - len(spinning)
-    if pulling:
-        axes = [column - parameters.FIRST_MOMENT.start for column in columns[:pulling] if column != parameters.MASS]
-        pushes, twists = _first_moment_wrenches(omega, alpha, force)
-        forces = _to_base(states.rotation, [pushes[k] for k in axes])
-        moments = _to_base(states.rotation, [twists[k] for k in axes])
-        if parameters.MASS in columns:
-            forces = torch.cat([states.specific_force[:, :, None], forces], 2)
-            moments = torch.nn.functional.pad(moments, (0, 0, 1, 0))
-        out[:3, :, :pulling] = forces
-        out[3:, :, :pulling] = moments + cross(states.position[:, :, None], forces)
-    if spinning:
-        by_axes = _inertia_moments(omega, alpha)
-        spins = [by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in spinning]
-        out[3:, :, pulling:] = _to_base(states.rotation, spins)
-
-
-def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
-    """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B)."""
-    components = torch.stack([torch.stack([vector[axis] for vector in vectors], dim=1) for axis in range(3)])
-    return rotate(rotation.unsqueeze(3), components)
-
-
 _REVOLUTE_KEPT = (1, 2, 4, 5, 6, 8, 9)  # mcx, mcy, Ixx, Ixy, Ixz, Iyz, Izz
 _PRISMATIC_KEPT = (0, 1, 2, 3)  # m, mcx, mcy, mcz
 _IXX, _IYY = 4, 7
@@ -117,7 +47,7 @@ class ColumnLayout:
 
 def full_layout(tree: KinematicTree) -> ColumnLayout:
     """All ten inertial columns of every body."""
-    return ColumnLayout((ALL_INERTIAL,) * tree.bodies)
+    return ColumnLayout((ALL_INERTIAL,) * tree.n_nodes)
 
 
 def reduced_layout(tree: KinematicTree) -> ColumnLayout:
@@ -135,12 +65,12 @@ def reduced_layout(tree: KinematicTree) -> ColumnLayout:
 def reduction_matrix(tree: KinematicTree) -> Array:
     """B, (columns of `reduced_layout`, 10 L) for L bodies, with `K = K_reduced @ B` for the inertial columns of K."""
     layout, width = reduced_layout(tree), parameters.INERTIAL.stop
-    effective = np.zeros((tree.bodies, width, width * tree.bodies))
-    for body in range(tree.bodies):
+    effective = np.zeros((tree.n_nodes, width, width * tree.n_nodes))
+    for body in range(tree.n_nodes):
         own = slice(width * body, width * (body + 1))
         effective[body][:, own] = parameters.change_of_frame(tree.T_joint_link[body])
-    rows = np.zeros((layout.count, width * tree.bodies))
-    for body in reversed(range(tree.bodies)):
+    rows = np.zeros((layout.count, width * tree.n_nodes))
+    for body in reversed(range(tree.n_nodes)):
         kept, gone = np.zeros((width, width)), np.eye(width)
         for column in layout.kept[body]:
             kept[column, column] = 1.0
@@ -152,5 +82,74 @@ def reduction_matrix(tree: KinematicTree) -> Array:
         if body > 0:
             X = parameters.change_of_frame(tree.T_parent_joint[body])
             effective[tree.parents[body]] += X @ gone @ effective[body]
-    own_columns = rows.reshape(layout.count, tree.bodies, width)[:, tree.node_of]
+    own_columns = rows.reshape(layout.count, tree.n_nodes, width)[:, tree.node_of]
     return np.asarray(own_columns.reshape(layout.count, -1))
+
+
+def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) -> None:
+    """Write the wrenches of some inertial parameters of all given bodies.
+
+    Args:
+        states: of the frames the parameters are expressed in, k of them.
+        columns: places in the order of `torchid.parameters`, ascending, below 10.
+        out: (6, k, len(columns), B), zero in the force rows of inertia columns; receives force [N], then moment about
+            the base origin [N m], per unit of the parameter.
+
+    Source: the Newton-Euler equations of a body about its frame's origin, sorted by parameter.
+    """
+    inverse = states.rotation.transpose(0, 1)
+    omega, alpha, force = (
+        rotate_vectors(inverse, x)
+        for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
+    )
+    spinning = [column for column in columns if column >= parameters.INERTIA.start]
+    pulling = len(columns) - len(spinning)
+    if pulling:
+        axes = [column - parameters.FIRST_MOMENT.start for column in columns[:pulling] if column != parameters.MASS]
+        pushes, twists = _first_moment_wrenches(omega, alpha, force)
+        forces = _to_base(states.rotation, [pushes[k] for k in axes])
+        moments = _to_base(states.rotation, [twists[k] for k in axes])
+        if parameters.MASS in columns:
+            forces = torch.cat([states.specific_force[:, :, None], forces], 2)
+            moments = torch.nn.functional.pad(moments, (0, 0, 1, 0))
+        out[:3, :, :pulling] = forces
+        out[3:, :, :pulling] = moments + cross_product(states.position[:, :, None], forces)
+    if spinning:
+        by_axes = _inertia_moments(omega, alpha)
+        spins = [by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in spinning]
+        out[3:, :, pulling:] = _to_base(states.rotation, spins)
+
+
+def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
+    """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B)."""
+    components = torch.stack([torch.stack([vector[axis] for vector in vectors], dim=1) for axis in range(3)])
+    return rotate_vectors(rotation.unsqueeze(3), components)
+
+
+def _first_moment_wrenches(
+    omega: Tensor, alpha: Tensor, force: Tensor
+) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
+    """Force ([alpha]x + [omega]x^2) e_k and moment e_k x specific force, for k = x, y, z, in the frame."""
+    x, y, z = omega
+    ax, ay, az = alpha
+    xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
+    forces = [[-yy - zz, az + xy, xz - ay], [xy - az, -xx - zz, yz + ax], [xz + ay, yz - ax, -xx - yy]]
+    zero = torch.zeros_like(x)
+    fx, fy, fz = force
+    moments = [[zero, -fz, fy], [fz, zero, -fx], [-fy, fx, zero]]
+    return forces, moments
+
+
+def _inertia_moments(omega: Tensor, alpha: Tensor) -> dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]:
+    """Moment E alpha + omega x (E omega) of a unit of each inertia number, about and in the frame; by inertia axes."""
+    x, y, z = omega
+    ax, ay, az = alpha
+    xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
+    return {
+        (0, 0): (ax, xz, -xy),
+        (0, 1): (ay - xz, ax + yz, xx - yy),
+        (0, 2): (az + xy, zz - xx, ax - yz),
+        (1, 1): (-yz, ay, xy),
+        (1, 2): (yy - zz, az - xy, ay + xz),
+        (2, 2): (yz, -xz, az),
+    }

@@ -9,8 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from torchid.parameters import Array
-from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross, joint_states, motion_from_state
-from torchid.regressor.regressor import joint_directions
+from torchid.regressor.kinematics import (
+    GRAVITY_WORLD,
+    BodyStates,
+    body_states,
+    cross_product,
+    joint_motion,
+    motion_from_state,
+)
+from torchid.regressor.regressor import joint_screw_axes
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
@@ -19,7 +26,7 @@ def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor) -> Tensor:
     """Wrenches that are constant in a body's joint frame, (k, 6), at the base origin in base axes, (6, k, B)."""
     rotation, position = states.rotation[:, :, body], states.position[:, body]
     force = wrenches[:, :3] @ rotation
-    return torch.cat([force, wrenches[:, 3:] @ rotation + cross(position[:, None].expand_as(force), force)])
+    return torch.cat([force, wrenches[:, 3:] @ rotation + cross_product(position[:, None].expand_as(force), force)])
 
 
 def generalized_forces(
@@ -29,7 +36,7 @@ def generalized_forces(
 
     Args:
         tree: the robot's constants.
-        directions: from `joint_directions`, (6, L, B).
+        directions: from `joint_screw_axes`, (6, L, B).
         body: which body.
         wrenches: at the base origin, (6, k, B).
         joints: independent joints to give columns for, after the base's six (none for a fixed base).
@@ -43,7 +50,7 @@ def generalized_forces(
     return torch.cat([wrenches.transpose(0, 1), torque], dim=1) if tree.base_rows else torque
 
 
-def wrench_map(T: Array) -> Array:
+def wrench_transform(T: Array) -> Array:
     """Matrix (6, 6) that takes a wrench at a frame, in its axes, to the frame that `T` (4, 4) gives its pose in."""
     R, p = T[:3, :3], T[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [np.cross(np.eye(3), p) @ R, R]])
@@ -65,9 +72,9 @@ class FrameJacobian(nn.Module):
         super().__init__()
         self.tree = KinematicTree(robot)
         self._body, T_joint_frame = self.tree.frame(robot, frame)
-        unit_wrenches = wrench_map(T_joint_frame).T
+        unit_wrenches = wrench_transform(T_joint_frame).T
         self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
-        self._joints = range(robot.dofs)
+        self._joints = range(robot.n_dofs)
 
     def forward(self, q: Tensor) -> Tensor:
         """Jacobian (B, 6, nv) at coordinates `q`, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
@@ -77,7 +84,7 @@ class FrameJacobian(nn.Module):
         tree = self.tree
         still = q.new_zeros(q.shape[0], tree.n + tree.base_rows)
         motion = motion_from_state(q, still, still, tree.n, not tree.base_rows, GRAVITY_WORLD)
-        states = body_states(tree, motion, joint_states(tree, motion))
+        states = body_states(tree, motion, joint_motion(tree, motion))
         wrenches = wrenches_at_base(states, self._body, self.get_buffer("unit_wrenches"))
-        J = generalized_forces(tree, joint_directions(tree, states), self._body, wrenches, self._joints)
+        J = generalized_forces(tree, joint_screw_axes(tree, states), self._body, wrenches, self._joints)
         return J.permute(2, 0, 1)

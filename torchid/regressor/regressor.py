@@ -12,96 +12,16 @@ from torchid.regressor.columns import ColumnLayout, full_layout, wrench_columns
 from torchid.regressor.kinematics import (
     GRAVITY_WORLD,
     BodyStates,
-    JointStates,
+    JointMotion,
     Motion,
     body_states,
-    cross,
-    joint_states,
+    cross_product,
+    joint_motion,
     link_states,
     motion_from_state,
 )
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
-
-
-@dataclass(frozen=True)
-class JointRow:
-    """Where the row of an independent joint can differ from zero.
-
-    `moved`: the bodies whose joints follow it (its own and mimic joints', in the order of bodies) with their
-    multipliers; `start` and `end`: the hull of their subtrees' columns.
-    """
-
-    moved: tuple[tuple[int, float], ...]
-    start: int
-    end: int
-
-
-def joint_rows(tree: KinematicTree, layout: ColumnLayout) -> list[JointRow]:
-    """One per independent joint."""
-    rows = []
-    for column in tree.joint_map[1:].T.tolist():
-        moved = [(joint + 1, ratio) for joint, ratio in enumerate(column) if ratio]
-        start = min(layout.starts[body] for body, _ in moved)
-        end = max(layout.starts[tree.subtree_end[body]] for body, _ in moved)
-        rows.append(JointRow(tuple(moved), start, end))
-    return rows
-
-
-def joint_directions(tree: KinematicTree, states: BodyStates) -> Tensor:
-    """Screw axes of all joints, (6, L, B): `direction . wrench at the base origin` is the torque about the joint."""
-    axis = states.rotation[:, 2]
-    linear = cross(states.position, axis) * tree.revolute + axis * tree.prismatic
-    return torch.cat([linear, axis * tree.revolute])
-
-
-def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | None = None) -> Tensor:
-    """Wrench columns (6, columns, B) of all bodies.
-
-    Args:
-        states: of the frames that `layout`'s parameters are expressed in.
-        layout: which columns to compute.
-        out: a buffer of the result's shape to write to, as it was left by an earlier call with the same layout.
-    """
-    if out is None:
-        out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
-    for kept, bodies in layout.runs():
-        if kept:
-            columns = out[:, layout.starts[bodies.start] : layout.starts[bodies.stop]]
-            wrench_columns(states.run(bodies.start, bodies.stop), kept, columns.unflatten(1, (-1, len(kept))))
-    return out
-
-
-def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, directions: Tensor, wrenches: Tensor) -> Tensor:
-    """Inertial part of one joint's row, (row.end - row.start, B)."""
-    body, ratio = row.moved[0]
-    if len(row.moved) == 1:
-        return ratio * _torque(directions[:, body], wrenches[:, row.start : row.end])
-    total = wrenches.new_zeros(row.end - row.start, wrenches.shape[-1])
-    for body, ratio in row.moved:
-        start, end = layout.starts[body], layout.starts[tree.subtree_end[body]]
-        part = ratio * _torque(directions[:, body], wrenches[:, start:end])
-        total = total + torch.nn.functional.pad(part, (0, 0, start - row.start, row.end - end))
-    return total
-
-
-def friction_columns(row: JointRow, tree: KinematicTree, joints: JointStates) -> list[tuple[int, Tensor, Tensor]]:
-    """Friction entries of one joint's row: body, column of fc, column of fv, each (B,).
-
-    Friction resists: it adds `fc sign(v) + fv v` to the torque the actuator must give.
-    """
-    entries = []
-    for body, ratio in row.moved:
-        velocity = joints.velocity[body]
-        entries.append((body, ratio * tree.coulomb_sign(velocity), ratio * velocity))
-    return entries
-
-
-def _torque(direction: Tensor, wrenches: Tensor) -> Tensor:
-    total = direction[0] * wrenches[0]
-    for k in range(1, 6):
-        total.addcmul_(direction[k], wrenches[k])
-    return total
 
 
 class Regressor(nn.Module):
@@ -110,6 +30,10 @@ class Regressor(nn.Module):
     Differentiable; `.to(device, dtype)` moves it. Columns: 12 per body, bodies in `robot.body_names`' order,
     parameters in `torchid.parameters`' order. Rows: base force, base moment (base frame, about the base origin), then
     `robot.dof_names`: joints, and the wrenches of force/torque sensors in limbs; a fixed base has no base rows.
+
+    With `FrameJacobian` and `torchid.Projection`, the plain way to the equations of a fit. Fits take
+    `torchid.RowBuilder`, which shares the functions of this package but never forms K, for speed
+    (`tests/test_rows_two_ways.py` compares both).
     """
 
     def __init__(
@@ -148,11 +72,11 @@ class Regressor(nn.Module):
     def from_motion(self, motion: Motion) -> Tensor:
         """As `forward`, from a `Motion` (which knows no base position, heading or linear velocity)."""
         tree, layout = self.tree, self._layout
-        joints = joint_states(tree, motion)
+        joints = joint_motion(tree, motion)
         states = body_states(tree, motion, joints)
-        directions = joint_directions(tree, states)
+        directions = joint_screw_axes(tree, states)
         wrenches = all_wrench_columns(link_states(tree, states), layout)
-        K = wrenches.new_zeros(tree.base_rows + len(self._rows), tree.bodies, parameters.PER_BODY, wrenches.shape[-1])
+        K = wrenches.new_zeros(tree.base_rows + len(self._rows), tree.n_nodes, parameters.PER_BODY, wrenches.shape[-1])
         inertial = K[:, :, parameters.INERTIAL]
         width = parameters.INERTIAL.stop
         if tree.base_rows:
@@ -163,6 +87,86 @@ class Regressor(nn.Module):
             for body, coulomb, viscous in friction_columns(row, tree, joints):
                 K[index, body, parameters.COULOMB] = coulomb
                 K[index, body, parameters.VISCOUS] = viscous
-        if len(tree.node_of) < tree.bodies:
+        if len(tree.node_of) < tree.n_nodes:
             K = K[:, tree.node_of]
         return K.flatten(1, 2).permute(2, 0, 1)
+
+
+@dataclass(frozen=True)
+class JointRow:
+    """Where the row of an independent joint can differ from zero.
+
+    `moved`: the bodies whose joints follow it (its own and mimic joints', in the order of bodies) with their
+    multipliers; `start` and `end`: the hull of their subtrees' columns.
+    """
+
+    moved: tuple[tuple[int, float], ...]
+    start: int
+    end: int
+
+
+def joint_rows(tree: KinematicTree, layout: ColumnLayout) -> list[JointRow]:
+    """One per independent joint."""
+    rows = []
+    for column in tree.joint_map[1:].T.tolist():
+        moved = [(joint + 1, ratio) for joint, ratio in enumerate(column) if ratio]
+        start = min(layout.starts[body] for body, _ in moved)
+        end = max(layout.starts[tree.subtree_end[body]] for body, _ in moved)
+        rows.append(JointRow(tuple(moved), start, end))
+    return rows
+
+
+def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, directions: Tensor, wrenches: Tensor) -> Tensor:
+    """Inertial part of one joint's row, (row.end - row.start, B)."""
+    body, ratio = row.moved[0]
+    if len(row.moved) == 1:
+        return ratio * _torque(directions[:, body], wrenches[:, row.start : row.end])
+    total = wrenches.new_zeros(row.end - row.start, wrenches.shape[-1])
+    for body, ratio in row.moved:
+        start, end = layout.starts[body], layout.starts[tree.subtree_end[body]]
+        part = ratio * _torque(directions[:, body], wrenches[:, start:end])
+        total = total + torch.nn.functional.pad(part, (0, 0, start - row.start, row.end - end))
+    return total
+
+
+def friction_columns(row: JointRow, tree: KinematicTree, joints: JointMotion) -> list[tuple[int, Tensor, Tensor]]:
+    """Friction entries of one joint's row: body, column of fc, column of fv, each (B,).
+
+    Friction resists: it adds `fc sign(v) + fv v` to the torque the actuator must give.
+    """
+    entries = []
+    for body, ratio in row.moved:
+        velocity = joints.velocity[body]
+        entries.append((body, ratio * tree.coulomb_sign(velocity), ratio * velocity))
+    return entries
+
+
+def joint_screw_axes(tree: KinematicTree, states: BodyStates) -> Tensor:
+    """Screw axes of all joints, (6, L, B): `direction . wrench at the base origin` is the torque about the joint."""
+    axis = states.rotation[:, 2]
+    linear = cross_product(states.position, axis) * tree.revolute + axis * tree.prismatic
+    return torch.cat([linear, axis * tree.revolute])
+
+
+def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | None = None) -> Tensor:
+    """Wrench columns (6, columns, B) of all bodies.
+
+    Args:
+        states: of the frames that `layout`'s parameters are expressed in.
+        layout: which columns to compute.
+        out: a buffer of the result's shape to write to, as it was left by an earlier call with the same layout.
+    """
+    if out is None:
+        out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
+    for kept, bodies in layout.runs():
+        if kept:
+            columns = out[:, layout.starts[bodies.start] : layout.starts[bodies.stop]]
+            wrench_columns(states.slice_bodies(bodies.start, bodies.stop), kept, columns.unflatten(1, (-1, len(kept))))
+    return out
+
+
+def _torque(direction: Tensor, wrenches: Tensor) -> Tensor:
+    total = direction[0] * wrenches[0]
+    for k in range(1, 6):
+        total.addcmul_(direction[k], wrenches[k])
+    return total

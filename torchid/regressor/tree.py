@@ -33,10 +33,10 @@ class Node:
     offset: float
 
 
-def nodes_of(robot: Robot) -> list[Node]:
+def tree_nodes(robot: Robot) -> list[Node]:
     """All nodes, depth first."""
     geometry, (matrix, constant) = robot.geometry, robot.joint_map
-    dofs, nodes, node_of = np.eye(robot.dofs), list[Node](), list[int]()
+    dofs, nodes, node_of = np.eye(robot.n_dofs), list[Node](), list[int]()
     for index, body in enumerate(robot.bodies):
         parent = node_of[body.parent] if index else -1
         T_parent_joint, T_joint_link = geometry.T_parent_joint[index], geometry.T_joint_link[index]
@@ -61,7 +61,7 @@ def nodes_of(robot: Robot) -> list[Node]:
         else:
             slides = bool(geometry.prismatic[index])
             kind = "base" if not index else "prismatic" if slides else "revolute"
-            motion = np.pad(matrix[index - 1], (0, robot.dofs - robot.n)) if index else np.zeros(robot.dofs)
+            motion = np.pad(matrix[index - 1], (0, robot.n_dofs - robot.n)) if index else np.zeros(robot.n_dofs)
             offset = float(constant[index - 1]) if index else 0.0
             axis = geometry.axis[index]
             nodes.append(Node(kind, index, parent, axis, slides, T_parent_joint, T_joint_link, motion, offset))
@@ -102,13 +102,13 @@ class KinematicTree(nn.Module):
     def __init__(self, robot: Robot, sign_width: float | None = None) -> None:
         super().__init__()
         self.sign_width = sign_width
-        nodes = nodes_of(robot)
+        nodes = tree_nodes(robot)
         self.node_of = [index for index, node in enumerate(nodes) if node.body is not None]
         self.body_of = np.searchsorted(self.node_of, np.arange(len(nodes))).tolist()
         self.parents = [node.parent for node in nodes]
         self.slides = [node.slides for node in nodes]
         self.kinds = [node.kind for node in nodes]
-        self.base_rows, self.n = robot.base_rows, robot.n
+        self.base_rows, self.n, self.n_dofs, self.n_rows = robot.base_rows, robot.n, robot.n_dofs, robot.n_rows
         count = len(nodes)
         joint_frame = np.tile(np.eye(4), (count, 1, 1))
         for index, node in enumerate(nodes[1:], start=1):
@@ -152,8 +152,8 @@ class KinematicTree(nn.Module):
         self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)
 
     @property
-    def bodies(self) -> int:
-        """Number L of nodes."""
+    def n_nodes(self) -> int:
+        """Number of nodes: one for each body, and five more for every force/torque sensor in a limb."""
         return len(self.parents)
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:

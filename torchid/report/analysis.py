@@ -17,10 +17,10 @@ from rich.text import Text
 from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
 from torchid.identifiability.expected_error import ExpectedErrors
 from torchid.problem import Metrics
-from torchid.problem.metrics import GROUPS, group_name
+from torchid.problem.metrics import ROW_GROUPS, group_name
 from torchid.report.figures import STYLE
+from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensor_planning.candidates import Candidate
-from torchid.sensor_planning.demands import TOLERANCE
 from torchid.sensor_planning.observability import BaseObservability, LostBase, PostureSummary
 from torchid.sensor_planning.planner import PartPlan, SensorPlan
 
@@ -193,7 +193,7 @@ def describe_losses(checks: Sequence[BaseObservability]) -> list[str]:
         lines.append(
             f"warning: at some postures of the logs the base is all but lost (smallest singular value {least:.2g})"
         )
-    rare = sum(check.lost is None and check.generic.low < TOLERANCE for check in checks)
+    rare = sum(check.lost is None and check.generic.low < BASE_RANK_TOLERANCE for check in checks)
     if rare:
         where = f"{rare} of {len(checks)} contact states"
         lines.append(f"warning: in {where} the base is nearly lost at one random posture in twenty or more")
@@ -268,7 +268,7 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
     table.add_column("channels", justify="right")
     table.add_column("rank", justify="right")
     table.add_column("", no_wrap=True)
-    for label in GROUPS.values():
+    for label in ROW_GROUPS.values():
         table.add_column(Text(label.replace(" [", "\n[")), justify="right")
     for name, found in sets.items():
         first: list[Text | str] = [Text(name), str(found.channels), str(found.rank)]
@@ -277,7 +277,7 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
             ("with noise", found.expected.total),
             ("measured", {} if found.measured is None else found.measured.rms),
         ):
-            table.add_row(*first, label, *(_figure(errors.get(group)) for group in GROUPS))
+            table.add_row(*first, label, *(_figure(errors.get(group)) for group in ROW_GROUPS))
             first = ["", "", ""]
         table.add_section()
     return table
@@ -290,10 +290,10 @@ def _figure(x: float | None) -> str:
 @matplotlib.rc_context(STYLE)
 def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
     """One panel per group of rows, with the sensor sets side by side on a logarithmic scale."""
-    figure = Figure(figsize=(2.6 * len(GROUPS) + 0.6, 3.8), layout="constrained")
-    axes = figure.subplots(1, len(GROUPS))
+    figure = Figure(figsize=(2.6 * len(ROW_GROUPS) + 0.6, 3.8), layout="constrained")
+    axes = figure.subplots(1, len(ROW_GROUPS))
     place = np.arange(len(sets))
-    for axis, (group, label) in zip(axes, GROUPS.items(), strict=True):
+    for axis, (group, label) in zip(axes, ROW_GROUPS.items(), strict=True):
         measured = [None if found.measured is None else found.measured.rms[group] for found in sets.values()]
         for shift, name, (marker, color), heights in (
             (-0.15, "expected model error", _MODEL, [found.expected.model[group] for found in sets.values()]),

@@ -25,9 +25,9 @@ from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import PARAMETERS, PER_BODY, Array
 from torchid.problem import Metrics
-from torchid.problem.metrics import BASE_ROWS, SHOWN, group_name
+from torchid.problem.metrics import BASE_ROWS, ERROR_GROUPS, group_name
 from torchid.report.tables import MARKS, marks_legend
-from torchid.text import escaped
+from torchid.text import escape
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -48,7 +48,7 @@ def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
     """
     with during("drawing", path), matplotlib.rc_context(STYLE):
         for text in figure.findobj(Text):
-            text.set_text(escaped(text.get_text(), "\n"))
+            text.set_text(escape(text.get_text(), "\n"))
         figure.savefig(path, dpi=130, format=kind)
 
 
@@ -57,7 +57,7 @@ _MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
 
 @dataclass(frozen=True)
 class ForceSeries:
-    """Forces of one log for plotting: `measured` (N, nv), `nominal` and `identified` (N, nv), NaN where unknown."""
+    """Forces of one log for plotting: `measured`, `nominal`, `identified`, (N, n_rows) each, NaN where unknown."""
 
     source: str
     time: Array
@@ -104,7 +104,7 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
     figure = Figure(figsize=(4.2 * len(sets) + 0.6, 3.2), layout="constrained")
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
-        groups = [group for group in SHOWN if nominal.relative.get(group) is not None]
+        groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         place = np.arange(len(groups))
         for shift, metrics, color, label in (
             (-0.2, nominal, _NOMINAL, "URDF"),

@@ -17,11 +17,11 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, Finding, Span
-from torchid.log_checks.channels import channel_names, unit
+from torchid.log_checks.channels import channel_names, channel_unit
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.report.figures import STYLE
-from torchid.text import listed, shown
+from torchid.text import excerpt, join_names
 
 COLORS = {CONDEMNED: "tab:red", SUSPICIOUS: "tab:orange", NOTE: "tab:blue"}
 _ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0  # inches
@@ -32,7 +32,7 @@ _RANGE = (0.5, 99.5)  # percentiles that fill a row
 
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False})
-def hygiene_figure(logs: Sequence[Checked]) -> Figure:
+def log_check_figure(logs: Sequence[Checked]) -> Figure:
     """One panel per log, one row per channel, each with its range beside it; findings are marked in their color."""
     rows = [len(_rows(one.log)) for one in logs]
     heights = [_ROW * (count + _title(one).count("\n")) + _HEAD for count, one in zip(rows, logs, strict=True)]
@@ -49,7 +49,7 @@ def hygiene_figure(logs: Sequence[Checked]) -> Figure:
 
 def _title(checked: Checked) -> str:
     """Name and verdict, wrapped here: matplotlib takes a text that it wraps for a formula, whatever it is told."""
-    return fill(shown(f"{Path(checked.log.source).name}: {checked.verdict}", _LONGEST), _LETTERS)
+    return fill(excerpt(f"{Path(checked.log.source).name}: {checked.verdict}", _LONGEST), _LETTERS)
 
 
 def _marked(checked: Checked) -> list[Finding]:
@@ -110,7 +110,7 @@ def _mark(axes: Axes, start: float, end: float, places: Sequence[int], lasts: fl
 def _range_text(field: str, name: str, values: FloatArray) -> str:
     """What a row spans, with its unit."""
     low, high = (f"{x:.3g}" for x in np.nanpercentile(values, _RANGE))
-    return f"{low} to {high} {unit(field, name)}".rstrip()
+    return f"{low} to {high} {channel_unit(field, name)}".rstrip()
 
 
 def _scaled(values: FloatArray) -> FloatArray:
@@ -122,14 +122,14 @@ def _scaled(values: FloatArray) -> FloatArray:
 _SPANS = 3
 
 
-def heading(checked: Checked) -> str:
+def log_heading(checked: Checked) -> str:
     """Name, length and duration of a log."""
     log = checked.log
     lasts = log.time[-1] - log.time[0]
     return f"{Path(log.source).name}: {len(log)} samples, {lasts:.4g} s"
 
 
-def hygiene_table(findings: Sequence[Finding]) -> Table:
+def finding_table(findings: Sequence[Finding]) -> Table:
     """Findings about one log, the gravest first."""
     table = Table(show_lines=True, expand=True)
     table.add_column("", no_wrap=True)
@@ -139,7 +139,7 @@ def hygiene_table(findings: Sequence[Finding]) -> Table:
     for finding, *others in _alike(findings):
         found = f"{finding.field}, {finding.name}: {finding.found}"
         if others:
-            found += f"; likewise {listed([other.field for other in others])}"
+            found += f"; likewise {join_names([other.field for other in others])}"
         table.add_row(finding.severity, Text(_places(finding)), Text(found), Text(finding.advice))
     return table
 
@@ -158,7 +158,7 @@ def _ranges(finding: Finding) -> tuple[tuple[int, int], ...]:
     return tuple(sorted({(span.first, span.last) for span in finding.spans}))
 
 
-def not_checked(checked: Checked) -> str:
+def skipped_checks_text(checked: Checked) -> str:
     """Checks that could not be made, and why; empty if there are none."""
     reasons: dict[str, list[str]] = {}
     for skip in checked.skipped:
@@ -174,7 +174,7 @@ def _places(finding: Finding) -> str:
     return f"all; seen at {some}" if finding.whole else some
 
 
-def hygiene_document(checked: Sequence[Checked]) -> dict[str, Any]:
+def log_check_document(checked: Sequence[Checked]) -> dict[str, Any]:
     """Everything that was found, for JSON."""
     return {"logs": [_log_entry(one) for one in checked]}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -12,7 +11,7 @@ import numpy as np
 from lxml import etree
 
 from torchid import parameters
-from torchid.errors import InputError, TorchidWarning, during
+from torchid.errors import InputError, during, warn
 from torchid.estimators import Estimate
 from torchid.guards import MAX_JSON, read_bytes
 from torchid.identifiability.confounding import ExtraEstimate
@@ -197,10 +196,10 @@ def _warn(robot: Robot, phi: Array) -> None:
             driving.append(body.joint.name)
     if impossible:
         message = f"identified.urdf: no distribution of positive mass has the parameters of {', '.join(impossible)}"
-        warnings.warn(f"{message}; simulators will refuse or misread them", TorchidWarning, stacklevel=3)
+        warn(f"{message}; simulators will refuse or misread them")
     if driving:
         message = f"identified.urdf: negative friction at {', '.join(driving)}; simulators and torchid refuse it"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
 
 
 def _set_inertial(link: etree._Element, values: Array | None) -> None:

@@ -18,16 +18,16 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.estimators import Estimate
-from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNSEEN
+from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contribution, Contributions, PartContribution
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
-from torchid.problem.metrics import SHOWN
-from torchid.text import escaped, unescaped
+from torchid.problem.metrics import ERROR_GROUPS
+from torchid.text import escape, raw_stream
 
-MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNSEEN: ".", FIXED: ""}
+MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNOBSERVABLE: ".", FIXED: ""}
 
 
 class PlainConsole(Console):
@@ -36,12 +36,12 @@ class PlainConsole(Console):
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """The segments of what is shown, of plain text."""
         for text, style, control in super().render(renderable, options):
-            yield Segment(text, style, control) if control else Segment(escaped(text, "\n"), style)
+            yield Segment(text, style, control) if control else Segment(escape(text, "\n"), style)
 
 
 def terminal_console(stderr: bool = False) -> Console:
     """A console on standard output or error, past the boundary's escaping, which would also undo its colors."""
-    return PlainConsole(file=unescaped(sys.stderr if stderr else sys.stdout))
+    return PlainConsole(file=raw_stream(sys.stderr if stderr else sys.stdout))
 
 
 def print_tables(*tables: Table) -> None:
@@ -75,7 +75,7 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]]) -> Table:
     for name in columns:
         for which in ("URDF", "identified"):
             table.add_column(Text(f"{name}\n{which}"), justify="right", overflow="fold")
-    for group, label in SHOWN.items():
+    for group, label in ERROR_GROUPS.items():
         errors = [_error_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *errors)
         if group == "base_force":

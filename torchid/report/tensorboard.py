@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from torch.utils.tensorboard import SummaryWriter
 
-from torchid.estimators import BoundEstimate, Epoch, Estimate
+from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
 from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
-from torchid.problem.metrics import SETS, SHOWN
+from torchid.problem.metrics import ERROR_GROUPS, SETS
 
 _CHARTED = (*SETS, "left_out")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
@@ -36,7 +36,9 @@ class RunEvents:
             since: step from which on the contents of earlier event files in the folder are void.
         """
         self._writer = SummaryWriter(str(folder), purge_step=since)
-        groups = {group: ["Multiline", [f"relative_error_{name}/{group}" for name in _CHARTED]] for group in SHOWN}
+        groups = {
+            group: ["Multiline", [f"relative_error_{name}/{group}" for name in _CHARTED]] for group in ERROR_GROUPS
+        }
         loss = {
             "train and held out": ["Multiline", ["loss/data", "loss_held_out/data"]],
             "terms": ["Multiline", [f"loss/{term}" for term in _TERMS]],
@@ -55,7 +57,7 @@ class RunEvents:
         """Write what is still held in memory."""
         self._writer.flush()
 
-    def write_errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(SHOWN)) -> None:
+    def write_errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(ERROR_GROUPS)) -> None:
         """Errors by group of rows of one parameter vector on sets of logs."""
         for name, metrics in sets.items():
             for group in groups:
@@ -98,11 +100,11 @@ class RunEvents:
         self._writer.add_scalar("loss/data", estimate.nominal_cost / rows, 0)
         self._writer.add_scalar("loss/data", estimate.cost / rows, 1)
         self._writer.add_scalar("descent/samples_per_second", samples_per_second, 1)
-        if isinstance(estimate, BoundEstimate):
+        if isinstance(estimate, ConstrainedEstimate):
             self._writer.add_scalar("loss/prior", estimate.objective - estimate.cost / rows, 1)
             self._writer.add_scalar("closed_form/distance", estimate.distance, 1)
-            if estimate.relative_price is not None:
-                self._writer.add_scalar("closed_form/objective_above_least", estimate.relative_price, 1)
+            if estimate.relative_increase is not None:
+                self._writer.add_scalar("closed_form/objective_above_least", estimate.relative_increase, 1)
 
     def write_fit(self, step: int, estimate: Estimate) -> None:
         """Statistics of the problem."""

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from torchid.parameters import COMPONENTS
+from torchid.parameters import WRENCH_COMPONENTS
 from torchid.report.figures import STYLE
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
@@ -108,12 +108,12 @@ def _draw_joint(
     axes: Axes, joint: BodyJoint, parent: Place, place: Place, readings: Collection[str], constrained: Collection[str]
 ) -> None:
     name = joint.name if joint.mimic is None else joint.mimic.master
-    weld = [k for k in COMPONENTS if f"{name}.{k}" in readings] if joint.kind == "fixed" else []
+    weld = [k for k in WRENCH_COMPONENTS if f"{name}.{k}" in readings] if joint.kind == "fixed" else []
     loaded, measured = name in constrained, bool(weld) or name in readings
     (x, y), turn = place, parent[1] + 0.5
     style: dict[str, Any] = {"color": _LOADED if loaded else _PLAIN, "linewidth": 2.2 if loaded else 1.4, "zorder": 0}
     axes.plot([parent[0], parent[0], x, x], [parent[1], turn, turn, y], **style)
-    color, part = _LIMB if weld else _TORQUE, 0 < len(weld) < len(COMPONENTS)
+    color, part = _LIMB if weld else _TORQUE, 0 < len(weld) < len(WRENCH_COMPONENTS)
     face = color if measured else "white"
     style = {"color": color if measured else "0.5", "markerfacecolor": face, "fillstyle": "left" if part else "full"}
     axes.plot(x, y, "h" if joint.kind == "fixed" else "o", markersize=8 if joint.kind == "fixed" else 7, **style)

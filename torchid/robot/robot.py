@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,8 +13,8 @@ import torch
 from yourdfpy.urdf import Inertial, Link
 
 from torchid import parameters
-from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError, during
-from torchid.parameters import COMPONENTS, Array
+from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError, during, warn
+from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.robot.chain import JointGeometry, build_chain, joint_geometry, link_poses
 from torchid.robot.tree import BodyJoint, BodyTree, build_tree
 from torchid.robot.urdf import read_urdf
@@ -26,42 +25,6 @@ if TYPE_CHECKING:
 _TRIANGLE_TOLERANCE = 1e-3  # URDFs carry few digits: thin plates break the inequality by rounding alone
 _ROUNDING = 1e-6  # of the largest principal inertia
 _POINT = 1e-12  # [m^2]: below it a point mass is meant
-
-
-def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Array:
-    """Parameters (L, 12) of the bodies, each in its link frame.
-
-    Warns:
-        UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
-    """
-    nominal = np.zeros((len(tree.names), parameters.PER_BODY))
-    for name, (body, T_body_link) in tree.links.items():
-        inertial = links[name].inertial
-        if inertial is None:
-            continue
-        _warn_if_unphysical(path, name, inertial)
-        T_link_com = np.eye(4) if inertial.origin is None else inertial.origin
-        at_com = parameters.inertial_vector(inertial.mass, np.zeros(3), inertial.inertia)
-        nominal[body, parameters.INERTIAL] += parameters.change_of_frame(T_body_link @ T_link_com) @ at_com
-    for body, joint in enumerate(tree.joints):
-        if joint is not None:
-            nominal[body, parameters.FRICTION] = joint.friction, joint.damping
-    return nominal
-
-
-def _warn_if_unphysical(path: Path, link: str, inertial: Inertial) -> None:
-    small, middle, large = np.linalg.eigvalsh(inertial.inertia)
-    if large == small == inertial.mass == 0.0:
-        return
-    if inertial.mass == 0.0:
-        what = "mass 0 kg with an inertia that is not 0"
-    elif small < -_ROUNDING * large - _POINT * inertial.mass:
-        what = f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m^2 are not all positive"
-    elif large > (small + middle) * (1.0 + _TRIANGLE_TOLERANCE) + _POINT * inertial.mass:
-        what = f"largest principal inertia {large:.3g} exceeds the sum of the others, {small + middle:.3g} kg m^2"
-    else:
-        return
-    warnings.warn(f"{path}: link '{link}': {what}; used as written", UnphysicalInertiaWarning, stacklevel=5)
 
 
 @dataclass(frozen=True)
@@ -108,10 +71,10 @@ class Robot:
 
         Such a sensor counts as six motionless degrees of freedom whose generalized force is measured.
         """
-        return (*self.joint_names, *(f"{name}.{k}" for name in self.ft_names for k in COMPONENTS))
+        return (*self.joint_names, *(f"{name}.{k}" for name in self.ft_names for k in WRENCH_COMPONENTS))
 
     @property
-    def dofs(self) -> int:
+    def n_dofs(self) -> int:
         """Number of `dof_names`, n + 6 F."""
         return len(self.dof_names)
 
@@ -127,8 +90,13 @@ class Robot:
 
     @property
     def nv(self) -> int:
-        """Number of generalized velocities."""
+        """Number of generalized velocities: n + 6, or n for a fixed base."""
         return self.n + self.base_rows
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of K: those of the base, then one for each of `dof_names`; nv + 6 F."""
+        return self.base_rows + self.n_dofs
 
     @property
     def body_names(self) -> tuple[str, ...]:
@@ -237,9 +205,45 @@ def load_robot(
         return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, build_chain(tree))
 
 
+def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Array:
+    """Parameters (L, 12) of the bodies, each in its link frame.
+
+    Warns:
+        UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
+    """
+    nominal = np.zeros((len(tree.names), parameters.PER_BODY))
+    for name, (body, T_body_link) in tree.links.items():
+        inertial = links[name].inertial
+        if inertial is None:
+            continue
+        _warn_if_unphysical(path, name, inertial)
+        T_link_com = np.eye(4) if inertial.origin is None else inertial.origin
+        at_com = parameters.inertial_vector(inertial.mass, np.zeros(3), inertial.inertia)
+        nominal[body, parameters.INERTIAL] += parameters.change_of_frame(T_body_link @ T_link_com) @ at_com
+    for body, joint in enumerate(tree.joints):
+        if joint is not None:
+            nominal[body, parameters.FRICTION] = joint.friction, joint.damping
+    return nominal
+
+
+def _warn_if_unphysical(path: Path, link: str, inertial: Inertial) -> None:
+    small, middle, large = np.linalg.eigvalsh(inertial.inertia)
+    if large == small == inertial.mass == 0.0:
+        return
+    if inertial.mass == 0.0:
+        what = "mass 0 kg with an inertia that is not 0"
+    elif small < -_ROUNDING * large - _POINT * inertial.mass:
+        what = f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m^2 are not all positive"
+    elif large > (small + middle) * (1.0 + _TRIANGLE_TOLERANCE) + _POINT * inertial.mass:
+        what = f"largest principal inertia {large:.3g} exceeds the sum of the others, {small + middle:.3g} kg m^2"
+    else:
+        return
+    warn(f"{path}: link '{link}': {what}; used as written", UnphysicalInertiaWarning)
+
+
 def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:
     parents = {body.parent for body in bodies}
     for index, body in enumerate(bodies):
         if body.massless and index not in parents:
             message = f"{path}: link '{body.name}': no inertia at the end of a limb; its inertia stays out of the fit"
-            warnings.warn(message, MasslessBodyWarning, stacklevel=3)
+            warn(message, MasslessBodyWarning)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,13 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Inertial
 
-from torchid.errors import TorchidWarning, UrdfError
+from torchid.errors import UrdfError, warn
 from torchid.guards import MAX_AXES, MAX_NUMBER, MAX_POINTS, MAX_SHAPES
 from torchid.parameters import Array
 from torchid.robot.meshes import MeshError, mesh_content
 from torchid.robot.robot import Robot
 from torchid.robot.urdf import parse_xml, read_urdf
-from torchid.text import shown
+from torchid.text import excerpt
 
 ShapeKind = Literal["collision", "visual"]
 SHAPE_TAGS = ("box", "sphere", "cylinder", "capsule", "mesh")
@@ -118,7 +117,7 @@ def _warn(path: Path, what: str, bodies: list[str], reasons: list[str]) -> None:
     if bodies:
         reason = f" ({reasons[0]}{', ...' if len(reasons) > 1 else ''})" if reasons else ""
         message = f"{path}: {what} at {', '.join(bodies)}{reason}: where their matter lies is not known"
-        warnings.warn(message, TorchidWarning, stacklevel=3)
+        warn(message)
 
 
 def _link_shapes(meshes: _Meshes, link: etree._Element, prefer: ShapeKind) -> list[_Shape]:
@@ -176,7 +175,7 @@ def _numbers(path: Path, field: str, element: etree._Element, name: str, count: 
     signed = name in ("xyz", "rpy", "scale")
     fits = values.shape == (count,) and np.isfinite(values).all() and np.abs(values).max() <= MAX_NUMBER
     if not fits or not (signed or (values >= 0.0).all()):
-        found = f"'{shown(text)}'" if text else "none"
+        found = f"'{excerpt(text)}'" if text else "none"
         accepted = f"{count} decimal number{'s' if count > 1 else ''}{'' if signed else ' of at least 0'}"
         raise UrdfError(path, f"{field} {name}>", found, accepted)
     return values
@@ -201,7 +200,7 @@ class _Meshes:
             raise found
         self._left -= len(found)
         if self._left < 0:
-            raise MeshError(f"{shown(filename)}: shapes of more than {MAX_POINTS} points in all")
+            raise MeshError(f"{excerpt(filename)}: shapes of more than {MAX_POINTS} points in all")
         return found
 
 
@@ -226,7 +225,7 @@ def _vertices(urdf: Path, filename: str) -> Array:
         with np.errstate(all="ignore"):
             mesh = trimesh.load(io.BytesIO(content), kind, force="mesh", process=False, skip_materials=True)
     except Exception as error:  # noqa: B902 - readers of several formats raise what they like
-        raise MeshError(f"{shown(filename)}: {type(error).__name__}: {shown(str(error))}") from error
+        raise MeshError(f"{excerpt(filename)}: {type(error).__name__}: {excerpt(str(error))}") from error
     units = getattr(mesh, "units", None)
     with np.errstate(all="ignore"):  # of units that no mesh has, which the check that follows refuses
         unit = trimesh.units.unit_conversion(units, "meters") if units else 1.0
@@ -240,16 +239,16 @@ def _of_stl(filename: str, content: bytes) -> np.ndarray:
     try:
         return np.array(_CORNER.findall(content)).astype(np.float64).reshape(-1, 3)
     except ValueError as error:
-        raise MeshError(f"{shown(filename)}: ValueError: {shown(str(error))}") from error
+        raise MeshError(f"{excerpt(filename)}: ValueError: {excerpt(str(error))}") from error
 
 
 def _checked(filename: str, vertices: object) -> Array:
     with np.errstate(invalid="ignore"):  # of NaN of a kind that float64 has not
         points = np.asarray(vertices, dtype=np.float64)
     if not len(points) or points.shape[1:] != (3,) or not np.isfinite(points).all():
-        raise MeshError(f"{shown(filename)}: no vertices")
+        raise MeshError(f"{excerpt(filename)}: no vertices")
     if np.abs(points).max() > MAX_NUMBER:
-        raise MeshError(f"{shown(filename)}: vertices farther than {MAX_NUMBER:g}")
+        raise MeshError(f"{excerpt(filename)}: vertices farther than {MAX_NUMBER:g}")
     return points
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Joint, Link
 
-from torchid.errors import TorchidWarning, UnknownNameError, UrdfError
+from torchid.errors import UnknownNameError, UrdfError, warn
 from torchid.guards import MAX_NUMBER
 from torchid.parameters import Array
 from torchid.robot.urdf import MOVING_TYPES
@@ -159,7 +158,7 @@ def _resolve_mimics(path: Path, joints: list[Joint]) -> dict[str, Mimic]:
         _check_ratio(path, joint.name, multiplier, offset)
         if master.type not in MOVING_TYPES:
             found = f"its mimic master '{master.name}' is fixed, so it is held still too"
-            warnings.warn(f"{path}: joint '{joint.name}': {found}", TorchidWarning, stacklevel=4)
+            warn(f"{path}: joint '{joint.name}': {found}")
         resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
     return resolved
 

@@ -14,8 +14,8 @@ from lxml import etree
 from yourdfpy.urdf import Joint, Link
 
 from torchid.errors import UnknownNameError, UrdfError
-from torchid.guards import MAX_LETTERS, MAX_LINKS, MAX_NUMBER, MAX_URDF, in_mebibytes, read_bytes
-from torchid.text import is_plain, shown
+from torchid.guards import MAX_LETTERS, MAX_LINKS, MAX_NUMBER, MAX_URDF, format_bytes, read_bytes
+from torchid.text import excerpt, is_plain
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING_TYPES, "fixed")
@@ -39,16 +39,16 @@ def parse_xml(path: Path) -> etree._ElementTree:
     except OSError as error:
         raise UrdfError(path, "file", f"cannot be read ({error.strerror})", "a readable URDF file") from error
     except ValueError as error:
-        accepted = f"a URDF of at most {in_mebibytes(MAX_URDF)}"
+        accepted = f"a URDF of at most {format_bytes(MAX_URDF)}"
         raise UrdfError(path, "file", f"cannot be read ({error})", accepted) from error
     try:
         tree = etree.parse(io.BytesIO(content), etree.XMLParser(resolve_entities=False, no_network=True))
     except (etree.XMLSyntaxError, ValueError, LookupError) as error:
-        found = shown(getattr(error, "msg", None) or str(error), 200)
+        found = excerpt(getattr(error, "msg", None) or str(error), 200)
         raise UrdfError(path, "XML", f"not well-formed: {found}", "a well-formed URDF") from error
     root = tree.getroot()
     if root.tag != "robot":
-        raise UrdfError(path, "XML root", f"<{shown(str(root.tag))}>", "<robot>")
+        raise UrdfError(path, "XML root", f"<{excerpt(str(root.tag))}>", "<robot>")
     return tree
 
 
@@ -121,7 +121,7 @@ def _check_names(path: Path, root: etree._Element) -> None:
 def _check_name(path: Path, field: str, name: str) -> None:
     if len(name) > MAX_LETTERS or not is_plain(name) or "$" in name:
         accepted = f"a printable name of at most {MAX_LETTERS} characters, without $ (expand xacro first)"
-        raise UrdfError(path, field, f"name '{shown(name)}'", accepted)
+        raise UrdfError(path, field, f"name '{excerpt(name)}'", accepted)
 
 
 def _check_numbers(path: Path, owner: etree._Element) -> None:
@@ -137,7 +137,7 @@ def _check_numbers(path: Path, owner: etree._Element) -> None:
                 if len(words) != count or not all(_DECIMAL.fullmatch(word) for word in words):
                     hint = " (expand xacro first)" if "${" in text else ""
                     accepted = f"{count} decimal number{'s' if count > 1 else ''}{hint}"
-                    raise UrdfError(path, f"{of}, <{element.tag!s} {name!s}>", f"'{shown(text)}'", accepted)
+                    raise UrdfError(path, f"{of}, <{element.tag!s} {name!s}>", f"'{excerpt(text)}'", accepted)
                 _check_size(path, f"{of}, <{part.tag!s}>", [float(word) for word in words])
 
 
@@ -152,7 +152,7 @@ def _check_size(path: Path, field: str, numbers: list[float]) -> None:
 def _check_joint(path: Path, joint: etree._Element, links: list[str], joints: list[str]) -> None:
     field, kind = f"joint '{joint.get('name')}'", joint.get("type")
     if kind not in JOINT_TYPES:
-        found = "no type" if kind is None else f"type '{shown(kind)}'"
+        found = "no type" if kind is None else f"type '{excerpt(kind)}'"
         raise UrdfError(path, field, found, ", ".join(JOINT_TYPES))
     for end in ("parent", "child"):
         element = joint.find(end)

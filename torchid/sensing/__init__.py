@@ -5,9 +5,9 @@ from torchid.sensing.sensors import (
     Contact,
     SensorNoise,
     SensorSet,
-    check_contacts,
     chosen_sensors,
     named_sensors,
+    validate_contacts,
     with_ft_sensors,
 )
 
@@ -17,7 +17,7 @@ __all__ = [
     "Projection",
     "SensorNoise",
     "SensorSet",
-    "check_contacts",
+    "validate_contacts",
     "chosen_sensors",
     "named_sensors",
     "with_ft_sensors",

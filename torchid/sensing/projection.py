@@ -8,135 +8,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-RANK_TOLERANCE = 1e-9
-"""A singular value of A_x below this share of the largest counts as zero (more in single precision)."""
+from torchid.rounding import BASE_RANK_TOLERANCE, KINEMATIC_TOLERANCE, relative_tolerance
 
 _SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an SVD
-
-
-def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
-    """Orthonormal bases of the null spaces of a batch of matrices, grouped by rank.
-
-    A QR factorization of the transpose serves samples of full row rank; only those that might have lost rank (straight
-    knees) pay for a singular value decomposition. Which basis of a null space comes out is arbitrary, and so is its
-    gradient; whatever depends on the null space alone, such as `V V^T` or the norm of `V^T f`, has the right one as
-    long as the rank stays. Where the rank changes, null spaces jump: there is no derivative, and what is returned is
-    that along motions that keep the rank.
-
-    Args:
-        A: (B, k, m); with gradient if it requires one.
-
-    Yields:
-        (index of the samples, V): V is (B', m, m - rank) with `A @ V = 0` and `V^T V = I`.
-    """
-    for index, V in _bases(A.detach()):
-        yield index, _differentiable(A[index], V) if A.requires_grad else V
-
-
-def _differentiable(A: Tensor, V: Tensor) -> Tensor:
-    """Bases `V` as functions of A: projected onto the null space of A and made orthonormal again.
-
-    Their value does not change but by rounding. To first order dV = -A^+ dA V (Golub, Pereyra 1973).
-    """
-    inverse = torch.linalg.pinv(A, rtol=_tolerance(A))
-    inside = V - inverse @ (A @ V)
-    L = torch.linalg.cholesky(inside.mT @ inside)
-    return torch.linalg.solve_triangular(L, inside.mT, upper=False).mT
-
-
-def _tolerance(A: Tensor) -> float:
-    return max(RANK_TOLERANCE, max(A.shape[1:]) * torch.finfo(A.dtype).eps)
-
-
-def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
-    samples, k, m = A.shape
-    if samples == 0:
-        return
-    identity = torch.eye(m, dtype=A.dtype, device=A.device)
-    tolerance = _tolerance(A)
-    if k == 0:
-        yield slice(None), identity.expand(samples, m, m)
-        return
-    suspect = torch.ones(samples, dtype=torch.bool, device=A.device)
-    if k <= m:
-        reflectors, tau = torch.geqrf(A.mT)
-        R = reflectors[:, :k].triu()
-        inverse = torch.linalg.solve_triangular(R, identity[:k, :k].expand_as(R), upper=True)
-        condition = torch.linalg.matrix_norm(R) * torch.linalg.matrix_norm(inverse)
-        suspect = ~(condition < 1.0 / (_SUSPECT * tolerance))  # so written, infinite and undefined ones are suspect too
-        V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
-        if not suspect.any():
-            yield slice(None), V
-            return
-        regular = torch.nonzero(~suspect)[:, 0]
-        if len(regular):
-            yield regular, V[regular]
-    left = torch.nonzero(suspect)[:, 0]
-    _, values, Vh = torch.linalg.svd(A[left], full_matrices=True)
-    rank = (values > tolerance * values[:, :1].clamp_min(torch.finfo(A.dtype).tiny)).sum(1)
-    for r in rank.unique().tolist():
-        same = rank == r
-        yield left[same], Vh[same, r:].mT
-
-
-def whitened_null_space(
-    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor
-) -> Iterator[tuple[Tensor | slice, Tensor]]:
-    """Bases W of the null spaces of A under which the projected sensor noise is white, grouped by rank.
-
-    Args:
-        A: (B, k, m).
-        row_std: (m,), > 0, noise of the generalized force itself (torque sensors, floor of the base rows).
-        J_m: (B, k_m, m), rows of the contact Jacobian whose wrench component is measured.
-        wrench_std: (k_m,), noise of each measured wrench component.
-
-    Yields:
-        (index of the samples, W): W is (B', m, m - rank) with `A @ W = 0` and `W^T S W = I`, where S, the covariance of
-        the generalized force, is `diag(row_std^2) + J_m^T diag(wrench_std^2) J_m`. Gradients as in `null_space`.
-    """
-    for index, V in null_space(A / row_std):
-        W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
-        if len(wrench_std):
-            through_contacts = (J_m[index] @ W) * wrench_std[:, None]
-            identity = torch.eye(W.shape[2], dtype=W.dtype, device=W.device)
-            L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
-            W = torch.linalg.solve_triangular(L, W.mT, upper=False).mT
-        yield index, W
-
-
-def levelled_null_space(
-    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor, axes: Tensor | None
-) -> Iterator[tuple[Tensor | slice, Tensor]]:
-    """As `whitened_null_space`, with noise of the base rows along other axes than the base's.
-
-    Args:
-        A: (B, k, m), the six base rows of the generalized force first.
-        row_std: (m,), base rows along `axes`.
-        J_m: (B, k_m, m).
-        wrench_std: (k_m,).
-        axes: (B, 3, 3), columns are unit vectors in the base frame; None: the base's own.
-    """
-    if axes is None:
-        yield from whitened_null_space(A, row_std, J_m, wrench_std)
-        return
-    axes = axes.detach()
-    for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std):
-        yield index, _along(W.mT, axes[index].mT).mT
-
-
-def _along(X: Tensor, axes: Tensor) -> Tensor:
-    """Rows (B, k, m) whose force and moment on the base are given by their components along some axes."""
-    return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)
-
-
-_BASE_RANK_TOLERANCE = 1e-6  # V_x is orthonormal: singular values of S_b V_x are at most 1
 
 
 @dataclass(frozen=True)
 class ProjectedGroup:
     """Samples that share a contact state and a rank.
 
-    `index`, (B',), into the batch; `active`, (k,) bool, rows of J_C in contact; `V`, (B', nv, r); `K`, (B', r, P);
+    `index`, (B',), into the batch; `active`, (k,) bool, rows of J_C in contact; `V`, (B', n_rows, r); `K`, (B', r, P);
     `f`, (B', r); `base_rank`, (B',), rank(S_b V_x). `V` is whitened, no longer orthonormal, if a noise was given.
     """
 
@@ -146,18 +27,6 @@ class ProjectedGroup:
     K: Tensor
     f: Tensor
     base_rank: Tensor
-
-
-def base_singular_values(V: Tensor) -> Tensor:
-    """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, nv, r) orthonormal."""
-    values = torch.linalg.svdvals(V[:, :6])
-    return nn.functional.pad(values, (0, 6 - values.shape[1]))
-
-
-def base_rank(singular_values: Tensor) -> Tensor:
-    """rank(S_b V_x), (B,), from `base_singular_values`."""
-    tolerance = max(_BASE_RANK_TOLERANCE, 100.0 * torch.finfo(singular_values.dtype).eps)
-    return (singular_values > tolerance).sum(1)
 
 
 class Projection(nn.Module):
@@ -170,6 +39,9 @@ class Projection(nn.Module):
     Gradients flow to all arguments, the Jacobian included: through `V_x` too, whose choice is arbitrary, so that only
     losses that do not depend on it (squares of projected forces, their sum over a batch) have one that means
     something. Where an active contact loses rank (a straight knee), the null space jumps and has no derivative.
+
+    Takes any K, dense and with any sensors, and is differentiable. Fits take `torchid.RowBuilder`, which uses the same
+    null spaces but multiplies V_x^T into the bodies' wrenches, for speed (`tests/test_rows_two_ways.py` compares both).
     """
 
     def __init__(
@@ -223,9 +95,9 @@ class Projection(nn.Module):
         """Project a batch.
 
         Args:
-            J_C: (B, k, nv), contact Jacobian with the rows of all contacts, active or not.
+            J_C: (B, k, n_rows), contact Jacobian with the rows of all contacts, active or not.
             active: (B, k) bool, rows whose contact touches the ground. The wrench of others is zero, whatever was read.
-            K: (B, nv, P), or any other matrix with the rows of the dynamics.
+            K: (B, n_rows, P), or any other matrix with the rows of the dynamics.
             torque: (B, n), read only where measured [N m].
             wrench: (B, k), by the rows of J_C, read only where measured and active [N, N m].
 
@@ -271,3 +143,117 @@ class Projection(nn.Module):
             return null_space(J_x[:, :, kept])
         row_std, wrench_std = (self.get_buffer(name).to(J_x) for name in ("row_std", "wrench_std"))
         return whitened_null_space(J_x[:, :, kept], row_std[kept], J_m[:, :, kept], wrench_std[measured])
+
+
+def base_singular_values(V: Tensor) -> Tensor:
+    """Singular values of S_b V_x, (B, 6), zeros where V_x has fewer than six columns; V: (B, n_rows, r) orthonormal."""
+    values = torch.linalg.svdvals(V[:, :6])
+    return nn.functional.pad(values, (0, 6 - values.shape[1]))
+
+
+def base_rank(singular_values: Tensor) -> Tensor:
+    """rank(S_b V_x), (B,), from `base_singular_values`."""
+    tolerance = max(BASE_RANK_TOLERANCE, 100.0 * torch.finfo(singular_values.dtype).eps)
+    return (singular_values > tolerance).sum(1)
+
+
+def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    """Orthonormal bases of the null spaces of a batch of matrices, grouped by rank.
+
+    A QR factorization of the transpose serves samples of full row rank; only those that might have lost rank (straight
+    knees) pay for a singular value decomposition. Which basis of a null space comes out is arbitrary, and so is its
+    gradient; whatever depends on the null space alone, such as `V V^T` or the norm of `V^T f`, has the right one as
+    long as the rank stays. Where the rank changes, null spaces jump: there is no derivative, and what is returned is
+    that along motions that keep the rank.
+
+    Args:
+        A: (B, k, m); with gradient if it requires one.
+
+    Yields:
+        (index of the samples, V): V is (B', m, m - rank) with `A @ V = 0` and `V^T V = I`.
+    """
+    for index, V in _bases(A.detach()):
+        yield index, _differentiable(A[index], V) if A.requires_grad else V
+
+
+def whitened_null_space(
+    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor, axes: Tensor | None = None
+) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    """Bases W of the null spaces of A under which the projected sensor noise is white, grouped by rank.
+
+    Args:
+        A: (B, k, m), with `axes` the six base rows of the generalized force first.
+        row_std: (m,), > 0, noise of the generalized force itself (torque sensors, floor of the base rows) [N, N m].
+        J_m: (B, k_m, m), rows of the contact Jacobian whose wrench component is measured.
+        wrench_std: (k_m,), noise of each measured wrench component [N, N m].
+        axes: (B, 3, 3), columns are the unit vectors in the base frame that the base rows of `row_std` are along; None:
+            the base's own axes.
+
+    Yields:
+        (index of the samples, W): W is (B', m, m - rank) with `A @ W = 0` and `W^T S W = I`, where S, the covariance of
+        the generalized force, is `diag(row_std^2) + J_m^T diag(wrench_std^2) J_m`. Gradients as in `null_space`.
+    """
+    if axes is not None:
+        axes = axes.detach()
+        for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std):
+            yield index, _along(W.mT, axes[index].mT).mT
+        return
+    for index, V in null_space(A / row_std):
+        W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
+        if len(wrench_std):
+            through_contacts = (J_m[index] @ W) * wrench_std[:, None]
+            identity = torch.eye(W.shape[2], dtype=W.dtype, device=W.device)
+            L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
+            W = torch.linalg.solve_triangular(L, W.mT, upper=False).mT
+        yield index, W
+
+
+def _along(X: Tensor, axes: Tensor) -> Tensor:
+    """Rows (B, k, m) whose force and moment on the base are given by their components along some axes."""
+    return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)
+
+
+def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    samples, k, m = A.shape
+    if samples == 0:
+        return
+    identity = torch.eye(m, dtype=A.dtype, device=A.device)
+    tolerance = _tolerance(A)
+    if k == 0:
+        yield slice(None), identity.expand(samples, m, m)
+        return
+    suspect = torch.ones(samples, dtype=torch.bool, device=A.device)
+    if k <= m:
+        reflectors, tau = torch.geqrf(A.mT)
+        R = reflectors[:, :k].triu()
+        inverse = torch.linalg.solve_triangular(R, identity[:k, :k].expand_as(R), upper=True)
+        condition = torch.linalg.matrix_norm(R) * torch.linalg.matrix_norm(inverse)
+        suspect = ~(condition < 1.0 / (_SUSPECT * tolerance))  # so written, infinite and undefined ones are suspect too
+        V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
+        if not suspect.any():
+            yield slice(None), V
+            return
+        regular = torch.nonzero(~suspect)[:, 0]
+        if len(regular):
+            yield regular, V[regular]
+    left = torch.nonzero(suspect)[:, 0]
+    _, values, Vh = torch.linalg.svd(A[left], full_matrices=True)
+    rank = (values > tolerance * values[:, :1].clamp_min(torch.finfo(A.dtype).tiny)).sum(1)
+    for r in rank.unique().tolist():
+        same = rank == r
+        yield left[same], Vh[same, r:].mT
+
+
+def _differentiable(A: Tensor, V: Tensor) -> Tensor:
+    """Bases `V` as functions of A: projected onto the null space of A and made orthonormal again.
+
+    Their value does not change but by rounding. To first order dV = -A^+ dA V (Golub, Pereyra 1973).
+    """
+    inverse = torch.linalg.pinv(A, rtol=_tolerance(A))
+    inside = V - inverse @ (A @ V)
+    L = torch.linalg.cholesky(inside.mT @ inside)
+    return torch.linalg.solve_triangular(L, inside.mT, upper=False).mT
+
+
+def _tolerance(A: Tensor) -> float:
+    return relative_tolerance(KINEMATIC_TOLERANCE, A.shape[1:], torch.finfo(A.dtype).eps)

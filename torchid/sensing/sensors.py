@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchid.errors import SensorError, UnknownNameError
-from torchid.parameters import COMPONENTS, Array
+from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.robot import Robot
 
 _FORCES, _MOMENTS = (0, 1, 2), (3, 4, 5)
@@ -41,7 +41,7 @@ class Contact:
 
     @property
     def components(self) -> tuple[int, ...]:
-        """Places in `COMPONENTS` that can differ from zero."""
+        """Places in `WRENCH_COMPONENTS` that can differ from zero."""
         if self.kind == "point":
             return _FORCES
         if self.kind == "flat":
@@ -51,10 +51,10 @@ class Contact:
     @property
     def component_names(self) -> tuple[str, ...]:
         """Names of `components`."""
-        return tuple(COMPONENTS[k] for k in self.components)
+        return tuple(WRENCH_COMPONENTS[k] for k in self.components)
 
 
-def check_contacts(robot: Robot, contacts: Sequence[Contact], source: object = "contacts") -> tuple[Contact, ...]:
+def validate_contacts(robot: Robot, contacts: Sequence[Contact], source: object = "contacts") -> tuple[Contact, ...]:
     """The contacts, after making sure that the robot has their frames.
 
     Raises:
@@ -98,29 +98,29 @@ class SensorNoise:
     ft_moment: float | None = None
 
     @property
-    def base(self) -> Array:
+    def base_std(self) -> Array:
         """Floor of the six base rows along the levelled base's axes, (6,) [N, N m]."""
         force = self.contact_force if self.base_force is None else self.base_force
         moment = self.contact_moment if self.base_moment is None else self.base_moment
         return np.concatenate([np.broadcast_to(np.asarray(x, dtype=float), 3) for x in (force, moment)])
 
     @property
-    def by_axis(self) -> bool:
+    def base_axes_differ(self) -> bool:
         """Whether the floors of the base rows differ from axis to axis."""
-        return bool(np.ptp(self.base.reshape(2, 3), axis=1).any())
+        return bool(np.ptp(self.base_std.reshape(2, 3), axis=1).any())
 
     @property
-    def limb(self) -> tuple[float, float]:
+    def limb_std(self) -> tuple[float, float]:
         """Of a force and of a moment that a sensor in a limb reads [N, N m]."""
         force = self.contact_force if self.ft_force is None else self.ft_force
         moment = self.contact_moment if self.ft_moment is None else self.ft_moment
         return force, moment
 
-    def dofs(self, n: int, count: int) -> Array:
+    def dof_std(self, n: int, count: int) -> Array:
         """Of n joint torques, then of the wrenches of force/torque sensors in limbs, (count,) [N m, N, N m]."""
-        return np.append(np.full(n, self.joint_torque), np.tile(np.repeat(self.limb, 3), (count - n) // 6))
+        return np.append(np.full(n, self.joint_torque), np.tile(np.repeat(self.limb_std, 3), (count - n) // 6))
 
-    def times(self, factor: float) -> SensorNoise:
+    def scaled(self, factor: float) -> SensorNoise:
         """All of them, larger by a factor."""
         scaled: dict[str, Any] = {
             name: tuple(factor * one for one in x) if isinstance(x, tuple) else factor * x
@@ -130,7 +130,7 @@ class SensorNoise:
         return SensorNoise(**scaled)
 
     @property
-    def wrench(self) -> Array:
+    def wrench_std(self) -> Array:
         """Of the six wrench components, (6,) [N, N m]."""
         return np.array([self.contact_force] * 3 + [self.contact_moment] * 3)
 
@@ -140,7 +140,7 @@ class SensorSet:
     """Which forces are measured.
 
     `torque`, (n + 6 F,) bool, by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs; `wrench`,
-    (C, 6) bool, by contacts and `COMPONENTS`.
+    (C, 6) bool, by contacts and `WRENCH_COMPONENTS`.
     """
 
     torque: np.ndarray
@@ -213,10 +213,10 @@ def chosen_sensors(
         contact = contacts[frames.index(frame)]
         for name in names:
             field_name = f"sensors.contact_wrenches.{frame}"
-            if name not in COMPONENTS:
+            if name not in WRENCH_COMPONENTS:
                 raise UnknownNameError(source, field_name, name, contact.component_names)
             if name not in contact.component_names:
                 found = f"'{name}', which a {contact.kind} contact cannot exert"
                 raise SensorError(source, field_name, found, ", ".join(contact.component_names))
-            wrench[frames.index(frame), COMPONENTS.index(name)] = True
+            wrench[frames.index(frame), WRENCH_COMPONENTS.index(name)] = True
     return SensorSet(torque, wrench, noise or SensorNoise())

@@ -118,7 +118,7 @@ def sensor_set(
     robot: Robot, contacts: Sequence[Contact], chosen: Iterable[Candidate], noise: SensorNoise | None = None
 ) -> SensorSet:
     """The sensor set that measures what some candidates read, and nothing else."""
-    torque, wrench = np.zeros(robot.dofs, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
+    torque, wrench = np.zeros(robot.n_dofs, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
     for candidate in chosen:
         torque[list(candidate.dofs)] = True
         if candidate.contact is not None:

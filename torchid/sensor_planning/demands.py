@@ -27,6 +27,7 @@ from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.contact_state import State
 from torchid.robot import Robot
+from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact
 from torchid.sensor_planning.candidates import Candidate, sensor_set
 
@@ -67,18 +68,20 @@ class Demand:
 
     def unreached(self, basis: Array) -> Array:
         """Dimensions of the target outside the span of orthonormal (or zero) columns (..., k, r), int (...)."""
-        return np.asarray((np.linalg.svd(orthogonal_part(self.target, basis), compute_uv=False) > TOLERANCE).sum(-1))
+        return np.asarray(
+            (np.linalg.svd(orthogonal_part(self.target, basis), compute_uv=False) > BASE_RANK_TOLERANCE).sum(-1)
+        )
 
     def gains(self, basis: Array) -> dict[Candidate, int]:
         """Dimensions that each candidate adds to a span (k, r)."""
         values = ((c, np.linalg.svd(orthogonal_part(x, basis), compute_uv=False)) for c, x in self.vectors.items())
-        return {candidate: int((s > TOLERANCE).sum()) for candidate, s in values}
+        return {candidate: int((s > BASE_RANK_TOLERANCE).sum()) for candidate, s in values}
 
 
 def orthonormal_basis(vectors: Array) -> Array:
     """Orthonormal basis of the span of unit columns, (..., k, w) to (..., k, min(k, w)), padded with zero columns."""
     U, values, _ = np.linalg.svd(vectors, full_matrices=False)
-    return U * (values > TOLERANCE * values[..., :1])[..., None, :]
+    return U * (values > BASE_RANK_TOLERANCE * values[..., :1])[..., None, :]
 
 
 def orthogonal_part(vectors: Array, basis: Array) -> Array:
@@ -89,7 +92,7 @@ def orthogonal_part(vectors: Array, basis: Array) -> Array:
 def span_basis(vectors: Array) -> Array:
     """Orthonormal basis (k, r) of the span of parts of unit vectors (k, w); small ones are none."""
     U, values, _ = np.linalg.svd(vectors, full_matrices=False)
-    return U[:, values > TOLERANCE]
+    return U[:, values > BASE_RANK_TOLERANCE]
 
 
 def demands(
@@ -147,7 +150,7 @@ def _demand(
     J: Array,
     candidates: Sequence[Candidate],
 ) -> Demand:
-    """What a group demands, from the Jacobians of all contacts, (C, 6, nv + 6 F)."""
+    """What a group demands, from the Jacobians of all contacts, (C, 6, n_rows)."""
     rows = [(place, k) for place in group for k in contacts[place].components]
     J_group = np.stack([J[row] for row in rows])
     J_group /= np.linalg.norm(J_group[:, :6])
@@ -156,8 +159,8 @@ def _demand(
         if candidate.dofs:
             x = J_group[:, [6 + dof for dof in candidate.dofs]]
             length = np.linalg.norm(x, axis=0)
-            if (length > TOLERANCE).any():
-                vectors[candidate] = x[:, length > TOLERANCE] / length[length > TOLERANCE]
+            if (length > BASE_RANK_TOLERANCE).any():
+                vectors[candidate] = x[:, length > BASE_RANK_TOLERANCE] / length[length > BASE_RANK_TOLERANCE]
         elif candidate.contact in group:
             read = [rows.index((candidate.contact, k)) for k in candidate.components]
             vectors[candidate] = np.eye(len(rows))[:, read]

@@ -15,10 +15,11 @@ from torchid.problem import RowBuilder
 from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import State, state_name
 from torchid.robot import Robot
+from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values
 from torchid.sensor_planning.candidates import Candidate, candidates, contained_candidates
-from torchid.sensor_planning.demands import TOLERANCE, Demand, demands, orthonormal_basis
+from torchid.sensor_planning.demands import Demand, demands, orthonormal_basis
 
 _ZERO = 1e-5  # of a unit vector
 _CHUNK = 1024
@@ -129,7 +130,7 @@ def base_values(builder: RowBuilder, state: State, postures: Array) -> torch.Ten
     values = torch.zeros(len(postures), 6, dtype=torch.float64)
     for start in range(0, len(postures), _CHUNK):
         samples = resting_samples(postures[start : start + _CHUNK], state)
-        for index, V in builder.bases(samples, state):
+        for index, V in builder.null_space_bases(samples, state):
             values[start : start + _CHUNK][index] = base_singular_values(V)
     return values
 
@@ -234,9 +235,9 @@ def _assess_state(
 
 
 def _lost(builder: RowBuilder, state: State, posture: Array, cause: _Cause) -> LostBase:
-    [(_, V)] = builder.bases(resting_samples(posture, state), state)
+    [(_, V)] = builder.null_space_bases(resting_samples(posture, state), state)
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
-    directions = U[:, (values > TOLERANCE).sum() :]
+    directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]
     short = cause.missing()
     groups = zip(cause.generic, short, strict=True)
     return LostBase(

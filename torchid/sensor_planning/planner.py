@@ -13,7 +13,7 @@ from torchid.errors import SensorError
 from torchid.identifiability.structure import random_postures
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples
-from torchid.problem.chunks import spread_by_state
+from torchid.problem.chunks import subsample_states
 from torchid.problem.contact_state import State
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -33,7 +33,7 @@ from torchid.sensor_planning.ranking import (
 from torchid.sensor_planning.search import CheapestSet, DemandGroup, all_minimal_sets, cheapest_set, demand_groups
 
 CRITERIA = ("per_sample", "stack")
-Progress = Callable[[str, int, int], None]
+StepCallback = Callable[[str, int, int], None]
 """Called with what is going on, steps done and steps in all."""
 
 _EXACT = 1e-9
@@ -75,7 +75,7 @@ class PlanningProblem:
     def assess(self, sensors: SensorSet) -> list[BaseObservability]:
         """Observability of the base with a sensor set, by contact state, over the postures of the logs as well."""
         pieces: dict[State, list[Array]] = {}
-        for samples, state, _ in spread_by_state(self.logs, _POSTURES):
+        for samples, state, _ in subsample_states(self.logs, _POSTURES):
             pieces.setdefault(state, []).append(samples.joint_position.numpy())
         return assess_sensors(
             robot=self.robot,
@@ -176,7 +176,7 @@ class SensorPlan:
     removals: tuple[Removal, ...]
 
 
-def plan_sensors(problem: PlanningProblem, progress: Progress | None = None) -> SensorPlan:
+def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorPlan:
     """The smallest sensor set for a scenario, the most informative of those.
 
     Raises:
@@ -252,7 +252,7 @@ def contact_requirements(
 
 
 def _best_parts(
-    problem: PlanningProblem, parts: Sequence[DemandGroup], least: CheapestSet, tell: Progress
+    problem: PlanningProblem, parts: Sequence[DemandGroup], least: CheapestSet, tell: StepCallback
 ) -> tuple[tuple[PartPlan, ...], tuple[Candidate, ...]]:
     """Every part with its minimal sets, and the union of their most informative cheapest sets.
 
@@ -289,7 +289,7 @@ def _best_parts(
     return tuple(out), tuple(c for c in problem.candidates if c in chosen)
 
 
-def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], tell: Progress) -> Iterable[Removal]:
+def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], tell: StepCallback) -> Iterable[Removal]:
     step = _counted(tell, "leaving sensors out", len(chosen))
     for candidate in chosen:
         fewer = [c for c in chosen if c is not candidate]
@@ -306,7 +306,7 @@ def _base_rank(problem: PlanningProblem, chosen: Sequence[Candidate]) -> int | N
     return min(int(base_rank(base_values(builder, state, postures)).max()) for state in problem.states)
 
 
-def _counted(tell: Progress, what: str, steps: int) -> Callable[[], None]:
+def _counted(tell: StepCallback, what: str, steps: int) -> Callable[[], None]:
     """Tells one step more at every call."""
     numbers = count(1)
     return lambda: tell(what, next(numbers), steps)

@@ -20,7 +20,7 @@ from torchid.identifiability.information import prior_directions, reading_direct
 from torchid.identifiability.structure import structural_problem, structural_samples
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
-from torchid.problem.chunks import one_thread, share_out, spread_by_state, worker_count
+from torchid.problem.chunks import one_thread, run_in_workers, subsample_states, worker_count
 from torchid.problem.contact_state import State
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
@@ -141,7 +141,7 @@ class SetRanking:
         directions = torch.from_numpy(prior_directions(builder, prior))
         self._states: list[_StateRows] = []
         self._information = torch.eye(directions.shape[1], dtype=torch.float64)
-        for samples, state, represented in spread_by_state(logs, _SAMPLES):
+        for samples, state, represented in subsample_states(logs, _SAMPLES):
             weight = represented / samples.oversampling
             rows, W = builder.rows_by_sample(samples, state)
             R = rows[..., :-1] @ directions
@@ -152,7 +152,7 @@ class SetRanking:
                 self._states.append(_StateRows(weight, owners, Q, Q @ R))
 
     def _ways(self, builder: RowBuilder, samples: Samples, state: State) -> tuple[list[int], Tensor]:
-        """How each channel of the candidates enters the generalized force, (B, c, nv), and whose channel it is."""
+        """How each channel of the candidates enters the generalized force, (B, c, n_rows), and whose it is."""
         J = builder.contact_jacobian(samples)
         base, owners, ways = builder.tree.base_rows, [], []
         for number, candidate in enumerate(self.candidates):
@@ -197,7 +197,7 @@ def rank_sets(
         return ranked
 
     workers = min(worker_count(torch.device("cpu")), max(len(sets), 1))
-    ranked = sorted(chain.from_iterable(share_out(range(len(sets)), run, workers)))
+    ranked = sorted(chain.from_iterable(run_in_workers(range(len(sets)), run, workers)))
     return [RankedSet(-bits, sets[place]) for bits, place in ranked]
 
 

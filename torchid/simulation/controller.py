@@ -18,129 +18,6 @@ _STANDING, _CENTRE, _TURN, _SWING, _JOINT, _POSTURE = 100.0, 10.0, 10.0, 10.0, 3
 ALOFT = 1e-3  # a foot that carries a smaller share than this is off the floor
 _PREVIEW, _SMOOTH = 0.02, 0.05  # s, rad/s: friction is that of the velocity to come, and smooth where it turns
 _TRIES, _LEAST_POINTS = 3, 3
-
-
-@dataclass(frozen=True)
-class Goal:
-    """What to do at one instant; `p`, `v`, `a` stand for position, velocity, acceleration.
-
-    Attributes:
-        com: (3, 3), rows p, v, a of the centre of mass, world axes.
-        base: rotation of the base, (3, 3).
-        base_rate: (2, 3), angular velocity and acceleration, base axes.
-        joints: (3, n), rows p, v, a.
-        driven: (n,), which joints follow their reference closely; the others yield to everything else.
-        feet: (F, 3, 3), rows p, v, a of every foot, world axes.
-        load: (F,), the share of its part of the load that a foot takes, 0 in the air.
-    """
-
-    com: Array
-    base: Array
-    base_rate: Array
-    joints: Array
-    driven: Array
-    feet: Array
-    load: Array
-
-
-class Controller:
-    """Joint torques from the state of the plant and a goal."""
-
-    def __init__(
-        self, plant: Plant, feet: tuple[Foot, ...], rotations: Array, friction: tuple[float, float] = (0.0, 0.0)
-    ) -> None:
-        """Fix the feet, their rotations to world, (F, 3, 3), which they keep, and the joint friction to make up for."""
-        self._plant = plant
-        self._coulomb, self._viscous = friction
-        self._feet = feet
-        self._rotations = rotations
-
-    def torque(self, goal: Goal) -> Array:
-        """Torques (n,) [N m] for the plant as last observed."""
-        plant = self._plant
-        M, bias = plant.inertia, plant.bias
-        feet = [plant.foot(i) for i in range(len(self._feet))]
-        acceleration = self._acceleration(goal, M, bias, feet)
-        needed = M @ acceleration + bias
-        velocity = plant.velocity[6:] + _PREVIEW * acceleration[6:]
-        lost = self._coulomb * np.tanh(velocity / _SMOOTH) + self._viscous * velocity
-        return (needed - self._contact_forces(needed[:6], goal.load, feet))[6:] + lost
-
-    def _acceleration(self, goal: Goal, M: Array, bias: Array, feet: list[FootMotion]) -> Array:
-        """The generalized acceleration (nv,) that meets all tasks best, by weighted least squares."""
-        plant = self._plant
-        velocity, nv = plant.velocity, plant.nv
-        tasks: list[tuple[float, Array, Array]] = []
-
-        com_J = M[:3] / plant.mass  # the base's linear rows are the momentum of everything
-        drift = (bias[:3] - plant.weight) / plant.mass
-        wanted = _servo(goal.com[0] - plant.com, goal.com[1] - com_J @ velocity, goal.com[2])
-        tasks.append((_CENTRE, com_J, wanted - drift))
-
-        turn = np.zeros((3, nv))
-        turn[:, 3:6] = np.eye(3)
-        error = turn_between(np.eye(3), plant.base_rotation.T @ goal.base)
-        tasks.append((_TURN, turn, _servo(error, goal.base_rate[0] - velocity[3:6], goal.base_rate[1])))
-
-        for i, foot in enumerate(feet):
-            p, v, a = goal.feet[i]
-            off = np.concatenate([p - foot.position, turn_between(foot.rotation, self._rotations[i])])
-            if goal.load[i] > ALOFT:
-                off[2] = 0.0  # the floor gives way
-                weight, wanted = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
-            else:
-                rate = np.concatenate([v, np.zeros(3)]) - foot.velocity
-                weight, wanted = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
-            rows = slice(self._feet[i].held)
-            tasks.append((weight, foot.J[rows], (wanted - foot.bias)[rows]))
-
-        joints = np.zeros((plant.n, nv))
-        joints[:, 6:] = np.diag(np.where(goal.driven, _JOINT, _POSTURE))
-        p, v, a = goal.joints
-        tasks.append((1.0, joints, joints[:, 6:] @ _servo(p - plant.position[7:], v - velocity[6:], a)))
-
-        A = np.vstack([weight * J for weight, J, _ in tasks])
-        b = np.concatenate([weight * target for weight, _, target in tasks])
-        return np.linalg.solve(A.T @ A + 1e-9 * np.eye(nv), A.T @ b)
-
-    def _contact_forces(self, base: Array, load: Array, feet: list[FootMotion]) -> Array:
-        """Generalized force (nv,) of the smallest point forces that give the base what it needs, (6,).
-
-        Points that would have to pull are left out, as far as enough others remain.
-        """
-        maps, shares = [], []
-        for foot, share, motion in zip(self._feet, load, feet, strict=True):
-            if share <= ALOFT:
-                continue
-            for arm in foot.arms @ motion.rotation.T:
-                maps.append(motion.J[:3] - _cross(arm) @ motion.J[3:])
-                shares.append(share)
-        J, S = np.vstack(maps), np.array(shares)
-        at_base = J[:, :6].T
-        for _ in range(_TRIES):
-            weighted = at_base * np.repeat(S, 3)
-            force = weighted.T @ np.linalg.solve(weighted @ at_base.T, base)
-            pulling = force[2::3] < 0.0
-            if not pulling.any() or (~pulling & (S > 0.0)).sum() < _LEAST_POINTS:
-                break
-            S = np.where(pulling, 0.0, S)
-        return J.T @ force
-
-
-def turn_between(start: Array, end: Array) -> Array:
-    """The turn from one rotation to another, (3,): axis in the outer frame times the sine of the angle."""
-    R = end @ start.T
-    return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-
-
-def _servo(error: Array, rate_error: Array, feedforward: Array) -> Array:
-    return feedforward + _STIFFNESS * error + _DAMPING * rate_error
-
-
-def _cross(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
 _ITERATIONS, _LARGEST_STEP = 300, 0.2
 _SINGULAR = 1e-4  # share of the largest singular value
 _TOLERANCE = 1e-3  # m or rad
@@ -211,18 +88,18 @@ def _tasks(plant: Plant, feet: Sequence[Foot], targets: Array, rotations: Array)
     jacobians, off = [], []
     for i, (foot, target, R) in enumerate(zip(feet, targets, rotations, strict=True)):
         now = plant.foot(i)
-        jacobians.append(now.J[: foot.held])
-        off.append(np.concatenate([target - now.position, turn_between(now.rotation, R)])[: foot.held])
+        jacobians.append(now.J[: foot.constrained])
+        off.append(np.concatenate([target - now.position, rotation_error(now.rotation, R)])[: foot.constrained])
     level = np.zeros((3, plant.nv))
     level[:, 3:6] = np.eye(3)
     A = np.vstack([*jacobians, plant.inertia[:2] / plant.mass, level])
     above = (targets.mean(axis=0) - plant.com)[:2]
-    return A, np.concatenate([*off, above, turn_between(plant.base_rotation, np.eye(3))])
+    return A, np.concatenate([*off, above, rotation_error(plant.base_rotation, np.eye(3))])
 
 
 def _flattened(R: Array, foot: Foot, source: object) -> Array:
     """The rotation nearest to R that puts all points of the foot at one height."""
-    if foot.held < 6:
+    if foot.constrained < 6:
         return R.copy()
     normal = np.linalg.svd(foot.arms @ R.T)[2][2]
     normal *= np.copysign(1.0, normal[2])
@@ -232,3 +109,124 @@ def _flattened(R: Array, foot: Foot, source: object) -> Array:
         found = f"{foot.frame} is {np.degrees(angle):.0f} degrees off the horizontal"
         raise InputError(source, "posture", found, f"joint positions that put it within {np.degrees(_STEEPEST):.0f}")
     return Rotation.from_rotvec(angle * axis / max(float(np.linalg.norm(axis)), 1e-12)).as_matrix() @ R
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What to do at one instant; `p`, `v`, `a` stand for position, velocity, acceleration.
+
+    Attributes:
+        com: (3, 3), rows p, v, a of the centre of mass, world axes.
+        base: rotation of the base, (3, 3).
+        base_rate: (2, 3), angular velocity and acceleration, base axes.
+        joints: (3, n), rows p, v, a.
+        driven: (n,), which joints follow their reference closely; the others yield to everything else.
+        feet: (F, 3, 3), rows p, v, a of every foot, world axes.
+        load: (F,), the share of its part of the load that a foot takes, 0 in the air.
+    """
+
+    com: Array
+    base: Array
+    base_rate: Array
+    joints: Array
+    driven: Array
+    feet: Array
+    load: Array
+
+
+class Controller:
+    """Joint torques from the state of the plant and a goal."""
+
+    def __init__(
+        self, plant: Plant, feet: tuple[Foot, ...], rotations: Array, friction: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Fix the feet, their rotations to world, (F, 3, 3), which they keep, and the joint friction to make up for."""
+        self._plant = plant
+        self._coulomb, self._viscous = friction
+        self._feet = feet
+        self._rotations = rotations
+
+    def torque(self, goal: Goal) -> Array:
+        """Torques (n,) [N m] for the plant as last observed."""
+        plant = self._plant
+        M, bias = plant.inertia, plant.bias
+        feet = [plant.foot(i) for i in range(len(self._feet))]
+        acceleration = self._acceleration(goal, M, bias, feet)
+        needed = M @ acceleration + bias
+        velocity = plant.velocity[6:] + _PREVIEW * acceleration[6:]
+        lost = self._coulomb * np.tanh(velocity / _SMOOTH) + self._viscous * velocity
+        return (needed - self._contact_forces(needed[:6], goal.load, feet))[6:] + lost
+
+    def _acceleration(self, goal: Goal, M: Array, bias: Array, feet: list[FootMotion]) -> Array:
+        """The generalized acceleration (nv,) that meets all tasks best, by weighted least squares."""
+        plant = self._plant
+        velocity, nv = plant.velocity, plant.nv
+        tasks: list[tuple[float, Array, Array]] = []
+
+        com_J = M[:3] / plant.mass  # the base's linear rows are the momentum of everything
+        drift = (bias[:3] - plant.weight) / plant.mass
+        wanted = _servo(goal.com[0] - plant.com, goal.com[1] - com_J @ velocity, goal.com[2])
+        tasks.append((_CENTRE, com_J, wanted - drift))
+
+        turn = np.zeros((3, nv))
+        turn[:, 3:6] = np.eye(3)
+        error = rotation_error(np.eye(3), plant.base_rotation.T @ goal.base)
+        tasks.append((_TURN, turn, _servo(error, goal.base_rate[0] - velocity[3:6], goal.base_rate[1])))
+
+        for i, foot in enumerate(feet):
+            p, v, a = goal.feet[i]
+            off = np.concatenate([p - foot.position, rotation_error(foot.rotation, self._rotations[i])])
+            if goal.load[i] > ALOFT:
+                off[2] = 0.0  # the floor gives way
+                weight, wanted = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
+            else:
+                rate = np.concatenate([v, np.zeros(3)]) - foot.velocity
+                weight, wanted = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
+            rows = slice(self._feet[i].constrained)
+            tasks.append((weight, foot.J[rows], (wanted - foot.bias)[rows]))
+
+        joints = np.zeros((plant.n, nv))
+        joints[:, 6:] = np.diag(np.where(goal.driven, _JOINT, _POSTURE))
+        p, v, a = goal.joints
+        tasks.append((1.0, joints, joints[:, 6:] @ _servo(p - plant.position[7:], v - velocity[6:], a)))
+
+        A = np.vstack([weight * J for weight, J, _ in tasks])
+        b = np.concatenate([weight * target for weight, _, target in tasks])
+        return np.linalg.solve(A.T @ A + 1e-9 * np.eye(nv), A.T @ b)
+
+    def _contact_forces(self, base: Array, load: Array, feet: list[FootMotion]) -> Array:
+        """Generalized force (nv,) of the smallest point forces that give the base what it needs, (6,).
+
+        Points that would have to pull are left out, as far as enough others remain.
+        """
+        maps, shares = [], []
+        for foot, share, motion in zip(self._feet, load, feet, strict=True):
+            if share <= ALOFT:
+                continue
+            for arm in foot.arms @ motion.rotation.T:
+                maps.append(motion.J[:3] - _cross(arm) @ motion.J[3:])
+                shares.append(share)
+        J, S = np.vstack(maps), np.array(shares)
+        at_base = J[:, :6].T
+        for _ in range(_TRIES):
+            weighted = at_base * np.repeat(S, 3)
+            force = weighted.T @ np.linalg.solve(weighted @ at_base.T, base)
+            pulling = force[2::3] < 0.0
+            if not pulling.any() or (~pulling & (S > 0.0)).sum() < _LEAST_POINTS:
+                break
+            S = np.where(pulling, 0.0, S)
+        return J.T @ force
+
+
+def rotation_error(start: Array, end: Array) -> Array:
+    """The turn from one rotation to another, (3,): axis in the outer frame times the sine of the angle."""
+    R = end @ start.T
+    return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+
+
+def _servo(error: Array, rate_error: Array, feedforward: Array) -> Array:
+    return feedforward + _STIFFNESS * error + _DAMPING * rate_error
+
+
+def _cross(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -17,7 +17,7 @@ BODY = ("com_x", "com_y", "com_z", "base_roll", "base_pitch", "base_yaw")  # wha
 LEAD_S = 2.0  # waves grow to their amplitude in this time, before the log begins
 
 
-class Motion:
+class ReferenceMotion:
     """A motion of a robot that starts from a stance: a goal for every control step from -LEAD_S to its end.
 
     Args:

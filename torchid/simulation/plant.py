@@ -10,12 +10,24 @@ import numpy as np
 from lxml import etree
 
 from torchid.config import FootConfig
-from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, install
+from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, how_to_install
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
 
+try:
+    import mujoco
+except ImportError as error:
+    found = "needs MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
+    raise InputError("torchid", "simulate", found, how_to_install("sim")) from error
+
 _RADIUS = 1e-4  # m, of contact points that the file gives: where they touch the floor is where they are
 _NARROWEST = 1e-3  # m, of a support polygon
+_WORLD = "world link"
+_DISCARDED = ("transmission", "gazebo", "material", "mujoco")
+_SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
+_STICTION = (0.002, 1.0)  # the same of dry friction in a joint; MuJoCo's own lets joints creep at 0.1 rad/s
+_FRICTION = (1.0, 0.005, 0.0001)
+_SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction creeps
 
 
 @dataclass(frozen=True)
@@ -37,9 +49,9 @@ class Foot:
         return np.array(self.points) - self.middle
 
     @property
-    def held(self) -> int:
+    def constrained(self) -> int:
         """How many of its six velocities the floor can hold: the linear three, and the rest if it stands flat."""
-        return 6 if can_hold(np.array(self.points)) else 3
+        return 6 if form_polygon(np.array(self.points)) else 3
 
 
 def find_feet(settings: list[FootConfig], urdf: Path, source: object) -> tuple[Foot, ...]:
@@ -77,11 +89,6 @@ def find_feet(settings: list[FootConfig], urdf: Path, source: object) -> tuple[F
     return tuple(feet)
 
 
-def can_hold(points: Array) -> bool:
-    """Whether contact points, (k, 3) [m], do not all lie on a line."""
-    return len(points) > 2 and float(np.linalg.svd(points - points.mean(axis=0))[1][1]) > _NARROWEST
-
-
 def _sphere(urdf: Path, frame: str, shape: object) -> tuple[tuple[float, float, float], float] | None:
     """Centre and radius [m] of a collision shape in its link's frame, None unless it is a sphere."""
     sphere, origin = shape.find("geometry/sphere"), shape.find("origin")  # type: ignore[attr-defined]
@@ -97,18 +104,9 @@ def _sphere(urdf: Path, frame: str, shape: object) -> tuple[tuple[float, float, 
     return (x, y, z), radius
 
 
-try:
-    import mujoco
-except ImportError as error:
-    found = "needs MuJoCo, which " + ("is not installed" if error.name == "mujoco" else f"does not load: {error}")
-    raise InputError("torchid", "simulate", found, install("sim")) from error
-
-_WORLD = "world link"
-_DISCARDED = ("transmission", "gazebo", "material", "mujoco")
-_SPRING = (0.004, 1.0)  # time constant [s] and damping ratio of the floor; a softer one lets feet creep, by v^2
-_STICTION = (0.002, 1.0)  # the same of dry friction in a joint; MuJoCo's own lets joints creep at 0.1 rad/s
-_FRICTION = (1.0, 0.005, 0.0001)
-_SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction creeps
+def form_polygon(points: Array) -> bool:
+    """Whether contact points, (k, 3) [m], do not all lie on a line."""
+    return len(points) > 2 and float(np.linalg.svd(points - points.mean(axis=0))[1][1]) > _NARROWEST
 
 
 @dataclass(frozen=True)

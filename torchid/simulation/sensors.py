@@ -12,7 +12,7 @@ from torchid.errors import InputError
 from torchid.logs import Log
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
-from torchid.simulation.simulation import exact
+from torchid.simulation.simulation import require_field
 
 
 def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: str | None = None) -> Log:
@@ -31,7 +31,7 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         InputError: a delay of no sample, or of all.
     """
     name = name or truth.source
-    torque, wrench = exact(truth, "joint_torque"), exact(truth, "contact_wrench_local")
+    torque, wrench = require_field(truth, "joint_torque"), require_field(truth, "contact_wrench_local")
     if sensors.delay.enabled:
         step = float(np.median(np.diff(truth.time)))
         late = round(sensors.delay.feet_s / step)
@@ -41,7 +41,9 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         wrench = wrench[np.maximum(np.arange(len(truth)) - late, 0)]  # the first reading is held
     if sensors.bias.enabled:
         torque, wrench = _biased(torque, wrench, sensors, np.random.default_rng([seed, 0]))
-    position, base, turn = (exact(truth, f) for f in ("joint_position", "base_position_world", "base_quat_xyzw"))
+    position, base, turn = (
+        require_field(truth, f) for f in ("joint_position", "base_position_world", "base_quat_xyzw")
+    )
     if sensors.noise.enabled:
         rng, noise = np.random.default_rng([seed, 1, zlib.crc32(name.encode())]), sensors.noise
 

@@ -14,8 +14,8 @@ from torchid.logs import Log
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
 from torchid.simulation.controller import Controller, Stance, find_stance
-from torchid.simulation.motion import Motion
-from torchid.simulation.plant import Foot, Plant, can_hold, find_feet
+from torchid.simulation.motion import ReferenceMotion
+from torchid.simulation.plant import Foot, Plant, find_feet, form_polygon
 
 _REPORT_S = 0.25  # simulated seconds between two looks at how the robot stands
 
@@ -34,7 +34,7 @@ class Recording:
     rotations: Array
 
 
-def exact(log: Log, name: str) -> Array:
+def require_field(log: Log, name: str) -> Array:
     """A field of a truth log.
 
     Raises:
@@ -50,7 +50,7 @@ def record(
     plant: Plant,
     controller: Controller,
     stance: Stance,
-    motion: Motion,
+    motion: ReferenceMotion,
     config: SimulationConfig,
     source: object,
     progress: Callable[[float], None] | None = None,
@@ -139,7 +139,7 @@ class Stability:
     effort: float
     unloaded: tuple[float, ...]
 
-    def check(self, bounds: BoundsConfig, motion: str, source: object) -> None:
+    def require_within(self, bounds: BoundsConfig, motion: str, source: object) -> None:
         """Refuse a motion that the robot did not do standing.
 
         Raises:
@@ -174,7 +174,7 @@ def stability(
         InputError: a foot never bears that much.
     """
     log = recording.log
-    wrench = exact(log, "contact_wrench_local")
+    wrench = require_field(log, "contact_wrench_local")
     R = recording.rotations
     force, moment = ((R @ part[..., None])[..., 0] for part in (wrench[..., :3], wrench[..., 3:]))
     middles = recording.feet + np.einsum("nfij,fj->nfi", R, np.array([foot.middle for foot in feet]))
@@ -185,14 +185,14 @@ def stability(
             found = f"{load:g} N, but {foot.frame} never bears more than {most:.3g} N"
             raise InputError(source, "sensors.contact_threshold", found, "a fraction of what a standing foot bears")
     low, high = plant.limits.T
-    height = exact(log, "base_position_world")[:, 2]
+    height = require_field(log, "base_position_world")[:, 2]
     return Stability(
         (float(height.min()), float(height.max())),
         float(np.abs(height - stance.position[2]).max()),
         max(_slip(middles[:, i, :2], standing[:, i]) for i in range(len(feet))),
         _zmp_margin(recording.feet, force, moment, stance, feet),
         max(float((log.joint_position - high).max()), float((low - log.joint_position).max()), 0.0),
-        float(np.max(np.abs(exact(log, "joint_torque")) / plant.efforts)),
+        float(np.max(np.abs(require_field(log, "joint_torque")) / plant.efforts)),
         tuple(map(float, 1.0 - standing.mean(axis=0))),
     )
 
@@ -238,7 +238,7 @@ class Simulation:
     feet: tuple[Foot, ...]
     stance: Stance
 
-    def motion(self, config: MotionConfig) -> Motion:
+    def reference(self, config: MotionConfig) -> ReferenceMotion:
         """The goals of a motion.
 
         Raises:
@@ -246,12 +246,14 @@ class Simulation:
             InputError: it is too short, or lifts feet that the robot cannot do without.
         """
         frames = self.plant.foot_frames
-        motion = Motion(config, self.stance, self.plant.joint_names, frames, self.config.control_hz, self.source)
+        motion = ReferenceMotion(
+            config, self.stance, self.plant.joint_names, frames, self.config.control_hz, self.source
+        )
         for support in motion.supports:
-            self.check_support(support, f"motions.{config.name}.steps")
+            self.require_support(support, f"motions.{config.name}.steps")
         return motion
 
-    def check_support(self, support: BoolArray, field: str) -> None:
+    def require_support(self, support: BoolArray, field: str) -> None:
         """Refuse to stand on feet, (F,) bool, that cannot hold a robot.
 
         Raises:
@@ -259,7 +261,7 @@ class Simulation:
         """
         standing = zip(self.feet, self.stance.feet, self.stance.rotations, support, strict=True)
         points = [middle + foot.arms @ R.T for foot, middle, R, on in standing if on]
-        if not points or not can_hold(np.concatenate(points)):
+        if not points or not form_polygon(np.concatenate(points)):
             names = ", ".join(foot.frame for foot, on in zip(self.feet, support, strict=True) if on)
             found = f"stands on {names} alone, whose contact points lie on a line" if names else "no foot on the floor"
             raise InputError(self.source, field, found, "three points on the floor that do not, at any time")
@@ -276,11 +278,13 @@ class Simulation:
         """
         friction = self.config.friction.levels or (0.0, 0.0)
         controller = Controller(self.plant, self.feet, self.stance.rotations, friction)
-        recording = record(self.plant, controller, self.stance, self.motion(config), self.config, self.source, progress)
+        recording = record(
+            self.plant, controller, self.stance, self.reference(config), self.config, self.source, progress
+        )
         found = stability(
             recording, self.plant, self.stance, self.feet, self.config.sensors.contact_threshold, self.source
         )
-        found.check(self.config.bounds, config.name, self.source)
+        found.require_within(self.config.bounds, config.name, self.source)
         return recording, found
 
 
@@ -293,5 +297,5 @@ def set_up_simulation(config: SimulationConfig, source: object = "simulation") -
     feet = find_feet(config.feet, config.robot.urdf, source)
     plant = Plant(config.robot.urdf, feet, config.physics_hz, config.friction.levels)
     simulation = Simulation(config, source, plant, feet, find_stance(plant, feet, config.posture, source))
-    simulation.check_support(np.ones(len(feet), dtype=bool), "feet")
+    simulation.require_support(np.ones(len(feet), dtype=bool), "feet")
     return simulation

@@ -1,17 +1,15 @@
-"""The files of a bag, ROS 1, SQLite and MCAP: channels, and records on them, unpacked within limits."""
+"""Readers of the files of bags, ROS 1, SQLite and MCAP: channels and records, within limits on what they cost."""
 
 from __future__ import annotations
 
 import bz2
-import contextlib
 import functools
 import io
 import sqlite3
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -25,38 +23,8 @@ from mcap.records import Channel as McapChannel
 from mcap.records import Chunk, Message, Schema
 from rosbags import rosbag1
 
-from torchid.errors import LogError, install
-from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget, plain
-from torchid.logs.containers import translated
-from torchid.text import shown
-
-
-def expanded(data: bytes, compression: str, budget: Budget) -> bytes:
-    """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
-
-    Raises:
-        ValueError: another compression, or more bytes than the budget of the file has left.
-    """
-    limit = budget.most()
-    if compression in ("", "none"):
-        out = data
-    elif compression == "bz2":
-        out = bz2.BZ2Decompressor().decompress(data, limit + 1)
-    elif compression == "lz4":
-        out = lz4.frame.LZ4FrameDecompressor().decompress(data, limit + 1)
-    elif compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
-            out = stream.read(limit + 1)
-    else:
-        raise ValueError(f"chunks compressed by '{shown(compression)}'")
-    if len(out) > limit:
-        raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
-    budget.expand(len(out))
-    return out
-
-
-#: What bags of any kind are read with.
-_PACKAGES = ("rosbags", "mcap", "zstandard")
+from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget, require_plain_name
+from torchid.text import excerpt
 
 
 @dataclass(frozen=True)
@@ -70,7 +38,7 @@ class Channel:
     def __post_init__(self) -> None:
         """Refuse what no message can show."""
         for text in (self.topic, self.type, self.encoding):
-            plain(text)
+            require_plain_name(text)
 
 
 @dataclass(frozen=True)
@@ -94,29 +62,6 @@ class BagFile(Protocol):
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
         """The messages of some topics, in any order."""
-
-
-@contextlib.contextmanager
-def open_bag_file(path: Path) -> Iterator[BagFile]:
-    """Open a .bag, .mcap or .db3 file.
-
-    Raises:
-        LogError: it is damaged, and so does what is read later; or its reader is not installed.
-    """
-    suffix = path.suffix.lower()
-    try:
-        import mcap  # noqa: F401
-        import rosbags.rosbag1  # noqa: F401
-        import zstandard  # noqa: F401
-    except ImportError as error:
-        absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
-        found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
-        raise LogError(path, "file", found, install("ros")) from error
-
-    readers: dict[str, Callable[[Path], BagFile]] = {".bag": Ros1File, ".mcap": McapFile, ".db3": SqliteFile}
-    accepted = f"a complete {suffix} file of ROS messages"
-    with translated(str(path), "file", accepted), contextlib.closing(readers[suffix](path)) as file:
-        yield file
 
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -168,7 +113,7 @@ class McapFile:
             raise ValueError("no MCAP file")
         for record in _records(self._stream, True, messages, budget):
             if isinstance(record, Chunk):
-                data = expanded(record.data, record.compression, budget)
+                data = decompress_chunk(record.data, record.compression, budget)
                 if record.uncompressed_crc and zlib.crc32(data) != record.uncompressed_crc:
                     raise ValueError("a chunk that does not match its checksum")
                 yield from _records(BytesIO(data), False, messages, budget)
@@ -230,7 +175,9 @@ class _Reader(rosbag1.Reader):
         stream.seek(start)
         compression = rosbag1.reader.Header.read(stream).get_string("compression")
         stream.seek(end)
-        return chunk._replace(decompressor=functools.partial(expanded, compression=compression, budget=self.budget))
+        return chunk._replace(
+            decompressor=functools.partial(decompress_chunk, compression=compression, budget=self.budget)
+        )
 
     def read_index_data(self, pos: int, indexes: Any) -> None:
         """As before, but every part of the index once."""
@@ -320,3 +267,27 @@ class SqliteFile:
             if not (isinstance(received, int) and isinstance(data, bytes) and len(data) <= MAX_RECORD):
                 raise ValueError(f"message {i} has no time or no data")
             yield Record(names[topic], received, data, i / total)
+
+
+def decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
+    """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
+
+    Raises:
+        ValueError: another compression, or more bytes than the budget of the file has left.
+    """
+    limit = budget.most()
+    if compression in ("", "none"):
+        out = data
+    elif compression == "bz2":
+        out = bz2.BZ2Decompressor().decompress(data, limit + 1)
+    elif compression == "lz4":
+        out = lz4.frame.LZ4FrameDecompressor().decompress(data, limit + 1)
+    elif compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True) as stream:
+            out = stream.read(limit + 1)
+    else:
+        raise ValueError(f"chunks compressed by '{excerpt(compression)}'")
+    if len(out) > limit:
+        raise ValueError(f"a chunk of {len(data)} bytes that stands for more than {limit}")
+    budget.expand(len(out))
+    return out

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import warnings
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, TorchidWarning, UnknownNameError
-from torchid.guards import MAX_ARRAYS, check_names, plain
+from torchid.errors import FieldError, UnknownNameError, current_file, warn
+from torchid.guards import MAX_ARRAYS, check_names, require_plain_name
 from torchid.logs.log import FloatArray
-from torchid.logs.ros.files import Channel
+
+if TYPE_CHECKING:
+    from torchid.logs.ros.files import Channel
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _JOINT_FIELDS = {"position": "joint_position", "velocity": "joint_velocity", "effort": "joint_torque"}
@@ -33,7 +34,7 @@ class Decoder(Protocol):
         """What rows (N, k) mean."""
 
 
-def deserializer(source: str, topic: str, channel: Channel) -> Callable[[bytes], Any]:
+def make_deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
     """What makes messages of the bytes on a channel, by the definitions of ROS itself and never those in the bag.
 
     Raises:
@@ -41,13 +42,13 @@ def deserializer(source: str, topic: str, channel: Channel) -> Callable[[bytes],
     """
     store = _typestore(channel.encoding)
     if store is None:
-        raise LogError(source, topic, f"messages serialized as '{channel.encoding}'", "cdr (ROS 2) or ros1")
+        raise FieldError(topic, f"messages serialized as '{channel.encoding}'", "cdr (ROS 2) or ros1")
     if channel.encoding == "ros1":
         return lambda data: store.deserialize_ros1(data, channel.type)
 
     def deserialize(data: bytes) -> Any:
         if data.startswith(_ZSTD):
-            raise LogError(source, topic, "messages compressed one by one", "a bag without message compression")
+            raise FieldError(topic, "messages compressed one by one", "a bag without message compression")
         return store.deserialize_cdr(data, channel.type)
 
     return deserialize
@@ -64,13 +65,15 @@ def _typestore(encoding: str) -> Any:
 class _Constant:
     """A text that all messages of a topic have to share."""
 
-    def __init__(self, source: str, topic: str, field: str) -> None:
-        self._where, self._field, self.value = (source, topic), field, ""
+    def __init__(self, topic: str, field: str) -> None:
+        self._topic, self._field, self.value = topic, field, ""
 
     def check(self, value: str) -> None:
-        self.value = self.value or plain(value)
+        self.value = self.value or require_plain_name(value)
         if value != self.value:
-            raise LogError(*self._where, f"{self._field} '{self.value}', then '{plain(value)}'", f"one {self._field}")
+            raise FieldError(
+                self._topic, f"{self._field} '{self.value}', then '{require_plain_name(value)}'", f"one {self._field}"
+            )
 
 
 class JointStates:
@@ -78,10 +81,10 @@ class JointStates:
 
     types: tuple[str, ...] = ("sensor_msgs/msg/JointState",)
 
-    def __init__(self, source: str, topic: str, joints: list[str] | None) -> None:
+    def __init__(self, topic: str, joints: list[str] | None) -> None:
         """Take the given joints, or those of the first message."""
         self.names = tuple(joints or ())
-        self._given, self._where = joints is not None, (source, topic)
+        self._given, self._topic = joints is not None, topic
         self._parts: tuple[str, ...] = ()
         self._orders: dict[tuple[str, ...], list[int] | slice | None] = {}
 
@@ -97,7 +100,7 @@ class JointStates:
         if names not in self._orders:
             check_names([len(names)])
             for name in names:
-                plain(name)
+                require_plain_name(name)
             self._orders[names] = self._order(names)
         order = self._orders[names]
         if order is None:
@@ -107,15 +110,15 @@ class JointStates:
         if parts != self._parts or "position" not in parts:
             found = f"a message with {' and '.join(parts) or 'nothing'}"
             accepted = f"positions, and in every message {' and '.join(self._parts) or 'the same'}"
-            raise LogError(*self._where, found, accepted)
+            raise FieldError(self._topic, found, accepted)
         values = [getattr(message, part) for part in parts]
         if any(len(x) != len(names) for x in values):
-            raise LogError(*self._where, f"{[len(x) for x in values]} values of {len(names)} names", "one per name")
+            raise FieldError(self._topic, f"{[len(x) for x in values]} values of {len(names)} names", "one per name")
         return np.concatenate([x[order] for x in values])
 
     def _order(self, names: tuple[str, ...]) -> list[int] | slice | None:
         if len(set(names)) != len(names):
-            raise LogError(*self._where, f"names {', '.join(names[:4])}, ... that repeat", "joints of different names")
+            raise FieldError(self._topic, f"names {', '.join(names[:4])}, ... that repeat", "joints of different names")
         self.names = self.names or names
         known = {name: i for i, name in enumerate(names)}
         missing = [name for name in self.names if name not in known]
@@ -124,7 +127,7 @@ class JointStates:
         if missing or (not self._given and len(names) != len(self.names)):
             found = f"a message without {missing[0]}" if missing else f"a message with {len(names)} joints"
             accepted = f"all {len(self.names)} joints in every message, or joint_states.joints with those that are"
-            raise LogError(*self._where, found, accepted)
+            raise FieldError(self._topic, found, accepted)
         order = [known[name] for name in self.names]
         return slice(None) if order == list(range(len(names))) else order  # which need not be copied
 
@@ -139,16 +142,16 @@ class Imu:
 
     types: tuple[str, ...] = ("sensor_msgs/msg/Imu",)
 
-    def __init__(self, source: str, topic: str) -> None:
+    def __init__(self, topic: str) -> None:
         """For the messages of a topic."""
-        self.frame, self._where = _Constant(source, topic, "header.frame_id"), (source, topic)
+        self.frame, self._topic = _Constant(topic, "header.frame_id"), topic
 
     def row(self, message: Any) -> FloatArray:
         """Specific force and angular velocity."""
         self.frame.check(message.header.frame_id)
         for part in ("linear_acceleration", "angular_velocity"):
             if getattr(message, f"{part}_covariance")[0] == -1.0:
-                raise LogError(*self._where, f"no {part} (the first of its covariances is -1)", "an IMU with both")
+                raise FieldError(self._topic, f"no {part} (the first of its covariances is -1)", "an IMU with both")
         return np.array([*_vector(message.linear_acceleration), *_vector(message.angular_velocity)])
 
     def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
@@ -161,9 +164,9 @@ class Odometry:
 
     types: tuple[str, ...] = ("nav_msgs/msg/Odometry",)
 
-    def __init__(self, source: str, topic: str, twist: str) -> None:
+    def __init__(self, topic: str, twist: str) -> None:
         """With the twist in the frame `child` or `world`, or `none`."""
-        self.frame, self._twist = _Constant(source, topic, "child_frame_id"), twist
+        self.frame, self._twist = _Constant(topic, "child_frame_id"), twist
 
     def row(self, message: Any) -> FloatArray:
         """Position, orientation (xyzw), linear and angular velocity."""
@@ -187,9 +190,9 @@ class Wrench:
 
     types: tuple[str, ...] = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 
-    def __init__(self, source: str, topic: str, sign: int) -> None:
+    def __init__(self, topic: str, sign: int) -> None:
         """With the sign that makes it the environment's or the parent side's action."""
-        self.frame, self._sign = _Constant(source, topic, "header.frame_id"), sign
+        self.frame, self._sign = _Constant(topic, "header.frame_id"), sign
 
     def row(self, message: Any) -> FloatArray:
         """Force and moment."""
@@ -204,7 +207,7 @@ class Wrench:
         return {"wrench": rows if self._sign == 1 else -rows}
 
 
-class Flag:
+class ContactFlag:
     """`std_msgs/Bool`."""
 
     types: tuple[str, ...] = ("std_msgs/msg/Bool",)
@@ -226,7 +229,7 @@ Stamps = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
+class TopicSeries:
     """What one topic says: stamps (N,) [ns], strictly increasing, and the fields of a log (N, ...).
 
     `stamped`: whether the stamps are the messages' own, and not the times of receipt.
@@ -238,12 +241,12 @@ class Series:
     stamped: bool = True
 
 
-class Rows:
+class TopicMessages:
     """Messages of a topic as they arrive."""
 
-    def __init__(self, source: str, topic: str, decoder: Decoder) -> None:
+    def __init__(self, topic: str, decoder: Decoder) -> None:
         """Start without any."""
-        self.topic, self._source, self._decoder = topic, source, decoder
+        self.topic, self._decoder = topic, decoder
         self._stamps, self._received, self._values = array("q"), array("q"), array("d")
 
     def add(self, message: Any, received: int) -> None:
@@ -256,9 +259,9 @@ class Rows:
         self._received.append(received)
         self._values.frombytes(np.asarray(row, dtype=np.float64).tobytes())
         if 8 * len(self._values) > MAX_ARRAYS:
-            raise LogError(self._source, self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
+            raise FieldError(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
 
-    def series(self) -> Series:
+    def series(self) -> TopicSeries:
         """All messages in the order of their stamps, each once.
 
         Raises:
@@ -270,9 +273,9 @@ class Rows:
         """
         if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.others:
             place, (name, *_) = "logs.topics.joint_states.joints", self._decoder.names
-            raise UnknownNameError(self._source, place, name, self._decoder.others)
+            raise UnknownNameError(current_file(), place, name, self._decoder.others)
         if not self._stamps:
-            raise LogError(self._source, self.topic, "no messages", "at least one")
+            raise FieldError(self.topic, "no messages", "at least one")
         stamps: Stamps = np.array(self._stamps, dtype=np.int64)
         rows: FloatArray = np.array(self._values, dtype=np.float64).reshape(len(stamps), -1)
         stamped = bool(stamps.any())
@@ -287,8 +290,8 @@ class Rows:
             if differ.any():
                 at = stamps[again[np.argmax(differ)]] / 1e9
                 found = f"messages of different content with one stamp, {at:.9f} s"
-                raise LogError(self._source, self.topic, found, "every stamp once")
-            message = f"{self._source}: {self.topic}: {len(again)} messages come twice; each counts once"
-            warnings.warn(message, TorchidWarning, stacklevel=4)
+                raise FieldError(self.topic, found, "every stamp once")
+            message = f"{current_file()}: {self.topic}: {len(again)} messages come twice; each counts once"
+            warn(message)
             stamps, rows = np.delete(stamps, again), np.delete(rows, again, axis=0)
-        return Series(self.topic, stamps, self._decoder.fields(rows), stamped)
+        return TopicSeries(self.topic, stamps, self._decoder.fields(rows), stamped)

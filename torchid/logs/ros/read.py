@@ -2,41 +2,43 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import LogError, TorchidWarning, UnknownNameError
-from torchid.logs.containers import bag_files
-from torchid.logs.log import FloatArray, is_quaternion, unit_quaternion
-from torchid.logs.quaternion import sign_continuous
-from torchid.logs.ros.files import Channel, open_bag_file
+from torchid.errors import FieldError, LogError, UnknownNameError, current_file, how_to_install, warn
+from torchid.logs.containers import list_bag_files, reader_errors_explained
+from torchid.logs.log import FloatArray, is_quaternion, normalize_quaternions
+from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.ros.messages import (
+    ContactFlag,
     Decoder,
-    Flag,
     Imu,
     JointStates,
     Odometry,
-    Rows,
-    Series,
     Stamps,
+    TopicMessages,
+    TopicSeries,
     Wrench,
-    deserializer,
+    make_deserializer,
 )
 from torchid.logs.ros.topics import ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
 from torchid.logs.timeline import LONGEST_STEP, spline_derivatives
 
+if TYPE_CHECKING:
+    from torchid.logs.ros.files import BagFile, Channel
+
 
 @dataclass(frozen=True, eq=False)
-class Clock:
+class CommonClock:
     """The stamps (N,) [ns] of a log: those of one topic within the time that all topics cover."""
 
-    source: str
     stamps: Stamps
 
     @property
@@ -48,7 +50,7 @@ class Clock:
         """Other stamps (K,) [ns] in seconds of this clock."""
         return (stamps - self.stamps[0]) / 1e9
 
-    def aligned(self, series: Series) -> dict[str, FloatArray]:
+    def aligned(self, series: TopicSeries) -> dict[str, FloatArray]:
         """The fields of a topic at the log's stamps: as they are where it has these, by a quintic spline elsewhere.
 
         Quaternions are interpolated as in `preprocess`, component by component without sign flips, then normalised.
@@ -66,11 +68,11 @@ class Clock:
         run = self._unbroken(series)
         return {name: self._interpolated(series, run, name) for name in series.fields}
 
-    def held(self, series: Series, values: FloatArray) -> FloatArray:
+    def held(self, series: TopicSeries, values: FloatArray) -> FloatArray:
         """Values (K, ...) of a topic as they were last said, (N, ...)."""
         return np.asarray(values[np.searchsorted(series.stamps, self.stamps, side="right") - 1])
 
-    def _unbroken(self, series: Series) -> slice:
+    def _unbroken(self, series: TopicSeries) -> slice:
         """The samples around the log's time without a gap across which an interpolation would invent what happened."""
         steps = np.diff(series.stamps)
         long = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) if len(steps) else steps
@@ -80,31 +82,32 @@ class Clock:
             at = self.seconds(series.stamps[inside])[0]
             found = f"a gap of {step:.4g} s from {at:.4g} s on, where the median step is {median:.4g} s"
             accepted = f"steps of at most {LONGEST_STEP:g} median steps: cut the bag there"
-            raise LogError(self.source, series.topic, found, accepted)
+            raise FieldError(series.topic, found, accepted)
         before, after = np.searchsorted(series.stamps[long], self.stamps[[0, -1]])
         start = int(long[before - 1]) + 1 if before else 0
         return slice(start, int(long[after]) + 1 if after < len(long) else len(series.stamps))
 
-    def _interpolated(self, series: Series, run: slice, name: str) -> FloatArray:
+    def _interpolated(self, series: TopicSeries, run: slice, name: str) -> FloatArray:
         values, stamps = series.fields[name][run], self.seconds(series.stamps[run])
         if is_quaternion(name):
-            quat = sign_continuous(unit_quaternion(self.source, f"{series.topic}: {name}", values))
+            quat = make_sign_continuous(normalize_quaternions(f"{series.topic}: {name}", values))
             quat = spline_derivatives(stamps, quat, self.time, (0,))[0]
             return np.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True))
         gaps = np.isnan(values).any(axis=0)
         if gaps.any() and not np.isnan(values[:, gaps]).all():
-            message = f"{self.source}: {series.topic}: NaN in part of {name}: NaN throughout after interpolation"
-            warnings.warn(message, TorchidWarning, stacklevel=6)
+            message = f"{current_file()}: {series.topic}: NaN in part of {name}: NaN throughout after interpolation"
+            warn(message)
         out = np.full((len(self.stamps), values.shape[1]), np.nan)
         out[:, ~gaps] = spline_derivatives(stamps, values[:, ~gaps], self.time, (0,))[0]
         return out
 
 
-def clock_of(source: str, rate: Series, others: Mapping[str, Series], events: Mapping[str, Series]) -> Clock:
+def make_common_clock(
+    rate: TopicSeries, others: Mapping[str, TopicSeries], events: Mapping[str, TopicSeries]
+) -> CommonClock:
     """The stamps of the topic `rate` within the time that all topics cover.
 
     Args:
-        source: the bag.
         rate: whose stamps the log takes.
         others: sampled topics, by role.
         events: topics of which a message holds until the next.
@@ -122,8 +125,12 @@ def clock_of(source: str, rate: Series, others: Mapping[str, Series], events: Ma
         found = (
             f"{late.topic} starts at {late.stamps[0] / 1e9:.3f} s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
         )
-        raise LogError(source, "time", f"no stamp of {rate.topic} that all topics cover: {found}", "one common clock")
-    return Clock(source, stamps)
+        raise FieldError("time", f"no stamp of {rate.topic} that all topics cover: {found}", "one common clock")
+    return CommonClock(stamps)
+
+
+#: What bags of any kind are read with.
+_PACKAGES = ("rosbags", "mcap", "lz4", "zstandard")
 
 
 _EVENT = "contact_active"
@@ -135,11 +142,10 @@ _REPORT_EVERY, _LISTED = 1000, 30
 class _Bag:
     """A bag with what its topics are used for; several roles may share a topic."""
 
-    source: str
     topics: Topics
     channels: Mapping[str, Channel]
     decoders: dict[str, Decoder] = field(default_factory=dict)
-    rows: dict[str, Rows] = field(default_factory=dict)
+    rows: dict[str, TopicMessages] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Look every topic up."""
@@ -148,11 +154,11 @@ class _Bag:
                 continue
             name, place = topic.topic, f"logs.topics.{role}"
             if name not in self.channels:
-                raise UnknownNameError(self.source, place, name, self.channels)
-            decoder, given = _decoder(self.source, topic), self.channels[name].type
+                raise UnknownNameError(current_file(), place, name, self.channels)
+            decoder, given = _decoder(topic), self.channels[name].type
             if given not in decoder.types:
-                raise LogError(self.source, place, f"{name} carries {given}", " or ".join(decoder.types))
-            self.decoders[role], self.rows[role] = decoder, Rows(self.source, name, decoder)
+                raise FieldError(place, f"{name} carries {given}", " or ".join(decoder.types))
+            self.decoders[role], self.rows[role] = decoder, TopicMessages(name, decoder)
 
 
 def read_bag(
@@ -173,9 +179,9 @@ def read_bag(
         TorchidWarning: messages without stamps, messages that come twice, channels that are NaN in part, a frame that
             is not the one expected or that nothing says to expect.
     """
-    source, files = str(path), bag_files(path)
+    files = list_bag_files(path)
     if topics is not None:
-        check_topics(source, topics)
+        check_topics(path, topics)
     channels: dict[str, Channel] = {}
     for file in files:
         with open_bag_file(file) as opened:
@@ -183,19 +189,19 @@ def read_bag(
                 first = channels.setdefault(channel.topic, channel)
                 if first != channel:
                     found = f"both {first.type} and {channel.type}"
-                    raise LogError(source, channel.topic, found, "one type of message per topic")
+                    raise FieldError(channel.topic, found, "one type of message per topic")
     if topics is None:
-        raise LogError(source, "logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
-    bag = _Bag(source, topics, channels)
+        raise FieldError("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
+    bag = _Bag(topics, channels)
     _read(bag, files, progress or (lambda share: None))
     series = {role: rows.series() for role, rows in bag.rows.items()}
     unstamped = dict.fromkeys(x.topic for x in series.values() if not x.stamped)
     if unstamped:
         what = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
-        warnings.warn(f"{source}: {', '.join(unstamped)}: {what}", TorchidWarning, stacklevel=3)
+        warn(f"{current_file()}: {', '.join(unstamped)}: {what}")
     sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
     events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
-    clock = clock_of(source, sampled[topics.rate_topic], sampled, events)
+    clock = make_common_clock(sampled[topics.rate_topic], sampled, events)
     return {
         "time": clock.time,
         **_motion(bag, clock, series),
@@ -204,28 +210,50 @@ def read_bag(
     }
 
 
+@contextmanager
+def open_bag_file(path: Path) -> Iterator[BagFile]:
+    """Open a .bag, .mcap or .db3 file.
+
+    Raises:
+        LogError: it is damaged, and so does what is read later; or its reader is not installed.
+    """
+    suffix = path.suffix.lower()
+    try:
+        # here: only those who read bags need the libraries of its readers
+        from torchid.logs.ros.files import McapFile, Ros1File, SqliteFile
+    except ImportError as error:
+        absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
+        found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
+        raise LogError(path, "file", found, how_to_install("ros")) from error
+
+    readers: dict[str, Callable[[Path], BagFile]] = {".bag": Ros1File, ".mcap": McapFile, ".db3": SqliteFile}
+    accepted = f"a complete {suffix} file of ROS messages"
+    with reader_errors_explained("file", accepted), closing(readers[suffix](path)) as file:
+        yield file
+
+
 def _listed(channels: Mapping[str, Channel]) -> str:
     shown = [f"{name} ({channel.type})" for name, channel in list(channels.items())[:_LISTED]]
     more = len(channels) - len(shown)
     return (", ".join(shown) or "no topics") + (f", and {more} more" if more else "")
 
 
-def _decoder(source: str, topic: object) -> Decoder:
+def _decoder(topic: object) -> Decoder:
     if isinstance(topic, JointTopic):
-        return JointStates(source, topic.topic, topic.joints)
+        return JointStates(topic.topic, topic.joints)
     if isinstance(topic, ImuTopic):
-        return Imu(source, topic.topic)
+        return Imu(topic.topic)
     if isinstance(topic, OdometryTopic):
-        return Odometry(source, topic.topic, topic.twist)
-    return Wrench(source, topic.topic, topic.sign) if isinstance(topic, WrenchTopic) else Flag()
+        return Odometry(topic.topic, topic.twist)
+    return Wrench(topic.topic, topic.sign) if isinstance(topic, WrenchTopic) else ContactFlag()
 
 
 def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> None:
     """Decode every message of the topics in use."""
-    users: dict[str, list[Rows]] = {}
+    users: dict[str, list[TopicMessages]] = {}
     for rows in bag.rows.values():
         users.setdefault(rows.topic, []).append(rows)
-    make = {topic: deserializer(bag.source, topic, bag.channels[topic]) for topic in users}
+    make = {topic: make_deserializer(topic, bag.channels[topic]) for topic in users}
     for i, file in enumerate(files):
         with open_bag_file(file) as opened:
             for n, record in enumerate(opened.records(users.keys())):
@@ -236,7 +264,7 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
                     progress((i + record.share) / len(files))
 
 
-def _motion(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+def _motion(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Joints, base and IMU."""
     out: dict[str, NDArray[Any]] = {}
     for role in ("joint_states", "odometry", "imu"):
@@ -251,12 +279,12 @@ def _motion(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, 
             frame = bag.topics.imu.frame or decoder.frame.value.removeprefix("/")
             if not frame:
                 accepted = "logs.topics.imu.frame, the frame of the URDF it sits at"
-                raise LogError(bag.source, bag.topics.imu.topic, "no header.frame_id", accepted)
+                raise FieldError(bag.topics.imu.topic, "no header.frame_id", accepted)
             out["imu_frame"] = np.array(frame)
     return out
 
 
-def _contacts(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+def _contacts(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Contacts in the order of `Topics.contacts`; NaN for the wrench of one without a topic."""
     names = bag.topics.contacts
     if not names:
@@ -272,7 +300,7 @@ def _contacts(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str
     return out
 
 
-def _active(bag: _Bag, clock: Clock, series: Mapping[str, Series], name: str) -> NDArray[np.bool_]:
+def _active(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
     """Whether a contact touches, (N,), as was last said or as its force was last."""
     if name in bag.topics.contact_active:
         said = series.get(f"contact_active.{name}")
@@ -284,17 +312,17 @@ def _active(bag: _Bag, clock: Clock, series: Mapping[str, Series], name: str) ->
         force = np.linalg.norm(measured.fields["wrench"][:, :3], axis=1)
     if np.isnan(force).any() or threshold is None:
         accepted = "forces to compare with contact_force_threshold, or contact_active"
-        raise LogError(bag.source, measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
+        raise FieldError(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
     return clock.held(measured, force) > threshold
 
 
 def _wrench(
-    bag: _Bag, clock: Clock, series: Mapping[str, Series], role: str, nothing: FloatArray | None = None
+    bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries], role: str, nothing: FloatArray | None = None
 ) -> FloatArray:
     return clock.aligned(series[role])["wrench"] if nothing is None or role in series else nothing
 
 
-def _ft_sensors(bag: _Bag, clock: Clock, series: Mapping[str, Series]) -> dict[str, NDArray[Any]]:
+def _ft_sensors(bag: _Bag, clock: CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     names = tuple(bag.topics.ft_wrenches)
     if not names:
         return {}
@@ -317,5 +345,5 @@ def _check_frame(bag: _Bag, role: str, expected: str | None, otherwise: str = ""
     if found and (expected is None or found.removeprefix("/") != expected.removeprefix("/")):
         taken_for = otherwise if expected is None else f"'{expected}'"
         what = f"frame '{found}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
-        message = f"{bag.source}: {bag.rows[role].topic}: {what}"
-        warnings.warn(message, TorchidWarning, stacklevel=5)
+        message = f"{current_file()}: {bag.rows[role].topic}: {what}"
+        warn(message)

@@ -1,0 +1,400 @@
+"""`torchid analyze`: answers in a folder, and a slip answered in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from demo import shortened_demo
+from refusals import files_in, refusal
+from synthetic import Oracle
+
+import torchid
+from torchid.cli import main
+from torchid.commands.analyze import analyze
+from torchid.commands.reading import LogReader
+from torchid.config import load_analysis
+from torchid.errors import TorchidWarning
+from torchid.identifiability.expected_error import ExpectedErrors
+from torchid.problem.metrics import ROW_GROUPS
+from torchid.report.analysis import SetAccuracy, accuracy_figure, describe_losses
+from torchid.report.tree_figure import tree_figure
+from torchid.sensor_planning.observability import BaseObservability, PostureSummary
+
+LEGS = ("front_left", "front_right", "rear_left", "rear_right")
+FEET = tuple(f"{leg}_foot" for leg in LEGS)
+TORQUES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "thigh", "knee"))
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's robot and shortened logs."""
+    return shortened_demo(tmp_path_factory.mktemp("analysis") / "experiment", 800)
+
+
+def asked(folder: Path, **settings: Any) -> Path:
+    """An experiment file that asks something of the demo's robot."""
+    content: dict[str, Any] = {
+        "robot": {"urdf": str(folder / "quadruped.urdf")},
+        "contacts": [{"frame": foot, "type": "point"} for foot in FEET],
+        "output": str(folder / "out"),
+    }
+    path = folder / "asked.yaml"
+    path.write_text(yaml.safe_dump(content | settings))
+    return path
+
+
+@pytest.fixture(scope="module")
+def with_logs(experiment: Path) -> tuple[Path, dict[str, Any]]:
+    """The folder and the answers of a run with logs, a proposed set that lacks one knee, and two sets to compare."""
+    file = asked(
+        experiment,
+        logs={"train": ["sway_train.npz"], "test": ["sway_test.npz"]},
+        preprocessing={"cutoff_hz": 8},
+        sensors={"joint_torques": [*TORQUES[:-1]], "noise": {"joint_torque": 0.1, "contact_force": 0.5}},
+        estimator={"name": "least_squares", "ridge": 0.001},
+        analysis={"compare": {"full": "full", "feet": "contacts"}},
+        output=str(experiment / "with_logs"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    folder = experiment / "with_logs.analysis"
+    return folder, json.loads((folder / "analysis.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def without_logs(experiment: Path) -> tuple[Path, dict[str, Any]]:
+    """The answers of a run with neither logs nor sensors, in two scenarios."""
+    scenarios = {"stand": [list(FEET)], "trot": [["front_left_foot", "rear_right_foot"], list(FEET[1:3]), []]}
+    file = asked(
+        experiment,
+        analysis={"scenarios": scenarios, "keep": ["front_left_foot"], "exclude": ["rear_left_knee"]},
+        output=str(experiment / "without_logs"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    folder = experiment / "without_logs.analysis"
+    return folder, json.loads((folder / "analysis.json").read_text())
+
+
+def test_the_folder_holds_answers_words_and_pictures(
+    with_logs: tuple[Path, dict[str, Any]], without_logs: tuple[Path, dict[str, Any]]
+) -> None:
+    always = {"analysis.json", "base_parameters.txt", "config.yaml", "manifest.json"}
+    assert set(files_in(with_logs[0])) == always | {"sensors-logs.png", "accuracy.png"}
+    assert set(files_in(without_logs[0])) == always | {"sensors-stand.png", "sensors-trot.png"}
+    words = (with_logs[0] / "base_parameters.txt").read_text()
+    assert max(map(len, words.splitlines())) <= 100
+    assert "m[trunk] + m[front_left_hip_link]" in words
+
+
+def test_a_proposed_set_is_checked_and_its_cure_is_named(with_logs: tuple[Path, dict[str, Any]]) -> None:
+    (scenario,) = with_logs[1]["scenarios"].values()
+    lame = [check for check in scenario["proposed"] if check["lost"] is not None]
+    assert {check["random_postures"]["rank"] for check in lame} == {5}
+    assert all("rear_right_foot" in check["state"] for check in lame)
+    for check in lame:
+        (lacking,) = check["lost"]["lacking"]
+        assert lacking == {"contacts": ["rear_right_foot"], "sensors": 1}
+        assert set(check["lost"]["would_help"]) == {"rear_right_knee", "rear_right_foot"}
+    assert any("rear_right_foot" not in check["state"] for check in scenario["proposed"])
+
+
+def test_the_plan_is_the_smallest_and_says_what_each_sensor_is_for(with_logs: tuple[Path, dict[str, Any]]) -> None:
+    (plan,) = with_logs[1]["scenarios"].values()
+    assert plan["proven"]
+    assert plan["cost"] == plan["lower_bound"] == 12
+    assert {need["sensors"] for need in plan["needs"]} == {3}
+    assert all(check["random_postures"]["rank"] == 6 for check in plan["checks"])
+    for part in plan["parts"]:
+        bits = [found["bits"] for found in part["cheapest"]]
+        assert bits == sorted(bits, reverse=True)
+        assert len(part["minimal_sets"]) == 2
+    assert {without["base_rank"] for without in plan["without"]} == {5}
+
+
+def test_expected_errors_are_of_the_size_of_the_measured_ones(with_logs: tuple[Path, dict[str, Any]]) -> None:
+    accuracy = with_logs[1]["accuracy"]
+    assert set(accuracy) == {"proposed", "full", "feet", "planned for logs"}
+    for found in accuracy.values():
+        for group, expected in found["expected"].items():
+            assert expected / 3.0 < found["measured"][group] < 3.0 * expected, group
+    torque = {name: found["expected"]["joint_torque"] for name, found in accuracy.items()}
+    assert torque["full"] == min(torque.values())
+
+
+def test_scenarios_are_answered_one_by_one_and_sensors_are_kept_and_excluded(
+    without_logs: tuple[Path, dict[str, Any]],
+) -> None:
+    stand, trot = without_logs[1]["scenarios"].values()
+    assert without_logs[1]["accuracy"] is None
+    assert (stand["contact_states"], trot["contact_states"][-1]) == ([list(FEET)], [])
+    for plan in (stand, trot):
+        assert plan["proposed"] is None
+        assert {"front_left_foot", "rear_left_foot"} <= set(plan["sensors"])  # the latter for want of a knee
+        assert "rear_left_knee" not in plan["sensors"]
+    assert stand["stack"]["full"] == 94
+
+
+def test_the_stack_of_all_samples_needs_far_fewer_sensors(experiment: Path) -> None:
+    file = asked(
+        experiment,
+        analysis={"scenarios": {"step": [list(FEET), list(FEET[1:])]}, "criterion": "stack"},
+        output=str(experiment / "stack"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    plan = json.loads((experiment / "stack.analysis" / "analysis.json").read_text())["scenarios"]["step"]
+    assert plan["stack"]["rank"] == plan["stack"]["full"]
+    assert plan["cost"] < 12
+    assert all(without["stack_rank"] < plan["stack"]["full"] for without in plan["without"])
+
+
+REFUSED = {
+    "a scenario with an unknown frame": ({"scenarios": {"stand": [["paw"]]}}, "analysis.scenarios.stand", "'paw'"),
+    "no scenario": ({"scenarios": {}}, "analysis.scenarios", "an empty mapping"),
+    "a scenario without states": ({"scenarios": {"stand": []}}, "analysis.scenarios.stand", "an empty list"),
+    "a scenario that is no file name": ({"scenarios": {"a/b": [[]]}}, "analysis.scenarios.a/b:", "a name of letters"),
+    "scenarios without names": ({"scenarios": [[[]]]}, "analysis.scenarios", "accepted: a mapping"),
+    "a kept sensor that is no candidate": ({"keep": ["knee"]}, "analysis.keep", "'knee'"),
+    "an excluded sensor that is no candidate": ({"exclude": ["front_left_foot.fx"]}, "analysis.exclude", "foot.fx'"),
+    "a sensor kept and excluded": (
+        {"keep": ["rear_left_knee"], "exclude": ["rear_left_knee"]}, "rear_left_knee", "one or the other",
+    ),
+    "a candidate joint that does not exist": (
+        {"candidates": {"joint_torques": ["knee"]}}, "analysis.candidates.joint_torques", "'knee'",
+    ),
+    "a cost of nothing": ({"costs": {"joint_torque": 0}}, "analysis.costs.joint_torque", "greater than 0"),
+    "a cost of an unknown sensor": ({"costs": {"elbow": 2}}, "analysis.costs", "'elbow'"),
+    "an unknown criterion": ({"criterion": "sample"}, "analysis.criterion", "'per_sample' or 'stack'"),
+    "an unknown key": ({"scenario": {}}, "analysis", "scenarios"),
+    "candidates that do not suffice": (
+        {"candidates": {"contacts": "none"}, "exclude": ["rear_left_knee"]}, "candidates", "rear_left_foot",
+    ),
+    "sets to compare without logs": ({"compare": {"full": "full"}}, "analysis.compare", "logs.train"),
+    "a set to compare that is empty": ({"compare": {"none": {}}}, "analysis.compare.none", "no sensor"),
+    "a set to compare that reads nothing": (
+        {"compare": {"none": {"contact_wrenches": {FEET[0]: []}}}}, "analysis.compare.none", "no sensor",
+    ),
+    "a set to compare without a name": ({"compare": {"": "full"}}, "analysis.compare", "accepted: a name"),
+    "a set to compare with a sensor at no fixed joint": (
+        {"compare": {"limb": {"ft_sensors": ["hip"]}}}, "analysis.compare", "without logs to predict accuracy from",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_slip_is_answered_in_one_line_and_nothing_is_written(
+    case: str, experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings, field, hint = REFUSED[case]
+    file = asked(experiment, analysis=settings)
+    message = refusal(["analyze", str(file)], experiment, capsys)
+    assert str(file) in message
+    assert field in message
+    assert hint in message
+
+
+COMPARED = {
+    "an unknown joint": ({"legs": {"joint_torques": ["knee"]}}, "analysis.compare.legs.joint_torques", "'knee'"),
+    "an unknown contact": ({"legs": {"contact_wrenches": {"paw": ["fx"]}}}, "analysis.compare.legs.contact", "'paw'"),
+    "a moment of a point": (
+        {"feet": {"contact_wrenches": {FEET[0]: ["mx"]}}}, f"analysis.compare.feet.contact_wrenches.{FEET[0]}", "'mx'",
+    ),
+    "the name of the proposed set": ({"proposed": "full"}, "analysis.compare.proposed", "another name"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", COMPARED)
+def test_a_slip_in_a_set_to_compare_is_placed_before_any_work(
+    case: str, experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compare, field, hint = COMPARED[case]
+    logs = {"train": ["sway_train.npz"]}
+    file = asked(experiment, logs=logs, sensors="joints", analysis={"compare": compare})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LogReader, "read", None)
+        message = refusal(["analyze", str(file)], experiment, capsys)
+    assert f"{file}: {field}" in message
+    assert hint in message
+
+
+def test_a_frozen_body_that_does_not_exist_is_looked_for_in_the_file(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs = {"train": ["sway_train.npz"]}
+    file = asked(experiment, logs=logs, estimator={"frozen": ["tail"]}, analysis={"scenarios": {"air": [[]]}})
+    assert f"{file}: estimator.frozen" in refusal(["analyze", str(file)], experiment, capsys)
+
+
+def test_an_output_without_a_name_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = refusal(["analyze", str(asked(experiment, output="/"))], experiment, capsys)
+    assert "no name for a file or folder" in message
+
+
+def test_a_robot_that_cannot_move_is_refused(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    inertial = "<mass value='1'/><inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
+    stone = experiment / "stone.urdf"
+    stone.write_text(f"<robot name='stone'><link name='stone'><inertial>{inertial}</inertial></link></robot>")
+    file = asked(experiment, robot={"urdf": str(stone), "fixed_base": True}, contacts=[])
+    assert "accepted: a robot that can move" in refusal(["analyze", str(file)], experiment, capsys)
+
+
+def test_sensors_that_tell_nothing_leave_nothing_to_determine(experiment: Path) -> None:
+    robot, output = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}, experiment / "blind"
+    file = asked(experiment, robot=robot, sensors="contacts", analysis={"scenarios": {"air": [[]]}}, output=str(output))
+    assert main(["analyze", str(file)]) == 0
+    plan = json.loads((experiment / "blind.analysis" / "analysis.json").read_text())["scenarios"]["air"]
+    assert (plan["base_parameters"]["rank"], plan["base_parameters"]["gap"]) == (0, None)
+
+
+def test_no_two_labels_of_the_tree_lie_on_each_other(experiment: Path) -> None:
+    robot = torchid.load_robot(experiment / "quadruped.urdf")
+    contacts = [torchid.Contact(link, "point") for link in ("trunk", "front_left_shank_link", "front_left_thigh_link")]
+    (axes,) = tree_figure("", robot, [*contacts, torchid.Contact(FEET[0], "point")], [], {}, []).axes
+    places = [label.xy for label in axes.texts]
+    assert len(set(places)) == len(places) == len(robot.bodies) + 4
+
+
+def test_a_base_that_is_often_all_but_lost_is_warned_of() -> None:
+    def checked(low: float) -> BaseObservability:
+        random, zero = PostureSummary(6, 0.1, low, low), PostureSummary(6, 0.1, 0.1, 0.1)
+        return BaseObservability((True,), "sole", random, zero, None, None, ())
+
+    (line,) = describe_losses([checked(1e-3), checked(1e-8)])
+    assert "in 1 of 2 contact states" in line
+
+
+def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
+    rms = {group: 0.05 for group in ROW_GROUPS}
+    expected = ExpectedErrors(rms, rms)
+    figure = accuracy_figure({name: SetAccuracy(1, 1, expected, None) for name in ("full", "joints")})
+    figure.savefig(io.BytesIO())
+    labels = [text.get_text() for axes in figure.axes for text in axes.yaxis.get_ticklabels(which="both")]
+    assert any(labels)
+    assert not any("$" in label for label in labels)
+
+
+def test_a_key_of_another_estimator_is_refused_without_logs_too(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = asked(experiment, estimator={"name": "least_squares", "total_mass": 12.0})
+    assert "estimator.total_mass" in refusal(["analyze", str(file)], experiment, capsys)
+
+
+def test_a_bolted_robot_cannot_lose_its_base_and_is_told_so(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = {"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True}
+    file = asked(experiment, robot=robot, analysis={"criterion": "per_sample"})
+    assert "accepted: stack" in refusal(["analyze", str(file)], experiment, capsys)
+
+
+def test_a_name_that_a_joint_and_a_contact_share_is_not_guessed_at(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    urdf = experiment / "clash.urdf"
+    urdf.write_text((experiment / "quadruped.urdf").read_text().replace("front_left_foot", "front_left_knee"))
+    contacts = [{"frame": "front_left_knee", "type": "point"}]
+    file = asked(experiment, robot={"urdf": str(urdf)}, contacts=contacts, analysis={"keep": ["front_left_knee"]})
+    assert "analysis.keep" in refusal(["analyze", str(file)], experiment, capsys)
+    urdf.unlink()
+
+
+def test_what_is_planned_for_flight_is_not_compared_on_logs_of_a_robot_that_stands(experiment: Path) -> None:
+    file = asked(
+        experiment,
+        logs={"train": ["sway_train.npz"], "test": ["sway_test.npz"]},
+        analysis={"scenarios": {"air": [[]]}, "compare": {"full": "full"}},
+        output=str(experiment / "air"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    answers = json.loads((experiment / "air.analysis" / "analysis.json").read_text())
+    assert list(answers["accuracy"]) == ["full"]
+    assert answers["scenarios"]["air"]["sensors"] == []
+
+
+def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(experiment: Path) -> None:
+    time, hz = np.arange(200)[:, None] * 0.01, 1.0 + 0.3 * np.arange(len(TORQUES))
+    position, velocity = np.sin(hz * time + np.arange(len(TORQUES))), hz * np.cos(hz * time + np.arange(len(TORQUES)))
+    oracle = Oracle(experiment / "quadruped.urdf", TORQUES, fixed_base=True)
+    torque = oracle.frictionless_forces(position, velocity, -(hz**2) * position)
+    np.savez(
+        experiment / "bolted.npz",
+        time=time[:, 0],
+        joint_names=np.array(TORQUES),
+        joint_position=position,
+        joint_torque=torque,
+    )
+    file = asked(
+        experiment,
+        robot={"urdf": str(experiment / "quadruped.urdf"), "fixed_base": True},
+        contacts=[],
+        logs={"train": ["bolted.npz"], "test": ["bolted.npz"]},
+        sensors="joints",
+        output=str(experiment / "bolted"),
+    )
+    with pytest.warns(TorchidWarning):  # fitted on what it is tested on
+        analysis = analyze(load_analysis(file), file)
+    (scenario,) = analysis.scenarios
+    assert scenario.plan.problem.criterion == "stack"
+    assert scenario.plan.stack_rank == scenario.plan.stack_full == scenario.base.rank - 2 * len(TORQUES)
+    assert scenario.plan.cost < len(TORQUES)
+    assert set(analysis.accuracies) == {"proposed", "planned for logs"}
+    assert {removal.base_rank for removal in scenario.plan.removals} == {None}
+
+
+WELDS = tuple(f"{leg}_sole" for leg in LEGS)
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
+def test_sensors_in_limbs_are_planned_named_and_drawn(experiment: Path) -> None:
+    """A dear knee: a three-axis reading of the lower leg's weld takes its place, and the proposal is checked."""
+    file = asked(
+        experiment,
+        sensors={"joint_torques": [*TORQUES[:-3]], "ft_sensors": [WELDS[-1]]},
+        analysis={
+            "candidates": {"contacts": "none", "ft_sensors": list(WELDS)},
+            "costs": {"joint_torque": 3.0, "ft_sensor": 1.0},
+            "exclude": [WELDS[0]],
+        },
+        output=str(experiment / "limbs"),
+    )
+    assert main(["analyze", str(file)]) == 0
+    folder = experiment / "limbs.analysis"
+    (answer,) = json.loads((folder / "analysis.json").read_text())["scenarios"].values()
+    candidates = {c["name"]: c for c in answer["candidates"]}
+    assert [candidates[weld]["channels"] for weld in WELDS] == [6] * 4
+    assert set(answer["sensors"]) == {*TORQUES[:3], *WELDS[1:]}
+    assert (answer["cost"], answer["proven"]) == (27.0, True)
+    assert {check["random_postures"]["rank"] for check in answer["checks"] + answer["proposed"]} == {6}
+    assert answer["exclude"] == [WELDS[0]]
+    assert (folder / "sensors-all_contacts.png").stat().st_size > 10_000
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
+def test_a_fixed_joint_that_does_not_exist_is_looked_for_in_the_file(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = asked(experiment, analysis={"candidates": {"ft_sensors": ["front_left_soul"]}}, output=str(experiment / "x"))
+    assert main(["analyze", str(file)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(
+        f"torchid: {file}: analysis.candidates.ft_sensors: unknown name 'front_left_soul'; accepted: "
+    )
+    assert "front_left_sole" in line
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.MasslessBodyWarning")
+def test_a_weld_is_drawn_with_what_is_measured_in_it(experiment: Path) -> None:
+    robot = torchid.load_robot(experiment / "quadruped.urdf", ft_joints=WELDS[:2])
+    contacts = [torchid.Contact(foot, "point") for foot in FEET]
+    figure = tree_figure("", robot, contacts, [f"{WELDS[0]}.{k}" for k in ("fx", "mz")], {}, [])
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert f"{WELDS[0]}: fx, mz" in texts
+    assert WELDS[1] in texts
+    assert "sensor in a limb" in [text.get_text() for text in figure.legends[0].get_texts()]
+    plain = tree_figure("", torchid.load_robot(experiment / "quadruped.urdf"), contacts, [], {}, [])
+    assert "sensor in a limb" not in [text.get_text() for text in plain.legends[0].get_texts()]

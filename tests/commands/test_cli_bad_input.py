@@ -1,0 +1,352 @@
+"""A user's mistake: exit status 2, one line on standard error, nothing written."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from demo import shortened_demo
+from refusals import files_in, refusal
+
+from torchid.cli import _interrupt_held_back, main
+from torchid.config import load_config
+from torchid.fitting.experiment import set_up
+from torchid.problem.extras import list_extras
+
+Edit = Callable[[Path], None]
+
+
+@pytest.fixture
+def experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the demo, shortened, that would run; also the working folder."""
+    folder = shortened_demo(tmp_path / "experiment", 300)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def edit_log(**changes: object) -> Edit:
+    """Replace fields of the training log; None drops a field, a function maps the old value."""
+
+    def apply(folder: Path) -> None:
+        path = folder / "sway_train.npz"
+        with np.load(path) as log:
+            fields = dict(log)
+        for name, change in changes.items():
+            if change is None:
+                del fields[name]
+            else:
+                fields[name] = change(fields[name]) if callable(change) else change
+        np.savez(path, **fields)
+
+    return apply
+
+
+def edit_urdf(old: str, new: str) -> Edit:
+    def apply(folder: Path) -> None:
+        path = folder / "quadruped.urdf"
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
+
+    return apply
+
+
+def edit_config(**changes: object) -> Edit:
+    def apply(folder: Path) -> None:
+        path = folder / "quadruped.yaml"
+        settings = yaml.safe_load(path.read_text())
+        for name, value in changes.items():
+            settings[name] = value
+        path.write_text(yaml.safe_dump(settings))
+
+    return apply
+
+
+def write(name: str, content: bytes) -> Edit:
+    def apply(folder: Path) -> None:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(content)
+
+    return apply
+
+
+def both(first: Edit, second: Edit) -> Edit:
+    def apply(folder: Path) -> None:
+        first(folder)
+        second(folder)
+
+    return apply
+
+
+def with_nan(sample: int) -> Callable[[np.ndarray], np.ndarray]:
+    def change(x: np.ndarray) -> np.ndarray:
+        x = x.copy()
+        x[sample, 3] = np.nan
+        return x
+
+    return change
+
+
+def swapped_time(x: np.ndarray) -> np.ndarray:
+    x = x.copy()
+    x[[10, 11]] = x[[11, 10]]
+    return x
+
+
+def renamed(old: str, new: str) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda names: np.array([new if name == old else name for name in names])
+
+
+LOOP = """<link name="extra"/><joint name="a" type="fixed"><parent link="trunk"/><child link="extra"/></joint>
+<joint name="b" type="fixed"><parent link="front_left_foot"/><child link="extra"/></joint></robot>"""
+CONTACTS = [
+    {"frame": f"{leg}_foot", "type": "point"} for leg in ("front_left", "front_right", "rear_left", "rear_right")
+]
+
+LOGS: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "unknown joint": (
+        edit_log(joint_names=renamed("rear_left_knee", "rear_left_kne")),
+        ("rear_left_kne", "rear_left_knee"),
+    ),
+    "joint missing": (
+        edit_log(joint_names=lambda x: x[:11], joint_position=lambda x: x[:, :11], joint_torque=lambda x: x[:, :11]),
+        ("rear_right_knee", "missing"),
+    ),
+    "wrong shape": (edit_log(joint_position=lambda x: x[:, :5]), ("joint_position", "(300, 5)")),
+    "NaN in a position": (edit_log(joint_position=with_nan(7)), ("joint_position", "7")),
+    "NaN in a measured torque": (edit_log(joint_torque=with_nan(7)), ("joint_torque",)),
+    "torque missing": (edit_log(joint_torque=None), ("joint_torque", "missing")),
+    "time runs backward": (edit_log(time=swapped_time), ("time", "11")),
+    "quaternion not normalised": (edit_log(base_quat_wxyz=lambda x: 2.0 * x), ("base_quat_wxyz", "2")),
+    "orientation missing": (edit_log(base_quat_wxyz=None), ("base_quat", "missing")),
+    "base position missing": (edit_log(base_position_world=None), ("base_linear_acceleration", "base_position_world")),
+    "contact not in the URDF": (
+        edit_log(contact_names=renamed("rear_left_foot", "rear_left_paw")),
+        ("sway_train.npz: contact_names: unknown name 'rear_left_paw'", "rear_left_foot"),
+    ),
+    "contact activity missing": (
+        edit_log(contact_active=None),
+        ("contact_wrench_local", "given without contact_active"),
+    ),
+    "pickled content": (
+        edit_log(joint_names=np.array([f"{leg}_hip" for leg in "abcdefghijkl"], dtype=object)),
+        ("joint_names", "pickle"),
+    ),
+    "unknown field": (edit_log(joint_positon=np.zeros((300, 12))), ("joint_positon", "joint_position")),
+    "not a log": (write("sway_train.npz", b"PK\x03\x04 truncated"), ("sway_train.npz",)),
+    "log too short to differentiate": (
+        lambda folder: edit_log(**{n: lambda x: x[:3] for n in _PER_SAMPLE})(folder),
+        ("sway_train.npz",),
+    ),
+}
+_PER_SAMPLE = (
+    *("time", "joint_position", "joint_torque", "base_position_world", "base_quat_wxyz"),
+    *("contact_active", "contact_wrench_local"),
+)
+
+ROBOTS: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "planar joint": (edit_urdf('type="revolute"', 'type="planar"'), ("front_left_hip", "planar", "revolute")),
+    "floating joint": (edit_urdf('type="revolute"', 'type="floating"'), ("front_left_hip", "floating")),
+    "link without a name": (edit_urdf('<link name="rear_left_foot"/>', "<link/>"), ("link", "no name")),
+    "duplicate link": (edit_urdf("</robot>", '<link name="trunk"/></robot>'), ("trunk", "more than once")),
+    "loop": (edit_urdf("</robot>", LOOP), ("extra", "one parent")),
+    "unknown parent": (edit_urdf('<parent link="trunk"/>', '<parent link="trunc"/>'), ("trunc", "trunk")),
+    "mass missing": (edit_urdf('<mass value="11.0"/>', ""), ("trunk", "mass")),
+    "negative mass": (edit_urdf('value="11.0"', 'value="-11"'), ("trunk", "-11 kg")),
+    "malformed XML": (edit_urdf("</robot>", ""), ("quadruped.urdf", "well-formed")),
+    "missing file": (lambda folder: (folder / "quadruped.urdf").unlink(), ("quadruped.urdf", "no such file")),
+}
+
+FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "unknown key": (edit_config(preprocesing={"cutoff_hz": 8}), ("preprocesing", "preprocessing")),
+    "unknown nested key": (edit_config(estimator={"rige": 1.0}), ("estimator", "rige", "ridge")),
+    "unknown estimator": (edit_config(estimator={"name": "magic"}), ("estimator.name", "magic", "least_squares")),
+    "negative ridge": (edit_config(estimator={"ridge": -1.0}), ("estimator.ridge", "-1")),
+    "cutoff above Nyquist": (edit_config(preprocessing={"cutoff_hz": 80.0}), ("cutoff_hz", "80")),
+    "unknown sensor set": (edit_config(sensors="everything"), ("sensors", "everything", "full")),
+    "unknown sensor joint": (
+        edit_config(sensors={"joint_torques": ["front_left_hop"]}),
+        ("front_left_hop", "front_left_hip"),
+    ),
+    "offset of sensors that are not there": (
+        edit_config(sensors={"set": "joints", "offsets": {"joint_torque": "all", "ft_force": "log"}}),
+        ("sensors.offsets.ft_force: no such sensor is measured; accepted: joint_torque, or",),
+    ),
+    "scale of sensors that are not there": (
+        edit_config(sensors={"set": "contacts", "scales": {"joint_torque": "all"}}),
+        ("sensors.scales.joint_torque: no such sensor is measured; accepted: contact_force, or",),
+    ),
+    "actuators without joint torques": (
+        edit_config(sensors="contacts", actuators={"sign_width": 0.1}),
+        ("actuators.sign_width: set, but no joint torque is measured",),
+    ),
+    "limb sensor at a moving joint": (
+        edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_hip"]}),
+        ("sensors.ft_sensors: 'front_left_hip', a revolute joint, not a fixed joint; accepted: front_left_sole",),
+    ),
+    "limb sensor at a link": (
+        edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_foot"]}),
+        ("sensors.ft_sensors: 'front_left_foot', a link, not a fixed joint; accepted: front_left_sole",),
+    ),
+    "limb sensor at nothing": (
+        edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_sol"]}),
+        ("sensors.ft_sensors: unknown name 'front_left_sol'; accepted: front_left_sole",),
+    ),
+    "limb sensor that the log lacks": (
+        edit_config(sensors={"set": "joints", "ft_sensors": ["front_left_sole"]}),
+        ("sway_train.npz: ft_wrench: missing; accepted: the field",),
+    ),
+    "component a point cannot exert": (
+        edit_config(sensors={"contact_wrenches": {"rear_left_foot": ["mx"]}}),
+        ("rear_left_foot", "mx", "fx"),
+    ),
+    "unknown contact frame": (
+        edit_config(contacts=[{"frame": "front_left_fot", "type": "point"}]),
+        ("quadruped.yaml: contacts[0].frame: unknown name 'front_left_fot'; accepted: front_left_foot",),
+    ),
+    "active contact left out": (edit_config(contacts=CONTACTS[:3]), ("rear_right_foot", "active")),
+    "contact missing in the log": (edit_config(contacts=[*CONTACTS, {"frame": "trunk", "type": "flat"}]), ("trunk",)),
+    "unknown base link": (
+        edit_config(robot={"urdf": "quadruped.urdf", "base_link": "trnk"}),
+        ("base_link", "trnk", "trunk"),
+    ),
+    "no training log": (edit_config(logs={"train": []}), ("logs.train", "at least one")),
+    "log missing": (edit_config(logs={"train": ["nowhere.npz"]}), ("nowhere.npz",)),
+    "unknown log type": (
+        both(write("log.mat", b"x"), edit_config(logs={"train": ["log.mat"]})),
+        ("log.mat", ".npz"),
+    ),
+    "base lost": (
+        edit_config(sensors={"joint_torques": ["front_left_hip", "front_left_thigh"]}),
+        ("rank(S_b V_x)", "rank 0 of 6"),
+    ),
+    "sensors that nothing moves": (
+        both(edit_config(robot={"urdf": "quadruped.urdf", "fixed_base": True}), edit_config(sensors="contacts")),
+        ("sensors", "no parameter is in reach"),
+    ),
+    "resampled to one sample": (
+        edit_config(preprocessing={"sample_rate_hz": 0.01}),
+        ("preprocessing.sample_rate_hz", "leaves one sample"),
+    ),
+    "resampled below twice the cutoff": (
+        edit_config(preprocessing={"cutoff_hz": 8, "sample_rate_hz": 15}),
+        ("preprocessing.sample_rate_hz", "16 Hz"),
+    ),
+    "output where nothing can be made": (edit_config(output="quadruped.urdf/run"), ("output", "no folder can be made")),
+    "output with too long a name": (edit_config(output="x" * 300), ("output", "accepted")),
+    "device of another spelling": (edit_config(device="CPU"), ("device", "cuda:0")),
+    "a number that YAML cannot make": (write("quadruped.yaml", b'device: !!int "x"'), ("quadruped.yaml", "YAML")),
+    "unavailable device": (edit_config(device="cuda:77"), ("device", "cuda:77")),
+    "malformed YAML": (write("quadruped.yaml", b"robot: [unclosed"), ("quadruped.yaml",)),
+    "YAML that is no mapping": (write("quadruped.yaml", b"- a\n- b\n"), ("quadruped.yaml", "mapping")),
+    "YAML with a tag": (write("quadruped.yaml", b"robot: !!python/object/apply:os.getcwd []"), ("quadruped.yaml",)),
+    "output is a file": (
+        both(write("taken", b""), edit_config(output="taken")),
+        ("taken", "output"),
+    ),
+    "output not empty": (
+        both(write("full/mine", b"x"), edit_config(output="full")),
+        ("full", "not empty"),
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "expected"), [*LOGS.values(), *ROBOTS.values(), *FILES.values()],
+                         ids=[*LOGS, *ROBOTS, *FILES])  # fmt: skip
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_bad_input_exits_2_with_one_line_and_writes_nothing(
+    experiment: Path, capsys: pytest.CaptureFixture[str], change: Edit, expected: tuple[str, ...]
+) -> None:
+    change(experiment)
+    line = refusal(["identify", str(experiment / "quadruped.yaml")], experiment.parent, capsys)
+    for part in expected:
+        assert part in line
+
+
+def test_a_limb_sensor_is_planned_at_a_fixed_joint_only(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    override = "analysis.candidates.ft_sensors=[front_left_knee]"
+    line = refusal(["analyze", str(experiment / "quadruped.yaml"), override], experiment.parent, capsys)
+    assert "analysis.candidates.ft_sensors: 'front_left_knee', a revolute joint, not a fixed joint" in line
+
+
+@pytest.mark.parametrize("scope", ["log", "all"])
+def test_a_scope_alone_is_that_of_the_channels_that_are_measured(experiment: Path, scope: str) -> None:
+    scene = set_up(load_config(experiment / "quadruped.yaml", [f"sensors.offsets={scope}", f"sensors.scales={scope}"]))
+    extras = list_extras(scene.robot, scene.contacts, scene.sensors, scene.terms)
+    assert {x.name for x in extras} == set(scene.robot.joint_names)
+
+
+@pytest.mark.parametrize("command", ["identify", "analyze", "simulate"])
+def test_a_log_in_place_of_an_experiment_file_is_told_for_what_it_is(
+    experiment: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    line = refusal([command, str(experiment / "sway_train.npz")], experiment.parent, capsys)
+    assert "sway_train.npz: file: a log, not a file of settings" in line
+    kind = "simulation" if command == "simulate" else "experiment"
+    assert line.endswith(f"accepted: a YAML {kind} file")
+
+
+@pytest.mark.parametrize("command", ["identify", "analyze", "simulate", "check"])
+def test_a_command_without_arguments_asks_for_a_file_and_not_for_overrides(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command])
+    assert capsys.readouterr().err.endswith("the following arguments are required: file\n")
+
+
+def test_unknown_override_names_the_nearest_key(experiment: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["identify", str(experiment / "quadruped.yaml"), "estimator.rigde=1"]) == 2
+    assert "accepted: ridge" in capsys.readouterr().err
+    assert main(["identify", str(experiment / "quadruped.yaml"), "estimator.ridge"]) == 2
+    assert "key.subkey=value" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("override", ["contacts[0].type=flat", "contacts.0.type=flat", "sensors=[joints]"])
+def test_an_override_that_does_not_fit_the_file_is_refused(
+    experiment: Path, capsys: pytest.CaptureFixture[str], override: str
+) -> None:
+    assert main(["identify", str(experiment / "quadruped.yaml"), override]) == 2
+    assert "accepted: " in capsys.readouterr().err
+
+
+def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(tmp_path), "--log", "x.npz"]) == 2
+    assert "config.yaml" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_that_a_loading_module_swallows_still_ends_the_command() -> None:
+    with pytest.raises(KeyboardInterrupt), _interrupt_held_back(), suppress(KeyboardInterrupt):  # noqa: PT012
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_leaves_nothing_behind(
+    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("json.dumps", interrupted)
+    before = files_in(experiment.parent)
+    assert main(["identify", str(experiment / "quadruped.yaml")]) == 1
+    assert "interrupted; nothing was written" in capsys.readouterr().err
+    assert files_in(experiment.parent) == before
+
+
+def test_a_failure_that_is_no_bad_input_exits_1_without_a_traceback(
+    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full_disk(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("json.dumps", full_disk)
+    before = files_in(experiment.parent)
+    assert main(["identify", str(experiment / "quadruped.yaml")]) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert files_in(experiment.parent) == before

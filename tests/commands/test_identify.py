@@ -1,0 +1,319 @@
+"""Whole runs through the command line, on the demo and on real logs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from repository import CONFIGS, DEMO, SHARED
+from synthetic import Oracle, random_states
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import torchid
+from torchid.cli import main
+from torchid.config import load_config
+from torchid.errors import TorchidWarning
+from torchid.estimators.least_squares import VERDICTS
+from torchid.identifiability.base_rank import StateReport
+from torchid.parameters import PARAMETERS
+from torchid.report import identified_urdf
+from torchid.report.tables import print_tables, state_table
+
+UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("runs") / "demo"
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={output}"]) == 0
+    return output
+
+
+def test_a_run_folder_holds_what_it_promises(run: Path) -> None:
+    names = {path.name.split(".")[0] for path in run.iterdir()}
+    assert names >= {
+        "config",
+        "parameters",
+        "metrics",
+        "identified",
+        "events",
+        "forces",
+        "errors",
+        "identifiability",
+        "contributions",
+    }
+    assert not [path for path in run.parent.iterdir() if path != run], "temporary folders left behind"
+
+
+def test_resolved_config_reads_back_as_itself(run: Path) -> None:
+    config = load_config(run / "config.yaml")
+    assert config.robot.urdf == DEMO / "quadruped.urdf"
+    assert config.sensors.set == "joints"
+    assert yaml.safe_load((run / "config.yaml").read_text())["sensors"]["noise"]["joint_torque"] == 0.1
+
+
+def test_the_noise_that_rows_were_weighed_with_stands_in_the_run(run: Path) -> None:
+    groups = {one["group"]: one for one in json.loads((run / "metrics.json").read_text())["noise"]["groups"]}
+    noise = load_config(run / "config.yaml").sensors.noise
+    assert groups["joint_torque"]["origin"] == "stated"
+    assert groups["joint_torque"]["used"] == noise.joint_torque == 0.1
+    for key in ("base_force", "base_moment"):
+        assert [groups[f"{key}.{axis}"]["used"] for axis in "xyz"] == list(getattr(noise, key))
+        assert {groups[f"{key}.{axis}"]["origin"] for axis in "xyz"} <= {"estimated", "at most", "confounded"}
+    assert noise.contact_force == 0.5, "as the file says, though no contact is measured"
+
+
+def test_parameters_json_names_every_body_and_parameter(run: Path) -> None:
+    document = json.loads((run / "parameters.json").read_text())
+    bodies, robot = document["bodies"], torchid.load_robot(DEMO / "quadruped.urdf")
+    assert [body["name"] for body in bodies] == list(robot.body_names)
+    for body, nominal in zip(bodies, robot.nominal, strict=True):
+        for column in ("nominal", "identified", "standard_error", "identifiable", "data_share", "verdict"):
+            assert tuple(body[column]) == PARAMETERS
+        np.testing.assert_allclose([body["nominal"][name] for name in PARAMETERS], nominal)
+        for name in PARAMETERS:
+            assert body["identifiable"][name] == (body["standard_error"][name] is not None)
+            assert (body["verdict"][name] in ("identified", "dominated by the prior")) == body["identifiable"][name]
+            assert (body["verdict"][name] == "fixed") == (body["data_share"][name] is None)
+    verdicts = [verdict for body in bodies for verdict in body["verdict"].values()]
+    assert document["verdicts"] == {verdict: verdicts.count(verdict) for verdict in VERDICTS}
+    assert bodies[0]["verdict"]["fc"] == "fixed", "the base has no joint"
+    assert bodies[1]["identifiable"]["fv"]
+
+
+def test_parameters_json_judges_every_contact_state_alone(run: Path) -> None:
+    document, metrics = (json.loads((run / f"{name}.json").read_text()) for name in ("parameters", "metrics"))
+    states = document["contact_states"]
+    assert {state["name"] for state in states} == {state["name"] for state in metrics["contact_states"]}
+    for state in states:
+        assert [body["name"] for body in state["bodies"]] == [body["name"] for body in document["bodies"]]
+        assert 0 < state["rank"] <= metrics["rank"]
+        assert len([x for x in state["singular_values"] if x > 1e-10 * state["singular_values"][0]]) == state["rank"]
+        for alone, together in zip(state["bodies"], document["bodies"], strict=True):
+            for name in PARAMETERS:
+                assert together["identifiable"][name] or not alone["identifiable"][name], "more data determine more"
+
+
+def test_metrics_json_has_the_documented_fields(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")
+    for name in ("train", "test"):
+        every = (*groups, "projected_residual")
+        assert set(metrics[name]) == {*every, *(f"{group}_relative" for group in every)}
+        assert metrics["base_force_rms_of_variation"][name] > metrics[name]["base_force_rms_relative"]
+        assert len(metrics[name]["joint_torque_rms_by_joint"]) == 12
+        joints = list(metrics[name]["joint_torque_rms_by_joint"].values())
+        assert metrics[name]["joint_torque_rms"] == pytest.approx(np.mean(joints))
+    assert metrics["rank"] == 118  # 10 + 7 * 12 inertial, 2 * 12 friction
+    assert metrics["parameters"] == 156
+    assert metrics["samples"] == 1250
+
+
+def test_metrics_json_says_what_each_log_contact_state_and_sensor_adds(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    found = metrics["identifiability"]
+    values = found["singular_values"]
+    assert values[0] / values[metrics["rank"] - 1] == pytest.approx(metrics["condition_number"])
+    assert found["condition_number"] == metrics["condition_number"]
+    assert found["oversampling"] == pytest.approx(100.0 / 2.0 / (0.898 * 8.0), rel=0.01)  # 100 Hz, filtered at 8 Hz
+    (log,) = found["logs"]
+    assert (Path(log["name"]).name, log["samples"], log["rank"], log["rank_lost"]) == ("sway_train.npz", 1250, 118, 118)
+    assert log["bits"] == pytest.approx(found["bits"])
+    assert 0.0 < found["determined"] < metrics["rank"]
+    for state in metrics["contact_states"]:
+        assert 0 <= state["rank_lost"] <= state["rank"] <= metrics["rank"]
+        assert 0.0 < state["bits"] < found["bits"]
+    sensors = found["sensors"]
+    assert {sensor["name"] for sensor in sensors} == set(torchid.load_robot(DEMO / "quadruped.urdf").joint_names)
+    assert [s["bits"] for s in sensors] == sorted((s["bits"] for s in sensors), reverse=True)
+    assert sensors[-1]["bits"] > 0.0
+
+
+def test_joint_torques_alone_predict_forces_no_sensor_of_the_fit_saw(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    for group in ("base_force_rms", "base_moment_rms", "joint_torque_rms", "nullspace_rms"):
+        assert metrics["test"][group] < 0.4 * metrics["test_nominal"][group]
+    assert metrics["total_mass"] == pytest.approx(21.347, abs=0.15)  # printed by scripts/make_demo.py
+
+
+def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
+    events = EventAccumulator(str(run), size_guidance={"images": 0})
+    events.Reload()
+    for name in ("train", "test"):
+        scalar = events.Scalars(f"relative_error_{name}/base_force")
+        assert [event.step for event in scalar] == [0, 1]
+        assert scalar[1].value < scalar[0].value
+    assert set(events.Tags()["images"]) == {"forces", "errors", "parameters", "identifiability", "contributions"}
+
+
+def test_tensorboard_shows_what_is_identified_and_by_what(run: Path) -> None:
+    events = EventAccumulator(str(run), size_guidance={"images": 0, "scalars": 0})
+    events.Reload()
+    metrics = json.loads((run / "metrics.json").read_text())
+    document = json.loads((run / "parameters.json").read_text())
+    for verdict, count in document["verdicts"].items():
+        assert events.Scalars(f"verdicts/{verdict}")[0].value == count
+    values = events.Scalars("identifiability/singular_value")
+    assert [value.step for value in values] == list(range(len(metrics["identifiability"]["singular_values"])))
+    assert values[0].value == pytest.approx(metrics["identifiability"]["singular_values"][0], rel=1e-6)
+    assert events.Scalars("identifiability/bits")[0].value == pytest.approx(metrics["identifiability"]["bits"])
+
+
+def test_evaluating_the_test_log_again_gives_the_same_figures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(run), "--log", str(DEMO / "sway_test.npz")]) == 0
+    assert "sway_test" in capsys.readouterr().out
+    found = json.loads((run / "evaluation" / "sway_test" / "metrics.json").read_text())["sway_test"]
+    expected = json.loads((run / "metrics.json").read_text())
+    assert found["identified"] == expected["test"]
+    assert found["nominal"]["base_force_rms"] == pytest.approx(expected["test_nominal"]["base_force_rms"])
+
+
+def test_a_run_is_replaced_only_on_request(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "metrics.json").read_bytes()
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={run}"]) == 2
+    assert "overwrite=true" in capsys.readouterr().err
+    assert (run / "metrics.json").read_bytes() == before
+
+
+def test_overwriting_keeps_what_is_no_part_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "notes.txt").write_text("mine")
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={run}", "overwrite=true"]) == 2
+    assert "notes.txt" in capsys.readouterr().err
+    assert (run / "notes.txt").read_text() == "mine"
+    (run / "notes.txt").unlink()
+
+
+def test_logs_of_one_name_are_not_evaluated_as_one(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = str(DEMO / "sway_test.npz")
+    assert main(["evaluate", str(run), "--log", log, "--log", log]) == 2
+    assert "several logs named 'sway_test'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("damage", [("NaN", "m"), ("true", "Ixx"), ('"1.0"', "fv")], ids=["NaN", "flag", "text"])
+def test_parameters_that_are_no_numbers_are_not_evaluated(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: tuple[str, str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    document = json.loads((copy / "parameters.json").read_text())
+    document["bodies"][3]["identified"][damage[1]] = json.loads(damage[0])
+    (copy / "parameters.json").write_text(json.dumps(document))
+    assert main(["evaluate", str(copy), "--log", str(DEMO / "sway_test.npz")]) == 2
+    printed = capsys.readouterr().err
+    assert f"identified.{damage[1]}" in printed
+    assert document["bodies"][3]["name"] in printed
+
+
+@pytest.mark.parametrize("noise", [(), ("sensors.noise={}",)], ids=["stated", "estimated"])
+def test_positions_in_degrees_stop_a_run_that_names_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: tuple[str, ...]
+) -> None:
+    demo_with(tmp_path / "demo", joint_position=np.rad2deg)
+    assert main(["identify", str(tmp_path / "demo" / "quadruped.yaml"), *noise]) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "torchid check finds in sway_train.npz: joint_position: " in told
+    assert "degrees?; accepted: convert joint_position" in told
+
+
+@pytest.mark.parametrize(
+    ("noise", "said"),
+    [((), "times the stated sensor noise"), (("sensors.noise={}",), "no rigid-body model explains 9")],
+    ids=["stated", "estimated"],
+)
+def test_torques_of_no_robot_are_noticed_and_the_fit_called_worse_than_the_urdf(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: tuple[str, ...], said: str
+) -> None:
+    rng = np.random.default_rng(0)
+    demo_with(tmp_path / "demo", joint_torque=lambda torque: 50.0 * rng.normal(size=torque.shape))
+    file, output = tmp_path / "demo" / "quadruped.yaml", tmp_path / "run"
+    assert main(["identify", str(file), f"output={output}", *noise]) == 0
+    printed = capsys.readouterr()
+    assert said in printed.err
+    assert printed.out.startswith("WORSE THAN URDF: the identified parameters predict worse")
+
+
+def demo_with(folder: Path, **changes: Callable[[Any], Any]) -> None:
+    """The demo with fields of its training log changed."""
+    shutil.copytree(DEMO, folder)
+    with np.load(DEMO / "sway_train.npz") as log:
+        fields = dict(log)
+    np.savez(folder / "sway_train.npz", **fields | {name: change(fields[name]) for name, change in changes.items()})
+
+
+def test_names_are_shown_as_they_are_and_never_as_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    print_tables(state_table([asdict(StateReport("[red]x[/blue]", 3, 6, 6, 0.1))]))
+    assert "[red]x[/blue]" in capsys.readouterr().out
+
+
+def test_the_same_experiment_gives_the_same_parameters_again(run: Path, tmp_path: Path) -> None:
+    output = tmp_path / "again"
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={output}", "overwrite=true"]) == 0
+    assert json.loads((output / "parameters.json").read_text()) == json.loads((run / "parameters.json").read_text())
+
+
+def test_identified_urdf_moves_as_its_parameters_say(tmp_path: Path) -> None:
+    robot = torchid.load_robot(DEMO / "quadruped.urdf")
+    rng = np.random.default_rng(0)
+    phi = robot.nominal * rng.uniform(0.9, 1.1, (len(robot.bodies), 1))
+    phi[1:, 10:] = rng.uniform(0.1, 0.5, (12, 2))
+    path = tmp_path / "identified.urdf"
+    path.write_bytes(identified_urdf(robot, phi))
+    oracle = Oracle(path, robot.joint_names)
+    q, v, a = random_states(rng, robot.n, 20)
+    inertial = phi.copy()
+    inertial[:, 10:] = 0.0
+    predicted = torchid.Regressor(robot)(*map(torch.tensor, (q, v, a))) @ torch.tensor(inertial).flatten()
+    expected = oracle.frictionless_forces(q, v, a)
+    np.testing.assert_allclose(predicted.numpy(), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+def test_identified_urdf_reads_back_with_its_friction(tmp_path: Path) -> None:
+    robot = torchid.load_robot(DEMO / "quadruped.urdf")
+    phi = robot.nominal * 1.1
+    phi[1:, 10:] = [0.25, 0.5]
+    path = tmp_path / "identified.urdf"
+    path.write_bytes(identified_urdf(robot, phi))
+    np.testing.assert_allclose(torchid.load_robot(path).nominal, phi, rtol=1e-12, atol=1e-15)
+
+
+def test_a_urdf_that_nothing_can_load_is_warned_of(tmp_path: Path) -> None:
+    robot = torchid.load_robot(DEMO / "quadruped.urdf")
+    phi = robot.nominal.copy()
+    phi[2, 11], phi[3, 0] = -0.1, -1.0
+    with pytest.warns(TorchidWarning) as caught:
+        identified_urdf(robot, phi)
+    mass, friction = (str(warning.message) for warning in caught)
+    assert robot.body_names[3] in mass
+    assert f"negative friction at {robot.joint_names[1]};" in friction
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded human squats (../shared/data) are not here")
+@pytest.mark.filterwarnings(UNPHYSICAL)
+def test_force_plates_alone_identify_a_person_who_then_squats_differently(tmp_path: Path) -> None:
+    """The ridge was chosen by leaving blocks of the training log out (see configs/human_squats.yaml)."""
+    config = CONFIGS / "human_squats.yaml"
+    assert main(["identify", str(config), f"output={tmp_path / 'run'}"]) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["test"]["base_force_rms_relative"] <= 0.02
+    assert metrics["test_nominal"]["base_force_rms_relative"] == pytest.approx(0.048, abs=0.001)
+    assert abs(metrics["total_mass"] - 60.03) <= 0.5
+    assert metrics["test"]["joint_torque_rms"] is None
+    assert metrics["test"]["nullspace_rms"] is None
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded arm motion (../shared/data) is not here")
+@pytest.mark.filterwarnings(UNPHYSICAL)
+def test_a_bolted_arm_is_identified_from_its_joint_torques(tmp_path: Path) -> None:
+    config = CONFIGS / "kuka_lwr4.yaml"
+    assert main(["identify", str(config), f"output={tmp_path / 'run'}"]) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["test"]["joint_torque_rms"] < 0.5 * metrics["test_nominal"]["joint_torque_rms"]
+    assert metrics["test"]["base_force_rms"] is None

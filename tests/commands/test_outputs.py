@@ -1,0 +1,520 @@
+"""What a folder of results may replace: files that torchid wrote, as it wrote them, and nothing else of anybody."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+from demo import DEMO
+from hostile_commands import Commands
+from refusals import refusal
+from repository import ROOT
+
+import torchid
+from torchid.cli import main
+from torchid.commands.folder import (
+    EVALUATION,
+    RUN,
+    SIMULATION,
+    TRAINING,
+    check_free,
+    new_folder,
+    refuse_inputs,
+    require_replaceable,
+)
+from torchid.commands.manifest import MANIFEST, read_manifest
+from torchid.commands.training import Training
+from torchid.config import load_analysis, load_simulation
+from torchid.errors import ConfigError, TorchidWarning
+from torchid.staging import interrupts_deferred, staging_folder, termination_as_interrupt
+
+Add = Callable[[Path], None]
+
+
+def write(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def a_run(output: Path, text: str = "old") -> Path:
+    """A folder as a run leaves it, with an evaluation."""
+    with new_folder(output, overwrite=True) as folder:
+        write(folder, {"config.yaml": text, "metrics.json": text, "hparams/events": text})
+    with new_folder(output / "evaluation" / "log", True, EVALUATION) as folder:
+        write(folder, {"metrics.json": text})
+    return output
+
+
+def everything(folder: Path) -> dict[str, tuple[bytes, str]]:
+    """All files and folders, with what is in them or where they point to."""
+    return {
+        str(path.relative_to(folder)): (
+            path.read_bytes() if path.is_file() and not path.is_symlink() else b"",
+            os.readlink(path) if path.is_symlink() else "",
+        )
+        for path in folder.rglob("*")
+    }
+
+
+# --------------------------------------------------------------------------------------------- what others put there
+
+
+def _text(name: str) -> Add:
+    return lambda run: write(run, {name: "mine"})
+
+
+def _link(name: str) -> Add:
+    """A link in place of what the run wrote, which lies elsewhere."""
+
+    def add(run: Path) -> None:
+        kept = run.parent / "kept"
+        (run / name).rename(kept)
+        (run / name).symlink_to(kept)
+
+    return add
+
+
+def _evaluation_copied(run: Path) -> None:
+    shutil.copytree(run / "evaluation" / "log", run / "evaluation" / "kept")
+
+
+def _run_kept_inside(run: Path) -> None:
+    shutil.copytree(run, run.parent / "copy")
+    (run.parent / "copy").rename(run / "kept")
+
+
+FOREIGN: dict[str, tuple[Add, str]] = {
+    "notes": (_text("notes.txt"), "notes.txt, which torchid did not write"),
+    "notes in the evaluations": (_text("evaluation/notes.txt"), "evaluation/notes.txt, which"),
+    "notes in an evaluation": (_text("evaluation/log/notes.txt"), "evaluation/log/notes.txt, which"),
+    "a thesis beside the hyperparameters": (_text("hparams/thesis.tex"), "hparams/thesis.tex, which"),
+    "a recorded log": (_text("logs/recorded.npz"), "logs/, which"),
+    "an event file": (_text("events.out.tfevents.1.host.2.0"), "events.out.tfevents.1.host.2.0, which"),
+    "a checkpoint": (_text("checkpoint.pt"), "checkpoint.pt, which"),
+    "a hidden file": (_text(".git/config"), ".git/, which"),
+    "a hidden folder of a name like ours": (_text(".x-01234567.torchid/notes.txt"), ".x-01234567.torchid/, which"),
+    "an empty folder": (lambda run: (run / "ideas").mkdir(), "ideas/, which"),
+    "a pipe": (lambda run: os.mkfifo(run / "pipe"), "pipe, which"),
+    "control characters": (_text("\x1b[2J\n.txt"), r"\x1b[2J\n.txt, which"),
+    "edited figures": (_text("metrics.json"), "metrics.json, changed since torchid wrote it"),
+    "an edited evaluation": (_text("evaluation/log/metrics.json"), "evaluation/log/metrics.json, changed"),
+    "a link in place of a file": (_link("metrics.json"), "metrics.json, which"),
+    "a link in place of a folder": (_link("hparams"), "hparams, which"),
+    "a link in place of the evaluations": (_link("evaluation"), "evaluation, which"),
+    "a link in place of an evaluation": (_link("evaluation/log"), "evaluation/log, which"),
+    "a link in place of the manifest": (_link(MANIFEST), "no manifest.json that says"),
+    "an evaluation that was copied": (_evaluation_copied, "evaluation/kept/, which"),
+    "another run": (_run_kept_inside, "kept/, which"),
+}
+
+
+@pytest.mark.parametrize(("add", "said"), FOREIGN.values(), ids=FOREIGN)
+def test_what_torchid_did_not_write_is_named_and_stays(tmp_path: Path, add: Add, said: str) -> None:
+    output = a_run(tmp_path / "run")
+    add(output)
+    before = everything(tmp_path)
+    for _ in range(2):
+        with pytest.raises(ConfigError, match=re.escape(said)) as caught:
+            check_free(output, True)
+        assert len(str(caught.value).splitlines()) == 1
+    with pytest.raises(ConfigError, match=re.escape(said)), new_folder(output, True):
+        pass
+    assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize(("add", "said"), FOREIGN.values(), ids=FOREIGN)
+def test_what_comes_in_the_way_while_a_run_goes_on_stays_with_the_old_run(tmp_path: Path, add: Add, said: str) -> None:
+    output = a_run(tmp_path / "run")
+    with pytest.raises(ConfigError, match=re.escape(said)), new_folder(output, True) as new:  # noqa: PT012
+        write(new, {"config.yaml": "new"})
+        add(output)
+        before = everything(tmp_path)
+    left = {name for name in everything(tmp_path) if not name.startswith(".run-")}
+    assert left == {name for name in before if not name.startswith(".run-")}
+    assert [path.name for path in tmp_path.glob(".*")] == []
+
+
+def test_all_names_are_named_at_once(tmp_path: Path) -> None:
+    output = a_run(tmp_path / "run")
+    write(output, {"notes.txt": "mine", "evaluation/notes.txt": "mine", "metrics.json": "mine"})
+    with pytest.raises(ConfigError, match="holds evaluation/notes.txt, notes.txt, which .* and metrics.json, changed"):
+        check_free(output, True)
+
+
+def test_a_folder_as_torchid_left_it_is_replaced_whole_even_if_files_are_gone(tmp_path: Path) -> None:
+    output = a_run(tmp_path / "run")
+    (output / "metrics.json").unlink()
+    a_run(output, "new")
+    assert {path.read_text() for path in output.rglob("*") if path.is_file() and path.name != MANIFEST} == {"new"}
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    require_replaceable(output, RUN)
+
+
+OTHERS: dict[str, dict[str, str]] = {
+    "somebody's settings": {"config.yaml": "mine"},
+    "a run of an older version": {"config.yaml": "x", "parameters.json": "x", "hparams/events.out.tfevents.1": "x"},
+    "the manifest of a web page": {"manifest.json": '{"name": "app", "icons": []}'},
+    "a manifest cut short": {"manifest.json": '{"torchid": "a run", "files": {'},
+    "a manifest that is a list": {"manifest.json": "[]"},
+    "a manifest nested beyond all bounds": {"manifest.json": "[" * 10**5},
+    "a manifest of infinite sizes": {
+        "manifest.json": '{"torchid": "a run", "folder": "", "growing": [], "files": {"x": {"size": 1e999}}}'
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("files", OTHERS.values(), ids=OTHERS)
+def test_a_folder_without_a_manifest_of_torchid_is_no_run(tmp_path: Path, files: dict[str, str]) -> None:
+    write(tmp_path / "run", files)
+    before = everything(tmp_path)
+    with pytest.raises(
+        ConfigError, match="no manifest.json that says that torchid wrote a run; accepted: a new folder"
+    ):
+        check_free(tmp_path / "run", True)
+    assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize("place", ["../mine.txt", "{folder}/mine.txt", "link/mine.txt", ".."])
+def test_a_manifest_cannot_name_what_lies_elsewhere(tmp_path: Path, place: str) -> None:
+    write(tmp_path, {"mine.txt": "mine"})
+    output = a_run(tmp_path / "run")
+    manifest = read_manifest(output)
+    assert manifest is not None
+    text = (output / MANIFEST).read_text().replace("metrics.json", place.format(folder=tmp_path))
+    (output / "metrics.json").unlink()
+    (output / MANIFEST).write_text(text)
+    a_run(output, "new")
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def test_a_folder_of_one_kind_is_not_replaced_by_another(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "x", kind=SIMULATION) as folder:
+        write(folder, {"logs/a.npz": "x"})
+    for kind in (RUN, TRAINING, EVALUATION):
+        with pytest.raises(ConfigError, match="holds a simulation; accepted: a new folder"):
+            check_free(tmp_path / "x", True, kind)
+
+
+def test_inputs_are_no_part_of_what_is_replaced(tmp_path: Path) -> None:
+    output = a_run(tmp_path / "run")
+    (tmp_path / "link").symlink_to(output)
+    (tmp_path / "other.json").symlink_to(output / "metrics.json")
+    for path in (output / "metrics.json", tmp_path / "link" / "metrics.json", tmp_path / "other.json"):
+        with pytest.raises(ConfigError, match="which is an input; accepted: another output"):
+            check_free(output, True, RUN, [path])
+    check_free(output, True, RUN, ["experiment", tmp_path / "elsewhere", tmp_path, tmp_path / "runs"])
+    refuse_inputs(tmp_path / "ru", [output / "metrics.json"])
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="nothing is closed to root")
+def test_a_folder_that_may_not_be_changed_is_refused_before_any_work(tmp_path: Path) -> None:
+    output = a_run(tmp_path / "run")
+    (output / "hparams").chmod(0o555)
+    with pytest.raises(ConfigError, match="hparams, where nothing can be removed"):
+        check_free(output, True)
+    (output / "hparams").chmod(0o755)
+
+
+# ------------------------------------------------------------------------------------------------ killed processes
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+import torchid.commands.folder as folder, torchid.staging as staging
+from torchid.commands.manifest import Contents
+stop, output, calls = int(sys.argv[1]), Path(sys.argv[2]), 0
+def counted(function):
+    def call(*args, **kwargs):
+        global calls
+        calls += 1
+        if calls == stop:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*args, **kwargs)
+    return call
+for name in ("mkdir", "open", "rename", "unlink", "rmdir", "replace", "remove"):
+    setattr(os, name, counted(getattr(os, name)))
+with folder.new_folder(output, True) as new:
+    (new / "config.yaml").write_text("new")
+    (new / "hparams").mkdir()
+    (new / "hparams" / "events").write_text("new")
+"""
+
+
+def test_a_process_killed_at_any_step_loses_nothing_and_the_next_run_clears_what_it_left(tmp_path: Path) -> None:
+    """At every change that it makes to the disk, the one between the old run and the new included."""
+    stop, fates = 0, set()
+    while True:
+        stop += 1
+        place = tmp_path / str(stop)
+        output = a_run(place / "run")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads, which the child does not use
+            pid = os.fork()  # an interpreter would take a second to start
+        if not pid:
+            try:
+                sys.argv = ["", str(stop), str(output)]
+                exec(_KILLED, {})
+                os._exit(0)
+            finally:
+                os._exit(1)
+        ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        check_free(output, True)  # which clears what was left
+        text = (output / "config.yaml").read_text()
+        assert {path.read_text() for path in output.rglob("*") if path.is_file() and path.name != MANIFEST} == {text}
+        assert [path.name for path in place.iterdir()] == ["run"], stop
+        fates.add(text)
+        if not ended:
+            break
+        assert ended == -signal.SIGKILL
+    assert stop > 10
+    assert fates == {"old", "new"}
+
+
+def test_what_a_living_process_makes_and_what_only_looks_like_it_stay(tmp_path: Path) -> None:
+    output = tmp_path / "run"
+    names = {".run-notes.torchid/new/a", ".run-01234567.torchid/mine", ".run-01234567/new", ".run-0123456x.torchid/new"}
+    write(tmp_path, dict.fromkeys(names, "mine"))
+    (tmp_path / ".run-76543210.torchid").symlink_to(tmp_path / ".run-01234567")
+    before = everything(tmp_path)
+    with staging_folder(output) as living:
+        (living / "new").mkdir()
+        a_run(output)
+        assert (living / "new").exists()
+    shutil.rmtree(output)
+    assert everything(tmp_path) == before
+
+
+# ---------------------------------------------------------------------------------------------------------- commands
+
+
+@pytest.fixture(scope="module")
+def run(place: Path, server: Commands) -> Path:
+    """A finished run with an evaluation."""
+    output = place / "run"
+    assert server.run(["identify", str(place / "demo" / "quadruped.yaml"), f"output={output}"]).status == 0
+    for _ in range(2):  # an evaluation replaces one of its name
+        assert server.run(["evaluate", str(output), "--log", str(place / "demo" / "sway_test.npz")]).status == 0
+    return output
+
+
+@pytest.fixture
+def copy(run: Path, tmp_path: Path) -> Path:
+    shutil.copytree(run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def refused(server: Commands, arguments: list[str], folder: Path) -> str:
+    before = everything(folder)
+    ended = server.run(arguments)
+    assert (ended.status, len(ended.said)) == (2, 1), ended
+    assert everything(folder) == before
+    return ended.said[0]
+
+
+def test_a_run_lists_every_file_of_its_own(copy: Path, place: Path, server: Commands) -> None:
+    manifest = read_manifest(copy)
+    assert manifest is not None
+    names = {str(path.relative_to(copy)) for path in copy.rglob("*") if path.is_file()}
+    evaluation = {name for name in names if name.startswith("evaluation/")}
+    assert set(manifest.files) == names - evaluation - {MANIFEST}
+    assert len(evaluation) == 5
+    assert (
+        server.run(["identify", str(place / "demo" / "quadruped.yaml"), f"output={copy}", "overwrite=true"]).status == 0
+    )
+    assert not (copy / "evaluation").exists()
+    assert {path.name for path in copy.parent.iterdir()} == {"run"}
+
+
+def test_experiments_never_remove_what_they_read(copy: Path, place: Path, tmp_path: Path, server: Commands) -> None:
+    """A log in the output, the output above the logs, the URDF and the settings of the run that is replaced."""
+    demo, more = place / "demo", [f"output={copy}", "overwrite=true"]
+    shutil.copy(demo / "sway_test.npz", copy / "mine.npz")
+    line = refused(
+        server, ["identify", str(demo / "quadruped.yaml"), *more, f"logs.test=[{copy / 'mine.npz'}]"], tmp_path
+    )
+    assert "mine.npz, which is an input" in line
+    (copy / "mine.npz").unlink()
+    line = refused(server, ["identify", str(copy / "config.yaml"), *more], tmp_path)
+    assert "config.yaml, which is an input" in line
+    line = refused(
+        server, ["identify", str(demo / "quadruped.yaml"), *more, f"robot.urdf={copy}/identified.urdf"], tmp_path
+    )
+    assert "identified.urdf, which is an input" in line
+    shutil.copytree(demo, tmp_path / "project" / "logs")
+    for command in ("identify", "analyze"):
+        output = tmp_path / ("project.analysis" if command == "analyze" else "project")
+        if command == "analyze":
+            (tmp_path / "project").rename(output)
+        more = [f"output={tmp_path / 'project'}", "overwrite=true"]
+        line = refused(server, [command, str(output / "logs" / "quadruped.yaml"), *more], tmp_path)
+        assert "logs/quadruped.yaml, which is an input" in line
+
+
+def test_a_simulation_leaves_recorded_logs_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    motion = {"name": "m", "duration_s": 1.0}
+    settings = {"robot": {"urdf": "robot.urdf"}, "feet": [{"frame": "l_sole"}], "motions": [motion], "output": "proj"}
+    (tmp_path / "sim.yaml").write_text(yaml.safe_dump(settings))
+    write(tmp_path / "proj", {"logs/recorded.npz": "mine", "simulation.yaml": "mine", "nominal.urdf": "mine"})
+    for more in ("overwrite=true", "overwrite=false"):
+        arguments = ["simulate", str(tmp_path / "sim.yaml"), f"output={tmp_path / 'proj'}", more]
+        refusal(arguments, tmp_path, capsys)
+    with new_folder(tmp_path / "made", kind=SIMULATION) as folder:
+        write(folder, {"logs/m.npz": "x", "simulation.yaml": "x"})
+    write(tmp_path / "made", {"logs/recorded.npz": "mine"})
+    line = refusal([*arguments[:2], f"output={tmp_path / 'made'}", "overwrite=true"], tmp_path, capsys)
+    assert "holds logs/recorded.npz, which torchid did not write" in line
+
+
+def test_an_evaluation_somebody_wrote_in_is_not_replaced(copy: Path, place: Path, server: Commands) -> None:
+    arguments = ["evaluate", str(copy), "--log", str(place / "demo" / "sway_test.npz")]
+    (copy / "evaluation" / "sway_test" / "metrics.json").write_text("{}")
+    assert "metrics.json, changed since" in refused(server, arguments, copy)
+    write(copy, {"evaluation/sway_test/notes.txt": "mine"})
+    assert "holds notes.txt, which torchid did not write" in refused(server, arguments, copy)
+    (copy / "evaluation").rename(copy.parent / "elsewhere")
+    (copy / "evaluation").symlink_to(copy.parent / "elsewhere")
+    assert "evaluation: output: a link; accepted: a folder" in refused(server, arguments, copy.parent)
+
+
+def test_the_end_of_a_training_takes_and_removes_what_is_its_own(tmp_path: Path) -> None:
+    training = object.__new__(Training)
+    training.folder = tmp_path / "run.training"
+    with new_folder(training.folder, kind=TRAINING, growing=["checkpoint.pt", "events.out.tfevents.*.host.7.*"]) as new:
+        write(new, {"config.yaml": "old"})
+    own = {"checkpoint.pt": "x", "events.out.tfevents.1.host.7.0": "x"}
+    write(
+        training.folder,
+        own | {"notes.txt": "mine", "events.out.tfevents.mine": "mine", "more/checkpoint.pt": "mine"},
+    )
+    training.copy_curves(tmp_path)
+    assert [path.name for path in tmp_path.glob("events*")] == ["events.out.tfevents.1.host.7.0"]
+    with pytest.warns(TorchidWarning, match="run.training: stays: it holds what torchid did not write"):
+        training.remove_checkpoint()
+    left = {"notes.txt", "events.out.tfevents.mine", "more", "more/checkpoint.pt"}
+    assert set(everything(training.folder)) == left
+
+
+def test_a_training_does_not_begin_where_somebody_keeps_notes(place: Path, tmp_path: Path, server: Commands) -> None:
+    output = tmp_path / "run"
+    line = ["identify", str(place / "demo" / "quadruped.yaml"), f"output={output}",
+            "estimator={name: sgd, training: {epochs: 3, checkpoint_seconds: 0}}"]  # fmt: skip
+    with new_folder(tmp_path / "run.training", kind=TRAINING, growing=["checkpoint.pt"]) as folder:
+        write(folder, {"config.yaml": "old"})
+    write(tmp_path / "run.training", {"notes.txt": "mine", "events.out.tfevents.mine": "mine"})
+    assert "events.out.tfevents.mine, notes.txt, which torchid did not write" in refused(server, line, tmp_path)
+    (tmp_path / "run.training").rename(tmp_path / "elsewhere")
+    (tmp_path / "run.training").symlink_to(tmp_path / "elsewhere")
+    for more in ("overwrite=true", "--resume"):
+        assert "run.training: output: a link" in refused(server, [*line, more], tmp_path)
+    (tmp_path / "run.training").unlink()
+    shutil.rmtree(tmp_path / "elsewhere")
+    assert server.run([*line, "--resume"]).status == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_files_are_replaced_only_on_request_and_links_and_inputs_never(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, json_file, figure = tmp_path / "log.npz", tmp_path / "found.json", tmp_path / "found.png"
+    shutil.copy(place / "demo" / "sway_test.npz", log)
+    given = ["check", str(log), "--json", str(json_file), "--figure", str(figure)]
+    write(tmp_path, {"found.json": "mine", "found.png": "mine"})
+    assert "found.json: --json: exists; accepted: a new file, or --overwrite" in refusal(given, tmp_path, capsys)
+    json_file.unlink()
+    assert "found.png: --figure: exists" in refusal(given, tmp_path, capsys)
+    assert main([*given, "--overwrite"]) == 0
+    assert json.loads(json_file.read_text())
+    capsys.readouterr()
+    json_file.unlink()
+    json_file.symlink_to(figure)
+    assert "--json: a link" in refusal([*given, "--overwrite"], tmp_path, capsys)
+    (tmp_path / "same.npz").hardlink_to(log)
+    for target in (log, tmp_path / "." / "log.npz"):
+        assert "what is read" in refusal(["convert", str(log), str(target), "--overwrite"], tmp_path, capsys)
+
+
+# ----------------------------------------------------------------------------------------------------- where results go
+
+
+def test_results_of_what_ships_go_to_the_working_folder_and_nothing_into_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in (DEMO / "quadruped.yaml", *(ROOT / "configs").glob("*.yaml")):
+        if "motions" in yaml.safe_load(file.read_text()):
+            output = load_simulation(file).output
+        else:
+            output = load_analysis(file, ["logs=null", "analysis.compare={}"]).output
+        assert output.parent == tmp_path / "runs", file
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("ignored", [False, True])
+def test_calls_to_end_are_interrupts_even_in_the_background(number: signal.Signals, ignored: bool) -> None:
+    """A shell starts commands in the background with SIGINT ignored; SIGHUP that `nohup` ignores stays ignored."""
+    before = signal.getsignal(signal.SIGINT)
+    inherited = signal.signal(number, signal.SIG_DFL)  # whoever started the tests may have it ignored
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(KeyboardInterrupt), termination_as_interrupt():
+            signal.raise_signal(number)
+        done = []
+        with pytest.raises(KeyboardInterrupt), termination_as_interrupt(), interrupts_deferred():  # noqa: PT012
+            signal.raise_signal(number)
+            done.append("all of it")
+        assert done
+        if ignored:
+            with interrupts_deferred():
+                signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        signal.signal(number, inherited)
+    earlier = signal.signal(number, signal.SIG_IGN)
+    try:
+        with termination_as_interrupt():
+            signal.raise_signal(number)
+    finally:
+        signal.signal(number, earlier)
+
+
+# ------------------------------------------------------------------------------------------------------------ the name
+
+
+def test_nobody_is_told_to_install_the_torchid_of_somebody_else() -> None:
+    """That name on PyPI is another package."""
+    files = [
+        path for folder in ("torchid", "scripts", "docs", "configs", "tests") for path in (ROOT / folder).rglob("*")
+    ]
+    files += [ROOT / name for name in ("README.md", "Makefile", "pyproject.toml", "constraints.txt")]
+    wrong = re.compile(r"pip3? install (?:-\S+ )*['\"]?torchid\b(?!/)|\btorchid\[[a-z]")
+    for path in files:
+        if path.suffix in (".py", ".md", ".yaml", ".toml", ".txt", "") and path.is_file() and path != Path(__file__):
+            assert not wrong.search(path.read_text()), path
+    assert wrong.search("pip install 'torchid[oracle]'")
+    assert wrong.search("pip install torchid")
+
+
+def test_the_lock_has_a_version_within_bounds_of_every_package_that_is_needed() -> None:
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    text = (ROOT / "pyproject.toml").read_text().partition("dependencies = [")[2].partition("[project.scripts]")[0]
+    needed = [Requirement(x) for x in re.findall(r'"([a-z][^"]*[=<>\]][^"]*)"', text)]
+    lock = [Requirement(x) for x in (ROOT / "constraints.txt").read_text().splitlines() if x and x[0] != "#"]
+    versions = {canonicalize_name(x.name): next(iter(x.specifier)).version for x in lock}
+    assert len(needed) > 15
+    for one in needed:
+        if one.name != "torchid-robotics":
+            assert one.specifier.contains(versions[canonicalize_name(one.name)]), one
+    assert torchid.__version__

@@ -1,0 +1,237 @@
+"""A module beside the rigid body: it takes what no parameters explain, in its turn, and leaves them the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from descents import Fixed, Springs, World, arm, arm_world, cable, demo, half_way, still, with_cable
+from synthetic import Array
+from torch import Tensor, nn
+
+from torchid.errors import InputError
+from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
+
+MODES = ("joint", "parameters_first", "alternating")
+modes = pytest.mark.parametrize("mode", MODES)
+RIDGE, EPOCHS = 1e-5, 60
+
+
+@cache
+def unseen() -> World:
+    return arm_world(seed=5, extra=cable)
+
+
+@cache
+def without_cable() -> World:
+    return arm_world(seed=6)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A descent and, by epoch, the raw numbers and the module's parameters."""
+
+    estimate: SgdEstimate
+    epochs: list[Epoch]
+    raw: list[Tensor]
+    strength: list[Tensor]
+
+
+@cache
+def run(mode: str | None) -> Run:
+    """Without a module if there is no mode."""
+    w = with_cable()
+    residual = None if mode is None else Springs(w.robot.n)
+    adam = {"name": "Adam", "lr": 0.1}
+    settings = Sgd(RIDGE, epochs=EPOCHS, optimizer=adam, residual=mode or "joint", residual_weight=0.0)
+    trainer = Trainer(settings, w.problem, w.batches, unseen().batches, residual)
+    record = Run(trainer.estimate(), [], [], [])
+
+    def watch(epoch: Epoch | None) -> None:
+        record.raw.append(trainer.loss.learnable.raw.detach().clone())
+        if residual is not None:
+            record.strength.append(residual.strength.detach().clone())
+        if epoch is not None:
+            record.epochs.append(epoch)
+
+    watch(None)
+    estimate = trainer.run(watch)
+    return Run(estimate, record.epochs, record.raw, record.strength)
+
+
+def cost(w: World, phi: Array) -> float:
+    """Mean squared whitened residual of the parameters alone."""
+    return w.problem.cost(phi) / w.problem.rows
+
+
+# --------------------------------------------------------------------------------------------------------- what it does
+
+
+@pytest.mark.parametrize(("mode", "share"), [("joint", 0.15), ("alternating", 0.4), ("parameters_first", 0.7)])
+def test_a_module_explains_unseen_motion_that_no_parameters_can(mode: str, share: float) -> None:
+    """Of the held-out loss of the parameters alone 0.04, 0.24 and 0.45 were found to be left."""
+    alone = min(min(epoch.held_out for epoch in run(None).epochs), cost(unseen(), run(None).estimate.phi))
+    assert min(epoch.held_out for epoch in run(mode).epochs) < share * alone
+
+
+def test_parameters_trained_together_with_a_module_are_those_of_the_robot_without_the_cable() -> None:
+    """Of the loss on logs without the cable 0.013 was found to be left; parameters found first stay as spoilt."""
+    spoilt = cost(without_cable(), run(None).estimate.phi)
+    assert cost(without_cable(), run("joint").estimate.phi) < 0.05 * spoilt
+    assert cost(without_cable(), run("parameters_first").estimate.phi) > 0.5 * spoilt
+
+
+def test_a_module_finds_the_strength_of_the_cable_that_there_is() -> None:
+    strength = run("joint").strength[run("joint").estimate.best_epoch]
+    assert strength[3].tolist() == pytest.approx([0.0, 0.0, 3.0], abs=0.3)
+    assert strength[1, 1].item() == pytest.approx(-8.0, abs=1.0)
+
+
+def test_a_force_that_is_known_needs_no_training() -> None:
+    w, held_out = with_cable(), unseen()
+    settings = Sgd(RIDGE, epochs=20, optimizer={"name": "Adam", "lr": 0.1})
+    estimate = Trainer(settings, w.problem, w.batches, held_out.batches, Fixed(cable)).run()
+    assert cost(without_cable(), estimate.phi) < 0.1 * cost(without_cable(), run(None).estimate.phi)
+
+
+# ------------------------------------------------------------------------------------------------------------ in turns
+
+
+@modes
+def test_only_those_change_in_an_epoch_whose_turn_it_is(mode: str) -> None:
+    record = run(mode)
+    for number in range(1, EPOCHS + 1):
+        first = number <= EPOCHS // 2
+        ours, theirs = {
+            "joint": (True, True),
+            "parameters_first": (first, not first),
+            "alternating": (number % 2 == 1, number % 2 == 0),
+        }[mode]
+        assert torch.equal(record.raw[number], record.raw[number - 1]) == (not ours)
+        assert torch.equal(record.strength[number], record.strength[number - 1]) == (not theirs)
+
+
+def test_patience_waits_until_a_module_that_comes_last_had_its_turn() -> None:
+    w, residual = arm(), Springs(arm().robot.n)
+    settings = Sgd(epochs=20, patience=3, residual="parameters_first", residual_weight=0.0)
+    trainer = Trainer(settings, w.problem, w.batches, half_way().batches, residual)
+    seen: list[tuple[int, bool]] = []
+    trainer.run(lambda epoch: seen.append((epoch.number, bool(residual.strength.detach().any()))))
+    assert len(seen) >= 13
+    assert seen[9] == (10, False)
+    assert seen[10] == (11, True)
+
+
+@modes
+def test_a_module_is_left_as_it_was_found_and_can_be_trained_again(mode: str) -> None:
+    w, residual = arm(), Springs(arm().robot.n)
+    residual.offset = nn.Parameter(torch.ones(3, dtype=torch.float64), requires_grad=False)
+    for _ in range(2):
+        before = residual.strength.detach().clone()
+        Trainer(Sgd(epochs=3, residual=mode, residual_weight=0.0), w.problem, w.batches, residual=residual).run()
+        assert not torch.equal(residual.strength, before)
+        assert residual.strength.requires_grad
+        assert not residual.offset.requires_grad
+        assert residual.offset.tolist() == [1.0] * 3
+
+
+def test_a_module_may_learn_at_a_rate_of_its_own() -> None:
+    w, residual = arm(), Springs(arm().robot.n)
+    settings = Sgd(optimizer={"name": "Adam", "lr": 0.05}, residual_lr=0.5, residual_weight=0.0)
+    trainer = Trainer(settings, w.problem, w.batches, residual=residual)
+    assert [group["lr"] for group in trainer.optimizer.param_groups] == [0.05, 0.5]
+    assert trainer.run_epoch().learning_rate == 0.05
+
+
+# -------------------------------------------------------------------------------------------------------- what is said
+
+
+def test_the_shares_of_an_epoch_are_those_of_the_projected_forces() -> None:
+    """On the quadruped, whose contact forces nobody measures: what is projected away does not count."""
+    w = demo()
+    trainer = Trainer(Sgd(**still()), w.problem, w.batches, residual=Fixed(lambda q, v, a: 0.3 * v + 1.0))
+    phi = torch.from_numpy(trainer.phi())
+    epoch = trainer.run_epoch()
+    squares = {"rigid_body": 0.0, "residual": 0.0, "measured": 0.0}
+    misfit = 0.0
+    for batch in w.batches.chunks():
+        other = (batch.W.mT @ (0.3 * batch.v + 1.0)[..., None])[..., 0]
+        rigid = batch.K @ (w.batches.columns @ phi)
+        misfit += float((rigid + other - batch.f).square().sum())
+        for name, force in (("rigid_body", rigid), ("residual", other), ("measured", batch.f)):
+            squares[name] += float(force.square().sum())
+    expected = {name: np.sqrt(squares[name] / squares["measured"]) for name in ("rigid_body", "residual")}
+    assert epoch.shares == pytest.approx(expected, rel=1e-10)
+    assert expected["residual"] > 0.01
+    assert epoch.losses["data"] == pytest.approx(misfit / w.problem.rows, rel=1e-10)
+    assert "residual" not in epoch.losses, "it has no weight"
+
+
+def test_a_weight_pulls_the_module_to_zero() -> None:
+    w, shares = with_cable(), []
+    for weight in (0.0, 1.0, 100.0):
+        trainer = Trainer(
+            Sgd(RIDGE, epochs=15, residual_lr=0.2, residual_weight=weight), w.problem, w.batches, residual=Springs(6)
+        )
+        epochs: list[Epoch] = []
+        trainer.run(epochs.append)
+        shares.append(epochs[-1].shares["residual"])
+        if weight:
+            size = np.mean(torch.cat([batch.f for batch in w.batches.chunks()]).square().numpy())
+            assert epochs[-1].losses["residual"] == pytest.approx(weight * shares[-1] ** 2 * size, rel=1e-9)
+    assert shares[1] < 0.6 * shares[0]
+    assert shares[2] < 0.02 * shares[0]
+
+
+def test_the_module_evaluates_on_held_out_logs_and_trains_on_the_others() -> None:
+    w, held_out = arm(), half_way()
+    springs = Springs(w.robot.n)
+    with torch.no_grad():
+        springs.strength.normal_(generator=torch.Generator().manual_seed(0))
+    residual = nn.Sequential()  # a container, so that the mode reaches the dropout
+    residual.springs, residual.dropout = springs, nn.Dropout(0.5)
+    residual.forward = lambda q, v, a: residual.dropout(springs(q, v, a))  # type: ignore[method-assign]
+    trainer = Trainer(Sgd(**still(residual_weight=0.0)), w.problem, w.batches, held_out.batches, residual)
+    found = trainer.run_epoch()
+    total, phi = 0.0, torch.from_numpy(trainer.phi())
+    for batch in held_out.batches.chunks():
+        force = (
+            batch.K @ (held_out.batches.columns @ phi)
+            + (batch.W.mT @ springs(batch.q, batch.v, batch.a)[..., None])[..., 0]
+        )
+        total += float((force - batch.f).detach().square().sum())
+    assert found.held_out == pytest.approx(total / held_out.problem.rows, rel=1e-12)
+    assert residual.training
+
+
+# ------------------------------------------------------------------------------------------------------------ refusals
+
+
+@pytest.mark.parametrize(
+    ("force", "shape"),
+    [
+        (lambda q, v, a: torch.cat([v, v[:, :1]], dim=1), (50, 7)),
+        (lambda q, v, a: v[:, 0], (50,)),
+        (lambda q, v, a: v[:1], (1, 6)),
+        (lambda q, v, a: v[..., None], (50, 6, 1)),
+    ],
+    ids=["a joint too many", "one joint", "one sample", "columns"],
+)
+def test_a_force_of_another_shape_is_refused_and_never_broadcast(force: Any, shape: tuple[int, ...]) -> None:
+    w = arm()
+    trainer = Trainer(Sgd(epochs=1), w.problem, w.batches, residual=Fixed(force))
+    with pytest.raises(ValueError) as raised:
+        trainer.run()
+    assert str(raised.value) == f"residual: found a force of shape {shape}; accepted: (50, 6)"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_force_that_is_not_finite_ends_the_descent(value: float) -> None:
+    w = arm()
+    trainer = Trainer(Sgd(epochs=1), w.problem, w.batches, residual=Fixed(lambda q, v, a: torch.full_like(v, value)))
+    with pytest.raises(InputError, match="training: a loss of (nan|inf) in epoch 1"):
+        trainer.run()

@@ -1,0 +1,316 @@
+"""Conditions in an experiment file: what is written is what holds, and a slip is answered in one line."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from experiments import LEAST
+from refusals import assert_wrong_value
+from refusals import refusal as command_refusal
+from repository import DEMO
+from synthetic import G1, SOLO12, Oracle, load, make_log
+from urdfs import INERTIAL, ball, inertial, joint, link, table, write
+
+from torchid.commands.identify import identify
+from torchid.config import dump_config, load_config
+from torchid.config.estimator import EstimatorConfig
+from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError
+from torchid.estimators import Conditions, violations
+from torchid.estimators.conditions import mirror_matrix
+from torchid.fitting.estimator import batch_estimator, conditions_from
+from torchid.parameters import PARAMETERS
+from torchid.problem import RowBuilder, bind_log, compress, linear_problem
+from torchid.problem.linear import parameter_scale
+from torchid.robot import Robot, body_extents
+from torchid.sensing import Contact, named_sensors
+
+BIPED = DEMO / "biped.urdf"
+
+
+def settings_of(folder: Path, **keys: Any) -> EstimatorConfig:
+    """Of an experiment file that says so."""
+    path = folder / "experiment.yaml"
+    path.write_text(yaml.safe_dump(LEAST | {"estimator": {"name": "consistent", **keys}}))
+    config = load_config(path)
+    path.write_text(dump_config(config))
+    assert load_config(path) == config, "what a run writes down reads back as itself"
+    return config.estimator
+
+
+def conditions(folder: Path, robot: Robot, **keys: Any) -> Conditions:
+    return conditions_from(settings_of(folder, **keys), robot, "experiment.yaml")
+
+
+def refusal(folder: Path, robot: Robot, kind: type[InputError] = ConfigError, **keys: Any) -> str:
+    """The one line with which conditions are refused, less the file."""
+    with pytest.raises(InputError) as caught:
+        conditions(folder, robot, **keys)
+    assert type(caught.value) is kind
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith("experiment.yaml: estimator.")
+    assert "; accepted: " in message
+    return message.removeprefix("experiment.yaml: estimator.")
+
+
+@pytest.fixture(scope="module")
+def biped() -> Robot:
+    return load(BIPED)
+
+
+# ----------------------------------------------------------------------------------------------------------- values
+
+
+def test_without_keys_there_are_the_margin_and_friction_that_is_not_negative(tmp_path: Path, biped: Robot) -> None:
+    found = conditions(tmp_path, biped)
+    names = biped.body_names
+    assert found == Conditions(margin=1e-4, names=names)
+    found = conditions(tmp_path, biped, margin=0.01, total_mass=66)
+    assert found == Conditions(margin=0.01, total_mass=66.0, names=names)
+
+
+def test_bounds_stand_at_their_bodies_and_parameters(tmp_path: Path, biped: Robot) -> None:
+    bounds = {"l_shank": {"m": [0.5, 1], "fc": [0, 2]}, "pelvis": {"mcx": [None, 0.25], "Iyz": [-0.5, None]}}
+    found = conditions(tmp_path, biped, bounds=bounds | {"torso": {"m": [12, 12]}})
+    lower, upper = found.bounds(len(biped.bodies))
+    expected = {("l_shank", "m"): (0.5, 1.0), ("l_shank", "fc"): (0.0, 2.0), ("pelvis", "mcx"): (-np.inf, 0.25),
+                ("pelvis", "Iyz"): (-0.5, np.inf), ("torso", "m"): (12.0, 12.0)}  # fmt: skip
+    for body, name in enumerate(biped.body_names):
+        for number, parameter in enumerate(PARAMETERS):
+            low, high = expected.get((name, parameter), (0.0 if parameter in ("fc", "fv") else -np.inf, np.inf))
+            assert (lower[body, number], upper[body, number]) == (low, high)
+
+
+@pytest.mark.parametrize("kind", ["box", "ellipsoid"])
+@pytest.mark.parametrize("shapes", ["visual", "collision"])
+def test_centres_of_mass_are_kept_in_what_encloses_the_shapes(kind: str, shapes: Any, tmp_path: Path) -> None:
+    robot = load(SOLO12)
+    found = conditions(tmp_path, robot, com_inside=kind, com_shapes=shapes)
+    extents = body_extents(robot, shapes)
+    assert [enclosure.body for enclosure in found.enclosures] == list(extents)
+    for enclosure, extent in zip(found.enclosures, extents.values(), strict=True):
+        assert enclosure.kind == kind
+        np.testing.assert_array_equal(enclosure.half, extent.half if kind == "box" else extent.semi_axes)
+        np.testing.assert_array_equal(enclosure.centre, extent.centre)
+        np.testing.assert_array_equal(enclosure.axes, extent.axes)
+
+
+def test_visual_shapes_are_the_ones_asked_if_none_are_named(tmp_path: Path) -> None:
+    elements = link("base", f"{INERTIAL}{ball(0.1, 'collision')}{ball(0.2, 'visual')}")
+    (enclosure,) = conditions(tmp_path, load(write(tmp_path, elements)), com_inside="box").enclosures
+    np.testing.assert_allclose(enclosure.half, 0.2)
+
+
+def test_frozen_bodies_and_bodies_without_mass_are_not_enclosed_nor_complained_of(tmp_path: Path) -> None:
+    elements = [link("base", INERTIAL + ball(0.1)), link("arm"), link("hand", INERTIAL + ball(0.2)), link("ghost", "")]
+    joints = [joint("a", "base", "arm"), joint("b", "arm", "hand"), joint("c", "hand", "ghost")]
+    robot = load(write(tmp_path, *elements, *joints))
+    with pytest.warns(TorchidWarning, match="no shapes at arm: where") as caught:
+        assert [e.body for e in conditions(tmp_path, robot, com_inside="box").enclosures] == [0, 2]
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        frozen = conditions(tmp_path, robot, com_inside="box", frozen=["arm", "base"])
+    assert [e.body for e in frozen.enclosures] == [2]
+
+
+def test_a_urdf_that_contradicts_its_own_shapes_is_warned_of(tmp_path: Path) -> None:
+    """The collision shapes at the feet of G1 are four balls under the sole."""
+    robot = load(G1)
+    with pytest.warns(TorchidWarning) as caught:
+        conditions(tmp_path, robot, com_inside="ellipsoid", com_shapes="collision")
+    (message,) = (str(warning.message) for warning in caught)
+    assert message.startswith("experiment.yaml: estimator.com_inside: the URDF's own centre of mass is outside the")
+    assert "ellipsoid at left_ankle_roll_link, right_ankle_roll_link; " in message
+    assert conditions(tmp_path, robot, com_inside="ellipsoid").enclosures
+
+
+@pytest.mark.parametrize("kind", ["box", "ellipsoid"])
+def test_outside_is_judged_along_the_shapes_axes_and_for_the_kind_asked_for(kind: str, tmp_path: Path) -> None:
+    """A slender box turned by 45 degrees; the centre of mass is beyond its end by 1.2 or 2."""
+    for share, outside in ((0.9, ()), (1.2, ("box",)), (2.0, ("box", "ellipsoid"))):
+        place = share * 0.5 * np.sqrt(0.5)
+        solid = inertial(origin=f'<origin xyz="{place} {place} 0"/>')
+        shape = '<visual><origin rpy="0 0 0.7853981633974483"/><geometry><box size="1 0.1 0.1"/></geometry></visual>'
+        robot = load(write(tmp_path, link("base", solid + shape)))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            conditions(tmp_path, robot, com_inside=kind)
+        assert len(caught) == (kind in outside)
+
+
+def test_left_and_right_become_mirror_images(tmp_path: Path, biped: Robot) -> None:
+    found = conditions(tmp_path, biped, symmetry={"left": "l_", "right": "r_"}).mirrors
+    assert len(found) == 7
+    for mirror in found:
+        assert biped.body_names[mirror.body].replace("l_", "r_") == biped.body_names[mirror.image]
+        image = mirror_matrix(mirror.reflection) @ biped.nominal[mirror.body]
+        np.testing.assert_allclose(image, biped.nominal[mirror.image], atol=1e-12)
+
+
+def test_two_frozen_bodies_are_no_mirror_images_and_one_still_is(tmp_path: Path, biped: Robot) -> None:
+    symmetry = {"left": "l_", "right": "r_"}
+    one = conditions(tmp_path, biped, symmetry=symmetry, frozen=["l_foot"]).mirrors
+    both = conditions(tmp_path, biped, symmetry=symmetry, frozen=["l_foot", "r_foot"]).mirrors
+    assert (len(one), len(both)) == (7, 6)
+
+
+# --------------------------------------------------------------------------------------------------------- refusals
+
+
+@table({
+    "lower above upper": ({"torso": {"m": [2, 1]}}, "bounds.torso.m: 2 above 1; accepted: [lower, upper]"),
+    "frozen": ({"waist": {"m": [1, 2]}}, "bounds.waist.m: a bound on a body that is frozen"),
+    "base's friction": ({"pelvis": {"fv": [0, 1]}}, "bounds.pelvis.fv: a bound on friction, but pelvis is the base"),
+    "negative friction": ({"torso": {"fc": [-1, 1]}}, "bounds.torso.fc: [-1.0, 1.0]; accepted: bounds of at least 0"),
+    "friction at most negative": ({"torso": {"fv": [None, -1]}}, "bounds.torso.fv: [None, -1.0]; accepted: bounds"),
+    "no mass": ({"torso": {"m": [None, 0]}}, "bounds.torso.m: at most 0; accepted: an upper bound above 0"),
+    "no inertia": ({"torso": {"Iyy": [None, -2]}}, "bounds.torso.Iyy: at most -2; accepted: an upper bound above 0"),
+})  # fmt: skip
+def test_bounds_that_nothing_meets_are_refused(case: tuple, tmp_path: Path, biped: Robot) -> None:
+    bounds, found = case
+    assert refusal(tmp_path, biped, bounds=bounds, frozen=["waist"]).startswith(found)
+
+
+def test_bounds_on_what_is_not_fitted_are_refused(tmp_path: Path, biped: Robot) -> None:
+    message = refusal(tmp_path, biped, bounds={"torso": {"fc": [0, 1]}}, friction=False)
+    assert message == "bounds.torso.fc: a bound on friction, which is not fitted; accepted: friction: true"
+    robot = load(write(tmp_path, link("base"), link("ghost", ""), joint("a", "base", "ghost")))
+    message = refusal(tmp_path, robot, bounds={"ghost": {"m": [0.1, 1]}})
+    assert message.startswith("bounds.ghost.m: a bound, but ghost has no mass in the URDF")
+    assert conditions(tmp_path, robot, bounds={"ghost": {"fc": [0.1, 1]}}).upper is not None
+
+
+def test_unknown_names_are_answered_with_the_nearest(tmp_path: Path, biped: Robot) -> None:
+    message = refusal(tmp_path, biped, UnknownNameError, bounds={"l_shnk": {"m": [0, 1]}})
+    assert message.startswith("bounds: unknown name 'l_shnk'; accepted: l_shank")
+    message = refusal(tmp_path, biped, UnknownNameError, bounds={"l_shank": {"mass": [0, 1]}})
+    assert message.startswith("bounds.l_shank: unknown name 'mass'; accepted: m, mcx, ")
+    message = refusal(tmp_path, biped, UnknownNameError, bounds={"l_shank": {"Ixxx": [0, 1]}})
+    assert message.startswith("bounds.l_shank: unknown name 'Ixxx'; accepted: Ixx")
+
+
+def test_symmetry_that_is_none_is_refused_by_its_key(tmp_path: Path, biped: Robot) -> None:
+    message = refusal(tmp_path, biped, symmetry={"left": "links", "right": "rechts"})
+    assert message.startswith(
+        "symmetry: no two bodies differ in 'links' and 'rechts'; accepted: parts of names: pelvis"
+    )
+    message = refusal(tmp_path, biped, symmetry={"left": "l_", "right": "r_", "normal": "x"})
+    assert "l_hip and r_hip are 0.2 m from being mirror images along x in a robot of " in message
+
+
+def test_centres_of_mass_inside_nothing_are_refused(tmp_path: Path) -> None:
+    robot = load(DEMO / "quadruped.urdf")
+    with pytest.warns(TorchidWarning, match="no shapes at trunk, front_left_hip_link"):
+        message = refusal(tmp_path, robot, com_inside="box")
+    assert message.startswith("com_inside: box, but quadruped.urdf says of no body that is fitted what shape it has")
+    message = refusal(tmp_path, robot, com_shapes="collision")
+    assert message.startswith("com_shapes: collision, without com_inside; accepted: com_inside: box or ellipsoid")
+
+
+@table({
+    "word": ({"com_inside": "sphere"}, "com_inside", "'sphere'"),
+    "flag": ({"com_inside": True}, "com_inside", "True"),
+    "shapes": ({"com_inside": "box", "com_shapes": "both"}, "com_shapes", "'both'"),
+    "tokens": ({"symmetry": ["l_", "r_"]}, "symmetry", "a list"),
+    "one token": ({"symmetry": {"left": "l_"}}, "symmetry.right", "missing"),
+    "empty token": ({"symmetry": {"left": "", "right": "r_"}}, "symmetry.left", "''"),
+    "normal": ({"symmetry": {"left": "l_", "right": "r_", "normal": "up"}}, "symmetry.normal", "'up'"),
+    "bounds": ({"bounds": [1, 2]}, "bounds", "a list"),
+    "number": ({"bounds": {"torso": {"m": 3}}}, "bounds.torso.m", "3"),
+    "one number": ({"bounds": {"torso": {"m": [3]}}}, "bounds.torso.m", "a list"),
+    "three numbers": ({"bounds": {"torso": {"m": [1, 2, 3]}}}, "bounds.torso.m", "a list"),
+    "not a number": ({"bounds": {"torso": {"m": ["a", 2]}}}, "bounds.torso.m.0", "'a'"),
+    "not finite": ({"bounds": {"torso": {"m": [float("nan"), 2]}}}, "bounds.torso.m.0", "nan"),
+})  # fmt: skip
+def test_a_value_of_the_wrong_kind_is_refused_by_its_place(case: tuple, tmp_path: Path) -> None:
+    keys, place, found = case
+    file = tmp_path / "experiment.yaml"
+    assert_wrong_value(lambda: settings_of(tmp_path, **keys), file, f"estimator.{place}", found)
+
+
+@table({
+    "com_inside": {"com_inside": "box"},
+    "com_shapes": {"com_shapes": "collision"},
+    "symmetry": {"symmetry": {"left": "l_", "right": "r_"}},
+    "bounds": {"bounds": {"torso": {"m": [1, 2]}}},
+})  # fmt: skip
+def test_least_squares_has_no_conditions(case: dict, tmp_path: Path) -> None:
+    (key,) = case
+    file = tmp_path / "experiment.yaml"
+    assert_wrong_value(
+        lambda: settings_of(tmp_path, name="least_squares", **case),
+        file,
+        f"estimator.{key}",
+        "which least_squares has not",
+    )
+
+
+# --------------------------------------------------------------------------------------------------------- whole runs
+
+
+def demo(folder: Path, **estimator: Any) -> Path:
+    """The demo's experiment with its paths absolute and another estimator."""
+    config = load_config(DEMO / "quadruped.yaml")
+    file = folder / "experiment.yaml"
+    file.write_text(dump_config(replace(config, estimator=EstimatorConfig(), output=folder / "run")))
+    settings = yaml.safe_load(file.read_text())
+    settings["estimator"] = {"name": "consistent", "ridge": 0.001, **estimator}
+    file.write_text(yaml.safe_dump(settings))
+    return file
+
+
+def test_a_run_meets_its_conditions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of a run but its figures, which take ten times as long."""
+    monkeypatch.setattr(sys.modules["torchid.commands.identify"], "write_run", lambda *_: None)
+    bounds = {"trunk": {"m": [9.5, 9.5]}, "front_left_shank_link": {"fc": [0.35, None]}}
+    file = demo(tmp_path, symmetry={"left": "left", "right": "right"}, bounds=bounds, frozen=["rear_right_shank_link"])
+    robot = load(DEMO / "quadruped.urdf")
+    phi = identify(load_config(file)).estimate.phi.reshape(robot.nominal.shape)
+    np.testing.assert_allclose(phi[0, 0], 9.5, rtol=1e-7)
+    row = robot.body_names.index("front_left_shank_link")
+    assert phi[row, 10] >= 0.35 * (1.0 - 1e-7)
+    for name in robot.body_names:
+        if "left" in name:
+            left, right = (robot.body_names.index(n) for n in (name, name.replace("left", "right")))
+            expected = mirror_matrix(np.diag([1.0, -1.0, 1.0])) @ phi[left]
+            np.testing.assert_allclose(phi[right], expected, rtol=0.0, atol=1e-7)
+    frozen = robot.body_names.index("rear_right_shank_link")
+    np.testing.assert_array_equal(phi[frozen], robot.nominal[frozen])
+
+
+@pytest.mark.parametrize("kind", ["box", "ellipsoid"])
+def test_all_conditions_hold_together_where_least_squares_breaks_each(kind: str, tmp_path: Path) -> None:
+    """On torques that are mostly noise."""
+    robot, feet = load(SOLO12), ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
+    contacts = [Contact(foot, "point") for foot in feet]
+    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, 4))
+    rng = np.random.default_rng(0)
+    log = make_log(Oracle.of(robot), [(foot, 3) for foot in feet], [[True] * 4], 40, rng)
+    assert log.joint_torque is not None
+    log = replace(log, joint_torque=log.joint_torque + 5.0 * rng.normal(size=log.joint_torque.shape))
+    problem = linear_problem(compress([bind_log(log, robot, contacts)], builder), builder, robot)
+    keys = {"com_inside": kind, "symmetry": {"left": "L_", "right": "R_"}, "total_mass": 2.5,
+            "bounds": {"base_link": {"m": [1.2, 1.3]}, "FL_SHOULDER": {"fc": [0.05, 0.1]}}}  # fmt: skip
+    settings = settings_of(tmp_path, ridge=1e-3, margin=1e-3, **keys)
+    wanted, scale = conditions_from(settings, robot), parameter_scale(robot.nominal)
+    phi = batch_estimator(settings, wanted).solve(problem).phi.reshape(robot.nominal.shape)
+    assert violations(phi, scale, wanted, 1e-7) == []
+    assert phi[:, 0].sum() == pytest.approx(2.5)
+    plain = batch_estimator(replace(settings, name="least_squares"), wanted).solve(problem).phi
+    broken = " ".join(found.condition for found in violations(plain.reshape(phi.shape), scale, wanted))
+    for word in (f"outside its {kind}", "no mirror image", "total mass", "m beyond its bounds", "fc beyond", "margin"):
+        assert word in broken
+
+
+def test_a_slip_ends_a_run_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = demo(tmp_path, bounds={"trunck": {"m": [1, 2]}})
+    message = command_refusal(["identify", str(file)], tmp_path, capsys)
+    assert message.endswith("estimator.bounds: unknown name 'trunck'; accepted: trunk")

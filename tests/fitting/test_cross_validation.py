@@ -1,0 +1,369 @@
+"""How a fit is judged: by blocks of the logs that it has not seen, and by what no robot can be."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from repository import DEMO
+from synthetic import SOLO12, UR5, Oracle, load, make_log
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import torchid
+from torchid.cli import main
+from torchid.commands.plausibility import force_gain, implausibility, is_implausible_factor
+from torchid.config import load_config
+from torchid.errors import BaseLostError
+from torchid.estimators import LeastSquares
+from torchid.fitting.cross_validation import with_all_readings
+from torchid.fitting.experiment import set_up
+from torchid.identifiability.base_rank import StateReport, _of_base, require_base
+from torchid.identifiability.confounding import TotalMass
+from torchid.logs import read_log
+from torchid.logs.preprocess import preprocess
+from torchid.problem import (
+    LinearProblem,
+    Metrics,
+    RowBuilder,
+    Samples,
+    bind_log,
+    compress,
+    compress_parts,
+    linear_problem,
+)
+from torchid.problem.compression import FOLDS, merge_folds, merge_states, split_into_folds
+from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
+from torchid.sensing import Contact, SensorNoise, named_sensors
+
+FEET = [f"{place}_foot" for place in ("front_left", "front_right", "rear_left", "rear_right")]
+UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
+
+# ------------------------------------------------------------------------------------------------------------- folds
+
+
+@pytest.fixture(scope="module")
+def demo() -> tuple[RowBuilder, Samples]:
+    robot, contacts = torchid.load_robot(DEMO / "quadruped.urdf"), [Contact(foot, "point") for foot in FEET]
+    sensors = named_sensors("joints", robot.n, 4, SensorNoise(0.1, 0.5, 0.05))
+    log = bind_log(preprocess(read_log(DEMO / "sway_train.npz"), 8.0), robot, contacts, sensors)
+    return RowBuilder(robot, contacts, sensors), log
+
+
+@pytest.mark.parametrize("lengths", [(1250,), (600, 650), (625, 625), (1000, 125, 125), (105,) * 11])
+def test_folds_are_contiguous_blocks_that_hold_every_sample_once(
+    demo: tuple[RowBuilder, Samples], lengths: tuple[int, ...]
+) -> None:
+    builder, log = demo
+    starts = np.cumsum([0, *lengths])
+    logs = [replace(log[a:b], source=f"{a}") for a, b in zip(starts, starts[1:], strict=False)]
+    blocks = split_into_folds(logs, builder)
+    assert torch.equal(torch.cat([block.time for block in blocks]), torch.cat([one.time for one in logs]))
+    folds = [block.fold for block in blocks]
+    assert folds == sorted(folds)
+    assert set(folds) == set(range(max(folds) + 1)), "without a gap"
+    assert FOLDS - 1 <= len(set(folds)) <= FOLDS
+    sizes = [sum(len(block) for block in blocks if block.fold == fold) for fold in set(folds)]
+    assert max(sizes) <= 2 * min(sizes)
+    if len(lengths) > FOLDS:
+        assert len(blocks) == len(logs), "whole logs are left out where there are many"
+
+
+def test_too_few_independent_samples_are_not_cut(demo: tuple[RowBuilder, Samples]) -> None:
+    builder, log = demo
+    assert [block.fold for block in split_into_folds([log[:200]], builder)] == [0], (
+        "200 samples at 100 Hz, filtered at 8 Hz"
+    )
+
+
+def test_parts_of_folds_together_are_those_of_the_logs(demo: tuple[RowBuilder, Samples]) -> None:
+    builder, log = demo
+    parts = compress_parts(split_into_folds([log], builder), builder)
+    whole = merge_folds(parts, builder)
+    by_state = {part.state: part for part in compress_parts([log], builder)}
+    assert {part.state for part in whole} == set(by_state)
+    for part in whole:
+        R, expected = (x.factor.triangle() for x in (part, by_state[part.state]))
+        assert (part.samples, part.factor.rows) == (by_state[part.state].samples, by_state[part.state].factor.rows)
+        assert torch.allclose(R.T @ R, expected.T @ expected, rtol=0.0, atol=1e-12 * float(expected.norm() ** 2))
+    assert [part.fold for part in merge_states(parts, builder)] == list(range(FOLDS))
+
+
+# ------------------------------------------------------------------------------------------------------- whole runs
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("runs") / "demo"
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={output}", "estimator.ridge=auto"]) == 0
+    return output
+
+
+def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple[RowBuilder, Samples]) -> None:
+    _, log = demo
+    metrics, config = json.loads((run / "metrics.json").read_text()), load_config(run / "config.yaml")
+    weighed = set_up(config)  # with the noise that the run has estimated
+    builder = RowBuilder(weighed.robot, weighed.contacts, weighed.sensors)
+    robot, blocks, squares, rows = torchid.load_robot(DEMO / "quadruped.urdf"), split_into_folds([log], builder), 0.0, 0
+    for fold in range(FOLDS):
+        seen = [block for block in blocks if block.fold != fold]
+        phi = config.estimator.least_squares.solve(linear_problem(compress(seen, builder), builder, robot)).phi
+        (unseen,) = (block for block in blocks if block.fold == fold)
+        left = linear_problem(compress([unseen], builder), builder, robot)
+        squares, rows = squares + left.cost(phi), rows + left.rows
+    found = metrics["cross_validation"]
+    assert found["folds"] == FOLDS
+    assert found["identified"][WHITENED] == pytest.approx(np.sqrt(squares / rows), rel=1e-6)
+    assert found["nominal"][WHITENED] == pytest.approx(metrics["train_nominal"][WHITENED])
+    assert metrics["train"][WHITENED] < found["identified"][WHITENED] < 0.2 * found["nominal"][WHITENED]
+    assert (metrics["verdict"], metrics["worse_than_nominal"]) == (None, [])
+
+
+def test_the_chosen_ridge_is_the_largest_within_a_standard_error_of_the_best(run: Path) -> None:
+    found = json.loads((run / "metrics.json").read_text())["ridge_selection"]
+    best = min(found["mean_square"])
+    good = [
+        ridge
+        for ridge, mean, error in zip(found["tried"], found["mean_square"], found["standard_error"], strict=True)
+        if mean - best <= error
+    ]
+    assert found["ridge"] == max(good)
+    assert yaml.safe_load((run / "config.yaml").read_text())["estimator"]["ridge"] == found["ridge"]
+    assert min(found["tried"]) < found["ridge"] < max(found["tried"]), "the grid holds the best"
+
+
+def test_evaluate_and_tensorboard_have_the_whitened_projected_residual(run: Path) -> None:
+    assert main(["evaluate", str(run), "--log", str(DEMO / "sway_test.npz")]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    found = json.loads((run / "evaluation" / "sway_test" / "metrics.json").read_text())["sway_test"]
+    assert found["identified"][WHITENED] == pytest.approx(metrics["test"][WHITENED])
+    assert found["nominal"][WHITENED] == pytest.approx(metrics["test_nominal"][WHITENED])
+    events = EventAccumulator(str(run))
+    events.Reload()
+    scalars = events.Scalars(f"rms_error_left_out/{WHITENED}")
+    cross = json.loads((run / "metrics.json").read_text())["cross_validation"]
+    assert [x.value for x in scalars] == pytest.approx([cross[x][WHITENED] for x in ("nominal", "identified")])
+    assert "verdict/text_summary" in events.Tags()["tensors"]
+
+
+def reversed_torques(log: dict[str, Any]) -> None:
+    log["joint_torque"] = -log["joint_torque"]
+
+
+def reversed_wrenches(log: dict[str, Any]) -> None:
+    log["contact_wrench_local"] = -log["contact_wrench_local"]
+
+
+def downward_world(log: dict[str, Any]) -> None:
+    w, x, y, z = log["base_quat_wxyz"].T
+    log["base_quat_wxyz"] = np.stack([-x, w, -z, y], axis=1)
+    log["base_position_world"] = log["base_position_world"] * [1, -1, -1]
+
+
+def swapped_feet(log: dict[str, Any]) -> None:
+    log["contact_active"] = log["contact_active"][:, [1, 0, 3, 2]]
+
+
+def in_degrees(log: dict[str, Any]) -> None:
+    log["joint_position"] = np.rad2deg(log["joint_position"])
+
+
+def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[str]:
+    """Overrides for the demo with changed logs."""
+    for name in ("train", "test"):
+        with np.load(DEMO / f"sway_{name}.npz") as file:
+            log = dict(file)
+        change(log)
+        np.savez(folder / f"{name}.npz", **log)
+    return [f"logs.train=[{folder}/train.npz]", f"logs.test=[{folder}/test.npz]", f"output={folder}/run"]
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "told"),
+    [
+        (
+            reversed_torques,
+            ["sensors.set=joints"],
+            ("total mass is -21.24", "opposite sign", "joint_torque: all reversed"),
+        ),
+        (reversed_torques, ["estimator.name=consistent"], ("-1.03 times what the URDF's bodies need", "all reversed")),
+        (reversed_torques, ["sensors.set=full"], ("times the stated sensor noise", "joint_torque: all reversed")),
+        (reversed_wrenches, ["sensors.set=contacts"], ("opposite sign", "contact_wrench_local: all reversed")),
+        (downward_world, ["sensors.set=joints"], ("total mass is -", "opposite sign")),
+        (swapped_feet, ["sensors.set=joints"], ("total mass is -", "opposite sign", "contact_active: ")),
+        (in_degrees, ["sensors.set=joints"], ("torchid check finds in train.npz: joint_position", "degrees")),
+    ],
+    ids=lambda x: x.__name__ if callable(x) else "".join(x),
+)
+def test_what_no_robot_can_be_ends_the_run_in_one_line_that_says_what_it_points_to(
+    tmp_path: Path,
+    change: Callable[[dict[str, Any]], None],
+    options: list[str],
+    told: tuple[str, ...],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    before = changed(tmp_path, change)
+    assert main(["identify", str(DEMO / "quadruped.yaml"), *before, *options]) == 2
+    printed = capsys.readouterr()
+    assert len(printed.err.splitlines()) == 1
+    assert printed.out == ""
+    for text in told:
+        assert text in printed.err
+    assert not (tmp_path / "run").exists()
+
+
+def scalars_of_the_feet(log: dict[str, Any]) -> None:
+    """Sizes of the feet's forces, entered as if they were all along the frames' z axes."""
+    wrench = np.zeros_like(log["contact_wrench_local"])
+    wrench[..., 2] = np.linalg.norm(log["contact_wrench_local"][..., :3], axis=-1)
+    log["contact_wrench_local"] = wrench
+
+
+def test_a_fit_that_predicts_worse_than_the_urdf_says_so_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [*changed(tmp_path, scalars_of_the_feet), "sensors.set=contacts"]
+    assert main(["identify", str(DEMO / "quadruped.yaml"), *options]) == 0
+    printed = capsys.readouterr()
+    headline, *_ = printed.out.splitlines()
+    assert headline.startswith("WORSE THAN URDF: the identified parameters predict worse than the URDF's")
+    assert "NumericalWarning" in printed.err
+    assert "predict worse than the URDF's, on blocks left out of the fit: joint torque" in printed.err
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["verdict"] in printed.err
+    worse = {(x["logs"], x["group"]): x for x in metrics["worse_than_nominal"]}
+    found = worse["test logs", "joint_torque"]
+    assert found["identified"] == metrics["test"]["joint_torque_rms"] > metrics["test_nominal"]["joint_torque_rms"]
+
+
+# ---------------------------------------------------------------------------------------------------------- the verdict
+
+
+def metrics_of(rms: float, measured: float, group: str = "base_force") -> Metrics:
+    values: dict[str, float | None] = dict.fromkeys([*ROW_GROUPS, WHITENED])
+    return Metrics({**values, group: rms}, {**values, group: rms / measured if rms else 0.0}, {}, {}, None)
+
+
+@pytest.mark.parametrize(
+    ("nominal", "identified", "worse"),
+    [
+        (1.0, 1.2, True),
+        (1.0, 1.04, False),
+        (1.0, 0.5, False),
+        (0.0, 1e-9, False),
+        (1e-12, 1e-10, False),
+        (0.0, 1, True),
+    ],
+)
+def test_worse_is_clearly_larger_and_no_rounding(nominal: float, identified: float, worse: bool) -> None:
+    found = worse_than_nominal({"test": (metrics_of(nominal, 100.0), metrics_of(identified, 100.0))})
+    assert bool(found) is worse
+    assert (describe_worse(found) is None) is not worse
+
+
+def test_what_was_not_measured_is_not_judged() -> None:
+    nothing = Metrics(dict.fromkeys(ROW_GROUPS), dict.fromkeys(ROW_GROUPS), {}, {}, None)
+    assert worse_than_nominal({"test": (nothing, nothing)}) == []
+
+
+# ------------------------------------------------------------------------------------------------- what no robot can be
+
+
+def arm_problem(factor: float = 1.0) -> tuple[LinearProblem, torchid.Robot]:
+    robot = load(UR5, fixed_base=True)
+    log = make_log(Oracle.of(robot), [], [()], 200, np.random.default_rng(0))
+    log = replace(log, joint_torque=factor * np.asarray(log.joint_torque))
+    builder = RowBuilder(robot, [], named_sensors("joints", robot.n, 0))
+    return linear_problem(compress([bind_log(log, robot, [])], builder), builder, robot), robot
+
+
+@pytest.mark.parametrize(("factor", "stops"), [(1.0, False), (3.0, False), (-1.0, True), (1e3, True), (1e-3, True)])
+def test_an_arm_s_torques_of_the_wrong_sign_or_unit_are_noticed_without_a_total_mass(
+    factor: float, stops: bool
+) -> None:
+    problem, robot = arm_problem(factor)
+    assert force_gain(problem) == pytest.approx(factor, rel=1e-6)
+    estimate, unknown = LeastSquares().solve(problem), TotalMass(float("inf"), True, -3.0, 18.0)
+    found = implausibility(problem, estimate.phi, unknown, robot)
+    assert (found is not None) is stops
+    assert ("opposite sign" in (found or "")) is (factor < 0.0)
+
+
+def test_forces_that_have_nothing_to_do_with_the_urdf_s_have_no_factor() -> None:
+    problem, _ = arm_problem()
+    noise = np.random.default_rng(1).normal(size=problem.b.shape)
+    assert force_gain(replace(problem, b=noise)) is None
+    assert force_gain(replace(problem, b=0.0 * noise)) is None
+
+
+def test_a_single_body_may_break_conditions_but_not_be_beyond_all_bounds() -> None:
+    problem, robot = arm_problem()
+    unknown, phi = TotalMass(float("inf"), True, 0.0, 18.0), problem.nominal.copy()
+    phi[12] = -3.0  # seen in combination with others only: a condition that is broken, and no more
+    assert implausibility(problem, phi, unknown, robot) is None
+    phi[12] = 1e11
+    assert "shoulder_link has m = 1e+11" in (implausibility(problem, phi, unknown, robot) or "")
+    phi[12], phi[22] = 3.0, 3.9e161
+    assert "fc = 3.9e+161" in (implausibility(problem, phi, unknown, robot) or "")
+
+
+@pytest.mark.parametrize(
+    ("mass", "determined", "stops"),
+    [
+        (TotalMass(0.1, True, -65.9, 15.0), True, True),
+        (TotalMass(0.1, True, 16.0, 15.0), True, False),
+        (TotalMass(0.1, True, 151.0, 15.0), True, True),
+        (TotalMass(20.0, True, -5.0, 15.0), False, False),
+        (TotalMass(0.1, False, -5.0, 15.0), False, False),
+        (TotalMass(float("inf"), True, -5.0, 15.0), False, False),
+    ],
+)
+def test_a_total_mass_counts_where_the_data_determine_it(mass: TotalMass, determined: bool, stops: bool) -> None:
+    problem, robot = arm_problem()
+    assert mass.determined is determined
+    assert (implausibility(problem, problem.nominal, mass, robot) is not None) is stops
+
+
+def test_a_ratio_that_is_no_number_is_absurd() -> None:
+    assert is_implausible_factor(float("nan"))
+    assert is_implausible_factor(float("inf"))
+    assert not is_implausible_factor(1.0)
+
+
+# ------------------------------------------------------------------------------------------------------------- the base
+
+
+def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
+    values = torch.ones(64, 6)
+    values[:63, 2:] = 0.0
+    rank, smallest, full, shares = _of_base(values, torch.ones(64))
+    assert (rank, smallest, full) == (2, 0.0, 1 / 64)
+    assert shares == {6: 1 / 64, 2: 63 / 64}
+    with pytest.raises(BaseLostError, match=r"rank 2 of 6, 6 in 1.6 % of them"):
+        require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
+    rank, smallest, full, shares = _of_base(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
+    assert rank == 6, "a sample counts as often as it stands for others"
+
+
+# ----------------------------------------------------------------------------------------- whatever the sensors are
+
+
+def test_samples_without_a_reading_are_left_out_of_the_residual() -> None:
+    robot, contacts = load(SOLO12), [Contact("FL_FOOT", "point")]
+    log = make_log(Oracle.of(robot), [("FL_FOOT", 3)], [(True,), (False,)], 20, np.random.default_rng(0))
+    samples = bind_log(log, robot, contacts)
+    assert samples.torque is not None
+    assert samples.wrench is not None
+    samples.torque[3, 2] = np.nan
+    samples.wrench[4, 0, 1] = samples.wrench[5, 0, 1] = np.nan  # 5: in the air
+    for name, lost in (("full", {3, 4}), ("joints", {3}), ("contacts", {4})):
+        found = with_all_readings(samples, RowBuilder(robot, contacts, named_sensors(name, robot.n, 1)))
+        assert set(range(20)) - {samples.time.tolist().index(t) for t in found.time.tolist()} == lost
+    silent = replace(samples, torque=None)
+    assert len(with_all_readings(silent, RowBuilder(robot, contacts, named_sensors("joints", robot.n, 1)))) == 0

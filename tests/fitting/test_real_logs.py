@@ -1,0 +1,71 @@
+"""Recorded logs with unknown offsets: an arm whose torque sensors have some, and a person whose plates are made to."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from repository import CONFIGS, SHARED
+
+from torchid.cli import main
+from torchid.errors import ConfoundedWarning
+from torchid.identifiability.confounding import INFLATION_LIMIT
+
+pytestmark = pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
+
+
+def identified(output: Path, config: str, *overrides: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What `torchid identify` writes: metrics and parameters."""
+    assert main(["identify", str(CONFIGS / config), f"output={output}", *overrides]) == 0
+    metrics, parameters = (json.loads((output / f"{name}.json").read_text()) for name in ("metrics", "parameters"))
+    return metrics, parameters
+
+
+def test_an_arm_is_predicted_to_two_and_a_half_percent_on_a_run_that_no_fit_has_seen(tmp_path: Path) -> None:
+    metrics, parameters = identified(tmp_path / "kuka", "kuka_lwr4.yaml")
+    assert metrics["test"]["nullspace_rms_relative"] <= 0.025  # rms over all joints; 0.0214 measured
+    offsets = {x["name"]: x for x in parameters["extras"]}
+    assert len(offsets) == 7
+    assert all(x["what"] == "offset" and x["log"] is None and x["unit"] == "N m" for x in offsets.values())
+
+
+def with_plates_off(folder: Path) -> Path:
+    """The training log of the squats, each axis of both plates off by 20 to 80 N."""
+    rng = np.random.default_rng(0)
+    with np.load(SHARED / "human_squats" / "squats1.npz") as log:
+        fields = dict(log)
+    off = rng.uniform(20.0, 80.0, (2, 3)) * rng.choice([-1.0, 1.0], (2, 3))
+    fields["contact_wrench_world"] = fields["contact_wrench_world"] + np.pad(off, ((0, 0), (0, 3)))
+    np.savez(folder / "off.npz", **fields)
+    return folder / "off.npz"
+
+
+def test_a_person_whose_feet_never_leave_the_plates_is_told_that_offset_and_mass_cannot_be_told_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, choice = (
+        with_plates_off(tmp_path),
+        "sensors={set: contacts, offsets: {contact_force: log, contact_moment: log}}",
+    )
+    overrides = f"logs.train=[{path}]", "logs.test=[]", choice
+    metrics, parameters = identified(tmp_path / "run", "human_squats.yaml", *overrides)
+    (message,) = [line for line in capsys.readouterr().err.splitlines() if ConfoundedWarning.__name__ in line]
+    sensors, parameters_named = message.split(" are confounded with ")
+    for plate in ("calcn_l", "calcn_r"):
+        (own,) = [part for part in sensors.split("; ") if plate in part]
+        assert "fz" in own
+    assert any(f" of {body['name']};" in parameters_named for body in parameters["bodies"])
+    assert any("m" in part.split(" of ")[0].split(", ") for part in parameters_named.split("; "))
+
+    vertical = [x for x in parameters["extras"] if x["component"] == "fz"]
+    assert len(vertical) == 2
+    for x in vertical:
+        assert x["told_apart"] is False
+        assert x["inflation"] > 3.0 * INFLATION_LIMIT
+        assert any(name.endswith((" m", " mcx", " mcy", " mcz")) for name in x["mixed_with"])
+    assert metrics["total_mass_told_from_offsets"] is False
+    verdicts = {body["name"]: body["verdict"]["m"] for body in parameters["bodies"]}
+    assert "identified" not in verdicts.values()

@@ -1,0 +1,290 @@
+"""What is said of unknowns beside the bodies' parameters: standard errors, and which cannot be told apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from motions import value
+from recordings import Miscalibration, in_world
+from synthetic import G1, Array, Oracle, load, make_log
+from unknowns import Fit, fit
+from urdfs import BASE, inertial, joint, link, write
+from welded import SENSORS, machine
+
+from torchid.config import load_config
+from torchid.errors import ConfigError
+from torchid.identifiability.confounding import INFLATION_LIMIT, total_mass
+from torchid.logs import Log
+from torchid.logs.preprocess import preprocess
+from torchid.parameters import WRENCH_COMPONENTS
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
+from torchid.problem.chunks import chunks_by_state
+from torchid.problem.compression import free_parameters
+from torchid.problem.extras import CHANNELS
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors, with_ft_sensors
+
+CONTACTS = (Contact("sole", "flat"), Contact("fin", "point"))
+STATES = [[True, False], [True, True], [False, True], [False, False]]
+NOISE = SensorNoise(joint_torque=0.5, contact_force=2.0, contact_moment=0.2, base_force=1e-6, base_moment=1e-7)
+OFFSETS = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log") | {"ft_force": "all", "ft_moment": "all"})
+Recorded = tuple[Robot, Oracle, list[Samples]]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """Two noise-free logs of the skew machine with sensors that are off, the same in both."""
+    rng = np.random.default_rng(3)
+    robot = load(machine(tmp_path_factory.mktemp("skew")), None, False, SENSORS[2:3])
+    oracle = Oracle.of(robot)
+    logs = [make_log(oracle, [("sole", 6), ("fin", 3)], STATES, 80, rng, name) for name in ("a.npz", "b.npz")]
+    found = Miscalibration.random(logs[0], rng)
+    return robot, oracle, [bind_log(found.read(log), robot, CONTACTS) for log in logs]
+
+
+def sensors_of(robot: Robot) -> SensorSet:
+    return with_ft_sensors(named_sensors("full", robot.n, len(CONTACTS), NOISE, ft=1), robot, robot.ft_names)
+
+
+def noisy(samples: Samples, robot: Robot, generator: torch.Generator) -> Samples:
+    """With the noise that is stated."""
+    torque, wrench = value(samples.torque), value(samples.wrench)
+    std = torch.from_numpy(NOISE.dof_std(robot.n, robot.n_dofs)), torch.from_numpy(NOISE.wrench_std)
+
+    def noise(x: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+        return x + scale * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+
+    return replace(samples, torque=noise(torque, std[0]), wrench=noise(wrench, std[1]))
+
+
+def stacked(builder: RowBuilder, robot: Robot, logs: list[Samples]) -> tuple[Array, Array, list[tuple[str, str]]]:
+    """All rows [K | extras], the extras of each log in columns of their own, the right-hand side, and the labels."""
+    labels = [(log.source, x.label) for log in logs for x in builder.extras if x.per_log]
+    labels += [("", x.label) for x in builder.extras if not x.per_log]
+    count, M = builder.columns.count, builder.columns.parameter_map()
+    blocks, right = [], []
+    for log in logs:
+        for state, index in chunks_by_state(log):
+            for support, rows in builder.rows(log[index], state):
+                wide = np.zeros((len(rows), builder.width))
+                wide[:, list(support)] = rows[:, :-1].numpy()
+                extra = np.zeros((len(rows), len(labels)))
+                for number, x in enumerate(builder.extras):
+                    extra[:, labels.index((log.source if x.per_log else "", x.label))] = wide[:, count + number]
+                blocks.append(np.hstack([wide[:, :count] @ M, extra]))
+                right.append(rows[:, -1].numpy().copy())
+    return np.vstack(blocks), np.concatenate(right), labels
+
+
+@pytest.mark.parametrize("oversampling", [1.0, 7.0])
+@pytest.mark.parametrize(
+    "terms",
+    [
+        OFFSETS,
+        ExtraTerms(
+            offsets={"joint_torque": "all", "contact_moment": "log"}, scales={"contact_force": "log"}, armature=True
+        ),
+    ],
+    ids=["offsets", "scales and actuators too"],
+)
+def test_eliminating_unknowns_is_solving_for_all_at_once(
+    recorded: Recorded, terms: ExtraTerms, oversampling: float
+) -> None:
+    """Values, standard errors, rank and residual against numpy on the stacked rows of all logs with all columns."""
+    robot, _, logs = recorded
+    generator = torch.Generator().manual_seed(0)
+    logs = [replace(noisy(log, robot, generator), oversampling=oversampling) for log in logs]
+    found = fit(robot, CONTACTS, sensors_of(robot), terms, logs)
+    X, y, labels = stacked(found.builder, robot, logs)
+    free, scale = free_parameters(robot), found.assembly.problem.scale
+    nominal = robot.nominal.flatten()
+    units = np.append(scale[free], np.ones(len(labels)))
+    columns = np.hstack([X[:, : len(free)][:, free], X[:, len(free) :]]) * units
+    y = y - X[:, : len(free)] @ nominal
+    norms = np.linalg.norm(columns, axis=0)
+    _, values, Vt = np.linalg.svd(columns / norms, full_matrices=False)
+    rank = int((values > 1e-9 * values[0]).sum())
+    inverse = np.linalg.pinv(columns / norms, rcond=1e-9) / norms[:, None]
+    step = inverse @ y
+    residual = y - columns @ step
+    noise = np.sqrt(oversampling * (residual @ residual) / (len(y) - oversampling * rank))
+    assert found.estimate.rank == rank - len(labels)
+    assert np.sqrt(oversampling) * found.estimate.residual_std == pytest.approx(noise, rel=1e-3)  # a rounded row count
+    error = noise * np.linalg.norm(inverse, axis=1)
+    assert {(x.log, x.extra.label) for x in found.extras} == set(labels)
+    for x in found.extras:
+        place = free.sum() + labels.index((x.log, x.extra.label))
+        assert x.value == pytest.approx(step[place], rel=1e-8, abs=1e-8)
+        assert x.standard_error == pytest.approx(error[place], rel=1e-3)
+    known = found.estimate.identifiable
+    expected = nominal.copy()
+    expected[free] += step[: free.sum()] * scale[free]
+    np.testing.assert_allclose(found.estimate.phi[known], expected[known], rtol=1e-7, atol=1e-7 * scale[known].max())
+    errors = np.full(len(free), np.nan)
+    errors[free] = error[: free.sum()] * scale[free]
+    np.testing.assert_allclose(found.estimate.standard_error[known], errors[known], rtol=1e-3)
+
+
+def slide(folder: Path) -> Robot:
+    """A bolted column on which a carriage of 2 kg slides up and down."""
+    limit = '<axis xyz="0 0 1"/><limit lower="-9" upper="9" effort="9" velocity="9"/>'
+    lift = joint("lift", "base", "arm", "prismatic", limit)
+    return load(write(folder, BASE, link("arm", inertial("2")), lift), None, True)
+
+
+def test_95_percent_intervals_of_offsets_hold_the_truth_that_often(tmp_path: Path) -> None:
+    """200 repetitions, with the noise that is stated, of five short logs of a slide."""
+    robot, rng = slide(tmp_path), np.random.default_rng(9)
+    terms = ExtraTerms(offsets={"joint_torque": "log"})
+    sensors = named_sensors("joints", robot.n, 0, NOISE)
+    logs = [bind_log(make_log(Oracle.of(robot), [], [[]], 8, rng, f"{k}.npz"), robot, ()) for k in range(5)]
+    generator, hits = torch.Generator().manual_seed(1), []
+    for _ in range(200):
+        found = fit(robot, (), sensors, terms, [noisy(log, robot, generator) for log in logs])
+        hits += [abs(x.value) < 1.96 * x.standard_error for x in found.extras]
+    assert len(hits) == 200 * len(logs)
+    assert 0.93 < np.mean(hits) < 0.97
+
+
+def test_a_contact_that_never_touches_in_a_log_has_no_offset_there(recorded: Recorded) -> None:
+    robot, _, logs = recorded
+    without = replace(logs[1], active=logs[1].active & torch.tensor([True, False]))
+    touching = ~logs[1].active[:, 1]
+    found = fit(robot, CONTACTS, sensors_of(robot), OFFSETS, [logs[0], without[touching.nonzero()[:, 0]]])
+    labels = {(x.log, x.extra.label) for x in found.extras}
+    assert ("a.npz", "offset of fin fz") in labels
+    assert not {label for log, label in labels if log == "b.npz" and "fin" in label}
+    assert all(np.isfinite(x.value) and np.isfinite(x.standard_error) for x in found.extras)
+    complete = fit(robot, CONTACTS, sensors_of(robot), OFFSETS, logs)
+    for key in labels:
+        assert found.values[key] == pytest.approx(complete.values[key], abs=1e-6)
+
+
+# ------------------------------------------------------------------------------------------- what cannot be told
+
+
+@pytest.mark.parametrize("acceleration", [0.0, 0.3, 0.9, 1.1, 3.0])
+def test_an_offset_and_a_weight_are_as_far_apart_as_the_acceleration_is_from_constant(
+    tmp_path: Path, acceleration: float
+) -> None:
+    """Of f = m (a + g) + o: the error of o grows by rms(a + g) / std(a) if m is not known."""
+    robot, rng = slide(tmp_path), np.random.default_rng(4)
+    a = acceleration * rng.choice([-1.0, 1.0], (200, 1))
+    s = a + 9.81
+    log = Log("lift.npz", np.arange(200) * 0.01, ("lift",), 0 * a, 0 * a, a, 2.0 * s + 7.0)
+    sensors = named_sensors("joints", 1, 0)
+    (found,) = fit(robot, (), sensors, ExtraTerms(offsets={"joint_torque": "all"}), [bind_log(log, robot, ())]).extras
+    if acceleration:
+        assert found.inflation == pytest.approx(np.sqrt((s**2).mean()) / a.std(), rel=1e-6)
+        assert found.value == pytest.approx(7.0, abs=1e-6)
+    assert found.separable == (acceleration > 9.81 / INFLATION_LIMIT)
+    if not found.separable:
+        assert found.confounded_with == ("arm m",)
+        assert (found.standard_error == np.inf) == (acceleration == 0.0)
+
+
+FEET = tuple(Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right"))
+
+
+@cache
+def standing(lifted: bool) -> Fit:
+    """An upright humanoid at rest in many postures, plates along world axes; both feet down, or each lifted in turn."""
+    robot, rng = load(G1), np.random.default_rng(5)
+    oracle = Oracle.of(robot)
+    states = [[True, True], [True, False], [False, True]] if lifted else [[True, True]]
+    log = make_log(oracle, [(foot.frame, 6) for foot in FEET], states, 3, rng)
+    N, n = 300, robot.n
+    q = np.hstack([np.zeros((N, 6)), np.ones((N, 1)), rng.uniform(-0.4, 0.4, (N, n))])
+    still = np.zeros((N, 6 + n))
+    active = np.array([states[i % len(states)] for i in range(N)])
+    needed = oracle.forces(q, still, still)
+    J = np.stack([oracle.jacobian(q, foot.frame) for foot in FEET], axis=1) * active[:, :, None, None]
+    J = J.reshape(N, 12, -1)
+    wrench = np.linalg.pinv(J[:, :, :6].transpose(0, 2, 1)) @ needed[:, :6, None]
+    torque = needed[:, 6:] - (J[:, :, 6:].transpose(0, 2, 1) @ wrench)[..., 0]
+    zero = np.zeros((N, 3))
+    log = Log(
+        "standing.npz", np.arange(N) * 0.01, robot.joint_names, q[:, 7:], still[:, 6:], still[:, 6:], torque,
+        base_quat_xyzw=q[:, 3:7], base_linear_acceleration_world=zero, base_angular_velocity_base=zero,
+        base_angular_acceleration_base=zero, contact_names=tuple(foot.frame for foot in FEET), contact_active=active,
+        contact_wrench_local=wrench.reshape(N, 2, 6),
+    )  # fmt: skip
+    samples = bind_log(in_world(oracle, log), robot, FEET)
+    return fit(robot, FEET, named_sensors("full", n, 2), ExtraTerms(offsets={"contact_force": "log"}), [samples])
+
+
+@pytest.mark.parametrize("lifted", [False, True], ids=["both feet always down", "each lifted in turn"])
+def test_only_a_lifted_foot_tells_its_plates_vertical_offset_from_the_mass_of_a_robot_at_rest(lifted: bool) -> None:
+    found = standing(lifted)
+    apart = {x.extra.component: x.separable for x in found.extras}
+    vertical = [x for x in found.extras if x.extra.component == "fz"]
+    mass = total_mass(found.assembly, found.estimate)
+    assert len(vertical) == 2
+    assert apart["fz"] == lifted
+    assert mass.separable == lifted
+    for x in vertical:
+        assert x.separable == lifted
+        if lifted:
+            assert abs(x.value) < 1e-6
+        else:
+            assert any(name.endswith(" m") for name in x.confounded_with), x.confounded_with
+
+
+# ---------------------------------------------------------------------------------------------------- filtered logs
+
+
+@pytest.mark.parametrize("axes", ["local", "world"])
+def test_a_filter_that_smears_the_switching_of_contacts_leaves_offsets_exact(recorded: Recorded, axes: str) -> None:
+    """Readings that differ by an offset while active: the fits differ by just that, to rounding."""
+    robot, oracle, _ = recorded
+    rng, N = np.random.default_rng(6), 600
+    raw = make_log(oracle, [("sole", 6), ("fin", 3)], STATES, N, rng)
+    time = np.arange(N) * 0.01
+    active = np.stack([np.sin(2.1 * time) > -0.3, np.sin(3.7 * time + 1.0) > 0.2], axis=1)
+    waves = rng.uniform(0.3, 1.2, (3, robot.n))
+    swing = np.sin(2 * np.pi * waves[0] * time[:, None] + 3 * waves[1]) * waves[2]
+    still = np.zeros((N, 3))
+    log = replace(
+        raw,
+        joint_position=swing,
+        contact_active=active,
+        base_quat_xyzw=value(raw.base_quat_xyzw)[:1].repeat(N, 0),
+        base_linear_acceleration_world=np.sin(time)[:, None] * np.ones(3),
+        base_angular_velocity_base=still,
+        base_angular_acceleration_base=still,
+    )
+    log = in_world(oracle, log) if axes == "world" else log
+    log = replace(log, joint_velocity=None, joint_acceleration=None)
+    off = Miscalibration.random(log, rng)
+    read = [preprocess(x, cutoff_hz=6.0) for x in (log, off.read(log))]
+    assert read[1].contact_share is not None
+    smeared = (read[1].contact_share > 0.01) & (read[1].contact_share < 0.99)
+    assert smeared.mean() > 0.01
+    terms = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log"))
+    before, after = (fit(robot, CONTACTS, sensors_of(robot), terms, [bind_log(x, robot, CONTACTS)]) for x in read)
+    assert after.assembly.problem.oversampling > 3.0
+    true = dict(zip((f"offset of {name}" for name in robot.joint_names), off.torque, strict=True))
+    for c, contact in enumerate(CONTACTS):
+        for k in range(len(contact.components)):
+            true[f"offset of {contact.frame} {WRENCH_COMPONENTS[k]}"] = off.wrench[c, k]
+    told = [x for x in after.extras if x.separable and x.extra.label in true]
+    assert len(told) >= 9
+    for x in told:
+        shift = x.value - before.values[x.log, x.extra.label]
+        assert shift == pytest.approx(true[x.extra.label], rel=1e-7, abs=1e-7), x.extra.label
+
+
+def test_a_descent_refuses_unknowns_beside_the_parameters_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "experiment.yaml"
+    path.write_text(
+        "robot: {urdf: a.urdf}\nlogs: {train: [a.npz]}\nsensors: {set: full, offsets: log}\n"
+        "estimator: {name: sgd}\noutput: out\n"
+    )
+    with pytest.raises(ConfigError, match="sensors.offsets: set, which sgd has not; accepted: ") as caught:
+        load_config(path)
+    assert "\n" not in str(caught.value)

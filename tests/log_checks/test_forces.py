@@ -1,0 +1,202 @@
+"""Forces that contradict the URDF: which usual mistake explains it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from faults import CONTACTS, CUTOFF, changed, demo_log, demo_robot, found, of_demo, only, scaled
+from motions import value
+from recordings import in_world
+from repository import SHARED
+from scipy.spatial.transform import Rotation
+from synthetic import PANDA, Oracle, load
+
+from torchid.log_checks import CONDEMNED, SUSPICIOUS, Checked
+from torchid.log_checks.check import check
+from torchid.logs import Log, read_log
+from torchid.logs.preprocess import preprocess
+from torchid.robot import Robot, load_robot
+from torchid.sensing import Contact
+
+EXPLAINED = "unit, sign or frame"
+ELSEWHERE = pytest.mark.skipif(not SHARED.is_dir(), reason=f"recorded logs are not in {SHARED}")
+
+
+@cache
+def arm(size: float = 1.0) -> tuple[Robot, Log]:
+    """A bolted arm whose inertia is up to 20 % off its URDF, swinging for 8 s; positions and torques with noise."""
+    robot, rng = load(PANDA, fixed_base=True), np.random.default_rng(0)
+    oracle = Oracle.of(robot)
+    oracle.perturb(rng, 0.2)
+    time, n = np.arange(1600) / 200.0, robot.n
+    phase = 2.0 * np.pi * time[:, None] * rng.uniform(0.2, 0.6, n) + rng.uniform(0.0, 6.0, n)
+    rate, swing = np.gradient(phase, time, axis=0), size * rng.uniform(0.3, 0.8, n)
+    q = size * rng.uniform(-0.5, 0.5, n) + swing * np.sin(phase)
+    torque = oracle.forces(q, swing * rate * np.cos(phase), -swing * rate**2 * np.sin(phase))
+    noise = rng.normal(size=(2, *q.shape))
+    return robot, Log("arm.npz", time, robot.joint_names, q + 1e-5 * noise[0], joint_torque=torque + 0.1 * noise[1])
+
+
+def rescaled(log: Log, joints: Sequence[int], factor: float) -> Log:
+    """The log with some joints' torques times a factor."""
+    torque = value(log.joint_torque).copy()
+    torque[:, joints] *= factor
+    return replace(log, joint_torque=torque)
+
+
+def of_arm(change: Callable[[Log], Log] = lambda log: log) -> Checked:
+    robot, log = arm()
+    return check(change(log), robot, (), 5.0)
+
+
+def test_forces_of_a_robot_that_differs_from_its_urdf_by_a_fifth_are_not_complained_of() -> None:
+    for checked in (of_arm(), of_demo(demo_log())):
+        assert checked.verdict == "usable"
+        assert {one.name for one in checked.findings} <= {"weight"}
+
+
+@pytest.mark.parametrize("joint", [1, 3])
+def test_a_reversed_torque_of_a_bolted_arm_is_named(joint: int) -> None:
+    checked = of_arm(lambda log: rescaled(log, [joint], -1.0))
+    sign = only(checked, "sign")
+    assert (sign.severity, sign.channels) == (CONDEMNED, (arm()[0].joint_names[joint],))
+    assert not checked.usable
+
+
+@pytest.mark.parametrize("measured", [True, False], ids=["contact forces measured", "contact forces unknown"])
+def test_reversed_torques_of_a_standing_robot_are_seen_through_the_contacts_null_space(measured: bool) -> None:
+    log = rescaled(demo_log(), [1, 5], -1.0)
+    log = log if measured else replace(log, contact_wrench_local=None)
+    assert set(only(of_demo(log), "sign").channels) == {"front_left_thigh", "front_right_knee"}
+
+
+def test_a_joint_whose_torque_is_friction_alone_is_not_judged() -> None:
+    _, log = arm()
+    rng = np.random.default_rng(1)
+    checked = of_arm(
+        lambda log: changed(log, "joint_torque", lambda t: t[:, 6].__setitem__(slice(None), rng.normal(size=1600)))
+    )
+    assert not found(checked, "sign")
+    (skipped,) = (skip for skip in checked.skipped if skip.name == "sign of torques")
+    assert log.joint_names[6] in skipped.reason
+
+
+def test_a_torque_of_the_motor_side_of_a_gear_is_suspicious() -> None:
+    scale = only(of_arm(lambda log: rescaled(log, [1], 0.02)), "scale")
+    assert (scale.severity, scale.channels) == (SUSPICIOUS, (arm()[0].joint_names[1],))
+
+
+def rolled(log: Log) -> Log:
+    return replace(log, base_quat_xyzw=np.roll(value(log.base_quat_xyzw), 1, axis=1))
+
+
+def inverted(log: Log) -> Log:
+    return replace(log, base_quat_xyzw=Rotation.from_quat(value(log.base_quat_xyzw)).inv().as_quat())
+
+
+def misnamed(log: Log) -> Log:
+    """World axes that are called the contact frames'."""
+    filled = preprocess(log)
+    world = value(in_world(Oracle.of(demo_robot()), filled).contact_wrench_world)
+    return replace(filled, contact_wrench_local=world)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "field", "text"),
+    [
+        (lambda log: scaled(log, "joint_torque", 1e3), "joint_torque", "in mN m"),
+        (lambda log: scaled(log, "joint_torque", 1e-3), "joint_torque", "in kN m"),
+        (lambda log: scaled(log, "joint_torque", -1.0), "joint_torque", "all reversed"),
+        (lambda log: scaled(log, "contact_wrench_local", 1e-3), "contact_wrench_local", "in kN"),
+        (lambda log: scaled(log, "contact_wrench_local", 1.0 / 9.81), "contact_wrench_local", "in kg"),
+        (lambda log: scaled(log, "contact_wrench_local", -1.0), "contact_wrench_local", "all reversed"),
+        (misnamed, "contact_wrench_local", "along the world's axes"),
+        (rolled, "base_quat_xyzw", "w first against w last"),
+        (inverted, "base_quat_xyzw", "rotates world to base"),
+    ],
+    ids=["mN m", "kN m", "torques reversed", "kN", "kg", "wrenches reversed", "axes", "order", "inverse"],
+)
+def test_a_usual_mistake_is_named_by_what_it_explains(mistake: Callable[[Log], Log], field: str, text: str) -> None:
+    checked = of_demo(mistake(demo_log().select(slice(0, 600))))
+    explained = only(checked, EXPLAINED)
+    assert (explained.severity, explained.field) == (CONDEMNED, field)
+    assert explained.found.startswith(text)
+    assert not checked.usable
+
+
+def test_positions_in_degrees_are_named_even_where_no_joint_turns_far() -> None:
+    robot, log = arm(0.1)
+    assert np.abs(log.joint_position).max() < np.radians(12.0)
+    checked = check(scaled(log, "joint_position", 180.0 / np.pi), robot, (), 5.0)
+    explained = only(checked, EXPLAINED)
+    assert (explained.field, explained.found[:10]) == ("joint_position", "in degrees")
+
+
+def test_one_joint_in_degrees_is_named() -> None:
+    checked = of_demo(changed(demo_log(), "joint_position", lambda q: q[:, 11].__imul__(180.0 / np.pi)))
+    assert only(checked, EXPLAINED).found.startswith("rear_right_knee in degrees")
+    assert not found(checked, "forces")
+
+
+def test_one_torque_in_another_unit_is_condemned_by_name() -> None:
+    robot, log = arm()
+    finding = only(check(rescaled(log, [1], 1e3), robot, (), 5.0), "unit")
+    assert (finding.severity, finding.channels) == (CONDEMNED, (robot.joint_names[1],))
+    assert "in mN m" in finding.found
+
+
+def test_forces_that_are_far_too_large_are_not_explained_by_what_makes_them_small() -> None:
+    swapped = of_demo(replace(demo_log(), contact_wrench_local=value(demo_log().contact_wrench_local)[:, ::-1]))
+    assert "no usual mistake" in only(swapped, "forces").found
+    assert not found(swapped, EXPLAINED)
+
+
+@ELSEWHERE
+def test_moments_of_a_force_plate_in_newton_millimetres_are_named() -> None:
+    folder = SHARED / "human_squats"
+    log, robot = read_log(folder / "static1.npz"), load_robot(folder / "human.urdf")
+    wrench = value(log.contact_wrench_world) * [1.0, 1.0, 1.0, 1e3, 1e3, 1e3]
+    contacts = [Contact(name, "flat") for name in log.contact_names]
+    checked = check(replace(log, contact_wrench_world=wrench), robot, contacts, 6.0)
+    assert only(checked, EXPLAINED).found.startswith("moments in N mm")
+
+
+def test_a_bolted_robot_is_not_asked_for_its_base_nor_for_contacts() -> None:
+    robot, log = arm()
+    assert not {"weight at rest", "contact flags against forces", "angular velocity against orientation"} & {
+        skip.name for skip in check(log, robot, (), 5.0).skipped
+    }
+
+
+def test_what_no_usual_mistake_explains_is_only_suspicious() -> None:
+    shuffled = of_arm(lambda log: replace(log, joint_torque=np.roll(value(log.joint_torque), 400, axis=0)))
+    finding = only(shuffled, "forces")
+    assert finding.severity == SUSPICIOUS
+    assert "no usual mistake" in finding.found
+
+
+def test_a_log_of_another_robot_is_not_usable() -> None:
+    robot, log = arm()
+    renamed = check(replace(log, joint_names=tuple(f"x_{name}" for name in log.joint_names)), robot)
+    assert only(renamed, "does not fit").field == "joint_names"
+    assert not renamed.usable
+    unknown = check(demo_log(), demo_robot(), CONTACTS[:3], CUTOFF)
+    assert "active, but not among" in only(unknown, "does not fit").found
+
+
+def test_a_log_without_a_robot_says_what_was_not_checked() -> None:
+    reasons = {skip.name: skip.reason for skip in check(arm()[1]).skipped}
+    assert "no robot" in reasons["forces against the URDF"]
+
+
+def test_a_long_log_is_compared_in_pieces() -> None:
+    robot, log = arm()
+    index: Any = np.concatenate([np.arange(1600), np.arange(1600)[::-1]] * 16)
+    long = replace(log.select(index), time=np.arange(len(index)) / 200.0)
+    flipped = rescaled(long, [1], -1.0)
+    assert only(check(flipped, robot, (), 5.0), "sign").channels == (robot.joint_names[1],)

@@ -1,0 +1,126 @@
+"""Mistakes of sign, frame, unit and order in logs of robots that walk and arms that swing: who names which."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mistaken import MISTAKES, NAMED, SENSORS, Cell, case_of, cells, checked, judged
+from motions import value
+from walking import MACHINES, robot_of, truth
+
+from torchid.log_checks import NOTE
+from torchid.log_checks.contacts import measure_foot_slip
+from torchid.log_checks.mistakes import exchanged_names
+from torchid.log_checks.model import bind_some_samples, preprocess_pieces
+from torchid.log_checks.scales import fit_time_scale, fit_torque_gains, motion_cutoff_hz
+
+BY_NAME = {mistake.name: mistake for mistake in MISTAKES}
+#: Cells of the whole table that are not named, and why: see docs/checking.md.
+UNNAMED = {("wrenches about another point", "biped", "contacts")}
+#: Of a robot that walks upright along the world's x axis, with all sensors.
+UPRIGHT = (
+    pytest.param("torques reversed", marks=pytest.mark.slow),
+    pytest.param("wrenches reversed", marks=pytest.mark.slow),
+    pytest.param("world downward", marks=pytest.mark.slow),
+    pytest.param("contact flags left for right", marks=pytest.mark.slow),
+    "quaternion w last for first",
+    pytest.param("quaternion inverse", marks=pytest.mark.slow),
+    "time x 2",
+    "time in minutes",
+    "one torque x 1.3",
+)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", UPRIGHT)
+def test_a_mistake_in_the_log_of_a_biped_that_walks_upright_is_named(name: str) -> None:
+    case = case_of(MACHINES["biped"], "full", heading=0.0)
+    found = checked(case, value(BY_NAME[name].make(case)))
+    assert BY_NAME[name].named(found), [(x.name, x.field, x.found) for x in found.findings]
+
+
+@pytest.mark.parametrize("name", ["one torque x 1.3", "time x 2", "joints swapped"])
+def test_a_mistake_in_the_log_of_an_arm_is_named(name: str) -> None:
+    case = case_of(MACHINES["arm"], "contacts")
+    assert BY_NAME[name].named(checked(case, value(BY_NAME[name].make(case))))
+
+
+@pytest.mark.parametrize(("machine", "sensors"), [("biped", "full"), ("arm", "joints")])
+def test_a_robot_unlike_its_urdf_gives_no_alarm(machine: str, sensors: str) -> None:
+    case = case_of(MACHINES[machine], sensors, heading=0.0 if machine == "biped" else None)
+    assert not [one for one in checked(case, case.log).findings if one.severity != NOTE]
+
+
+def test_an_accelerometer_is_told_from_the_world_by_where_the_feet_are() -> None:
+    case = case_of(MACHINES["quadruped"], "joints")
+    for name in ("accelerometer reversed", "world downward"):
+        assert BY_NAME[name].named(checked(case, value(BY_NAME[name].make(case)))), name
+
+
+def test_factors_of_torques_and_of_time_are_recovered() -> None:
+    machine = MACHINES["arm"]
+    case, robot = case_of(machine, "contacts"), robot_of(machine)
+    slow = replace(case.log, time=3.0 * case.log.time)
+    found = fit_time_scale(slow, robot, (), value(motion_cutoff_hz(slow)))
+    assert found.factor == pytest.approx(1.0 / 3.0, rel=0.1)
+    log = value(BY_NAME["one torque x 1.3"].make(case))
+    factors = value(fit_torque_gains(bind_some_samples(preprocess_pieces(log, 10.0), robot, (), 240), robot, ()))
+    assert factors.gain[1] / np.median(factors.gain) == pytest.approx(1.0 / 1.3, abs=3.0 * factors.spread[1])
+
+
+def test_feet_that_stand_do_not_move_and_tell_nothing_of_a_base_that_stands_still() -> None:
+    machine = MACHINES["biped"]
+    case, robot = case_of(machine, "full", heading=0.0), robot_of(machine)
+    assert value(measure_foot_slip(case.log, robot, machine.contacts)) < 0.02
+    still = case.log.select(np.zeros(400, np.intp))
+    still = replace(still, time=np.arange(400) / 200.0)
+    assert measure_foot_slip(still, robot, machine.contacts) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "other"),
+    [
+        (("l_sole", "r_sole"), ("r_sole", "l_sole")),
+        (("LAnkle", "RAnkle", "Neck"), ("RAnkle", "LAnkle", "Neck")),
+        (("FL_foot", "FR_foot", "RL_foot", "RR_foot"), ("FR_foot", "FL_foot", "RR_foot", "RL_foot")),
+        (("leg_left_1", "leg_right_1"), ("leg_right_1", "leg_left_1")),
+    ],
+)
+def test_sides_are_exchanged_by_name(names: tuple[str, ...], other: tuple[str, ...]) -> None:
+    assert next(exchanged_names(names)) == ("left and right", other)
+
+
+def test_names_without_sides_have_none_to_exchange() -> None:
+    assert "left and right" not in [what for what, _ in exchanged_names(("shell", "roller", "elbow"))]
+    assert list(exchanged_names(("one",))) == []
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("machine", MACHINES)
+def test_who_names_which_mistake(machine: str) -> None:
+    found: list[Cell] = list(cells([MACHINES[machine]]))
+    assert {cell.sensors for cell in found} == set(SENSORS)
+    unnamed = {(cell.mistake, cell.machine, cell.sensors) for cell in found if cell.check not in (NAMED, "-")}
+    assert unnamed == {cell for cell in UNNAMED if cell[1] == machine}
+
+
+@pytest.mark.slow
+def test_forty_logs_of_robots_unlike_their_urdf_give_no_alarm() -> None:
+    alarms = []
+    for seed in range(1, 11):
+        for place, (name, machine) in enumerate(MACHINES.items()):
+            sensors = SENSORS[(seed + place) % len(SENSORS)]
+            case = case_of(machine, sensors, seed)
+            found = [one.found for one in checked(case, case.log).findings if one.severity != NOTE]
+            alarms += [(name, sensors, seed, text) for text in found]
+            truth.cache_clear()
+    assert alarms == []
+
+
+def test_a_finding_that_the_clean_log_has_too_does_not_count() -> None:
+    case = case_of(MACHINES["arm"], "contacts")
+    clean = checked(case, case.log)
+    assert judged(BY_NAME["one torque x 1.3"], clean, clean) == "silent"

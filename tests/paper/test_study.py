@@ -1,0 +1,210 @@
+"""The study of the paper's section V, run as a reader runs it (`scripts/reproduce_paper.py --quick`)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from paper.results import NOMINAL, TRUE, Record, Results, findings
+from script_calls import call
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from torchid.problem import Metrics
+from torchid.problem.metrics import ROW_GROUPS
+
+SETS = ("full", "contacts", "joints", "reduced")
+CONDITIONS = ("exact sensors", "white noise", "bias and gain", "delay", "joint friction", "all")
+TRAINING = ("all runs", "squats alone")
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a quick study, and what it printed."""
+    folder = tmp_path_factory.mktemp("study") / "paper"
+    status, out, err = call("reproduce_paper", "--quick", "--output", str(folder))
+    assert status == 0, err
+    return folder, out
+
+
+@pytest.fixture(scope="module")
+def error(study: tuple[Path, str]) -> Callable[..., float]:
+    """Median error on the unseen log, as a share of the measured."""
+    records = json.loads((study[0] / "results.json").read_text())["records"]
+
+    def median(condition: str, training: str, sensors: str, group: str, against: str = "exact") -> float:
+        key = (condition, training, sensors)
+        chosen = [r for r in records if (r["condition"], r["training"], r["sensors"]) == key]
+        return float(np.median([r[against][f"{group}/relative"] for r in chosen]))
+
+    return median
+
+
+def test_every_sensor_set_meets_every_condition_on_both_training_sets(study: tuple[Path, str]) -> None:
+    document = json.loads((study[0] / "results.json").read_text())
+    found = {(r["condition"], r["training"], r["sensors"]) for r in document["records"]}
+    rows = (NOMINAL, *SETS, TRUE)
+    assert found == {(c, t, s) for c in CONDITIONS for t in TRAINING for s in rows}
+    draws = {r["nominal_draw"] for r in document["records"] if r["sensors"] == "full"}
+    assert draws == {0, 1}
+
+
+def test_the_true_parameters_are_the_floor_where_sensors_are_exact(error: Callable[..., float]) -> None:
+    for group in ROW_GROUPS:
+        assert error("exact sensors", "all runs", TRUE, group) < 1e-3
+        assert error("exact sensors", "all runs", NOMINAL, group) > 0.03
+
+
+@pytest.mark.parametrize("condition", ["exact sensors", "white noise", "delay"])
+def test_full_sensing_is_a_tenth_of_the_nominal_error_or_less(condition: str, error: Callable[..., float]) -> None:
+    for group in ROW_GROUPS:
+        assert error(condition, "all runs", "full", group) < 0.1 * error(condition, "all runs", NOMINAL, group)
+
+
+@pytest.mark.parametrize("condition", ["exact sensors", "white noise", "delay", "joint friction"])
+def test_contacts_alone_give_the_base_rows_and_not_the_joint_torques(
+    condition: str, error: Callable[..., float]
+) -> None:
+    nominal, full, contacts = (
+        {group: error(condition, "all runs", sensors, group) for group in ROW_GROUPS}
+        for sensors in (NOMINAL, "full", "contacts")
+    )
+    assert contacts["base_force"] < 0.2 * nominal["base_force"]
+    assert contacts["base_moment"] < 0.2 * nominal["base_moment"]
+    assert contacts["joint_torque"] > 2.0 * full["joint_torque"]
+
+
+def test_joints_alone_do_not_feel_a_delay_of_the_foot_sensors(error: Callable[..., float]) -> None:
+    for training in TRAINING:
+        for group in ROW_GROUPS:
+            exact, late = (error(c, training, "joints", group) for c in ("exact sensors", "delay"))
+            assert abs(late - exact) < 0.1 * exact + 1e-4  # the delay moves a few contact flags, nothing else
+
+
+def test_without_a_step_joints_alone_lose_the_feet(study: tuple[Path, str], error: Callable[..., float]) -> None:
+    ranks = json.loads((study[0] / "results.json").read_text())["ranks"]
+    together = {(r["training"], r["sensors"]): r["states"][-1]["rank"] for r in ranks}
+    for sensors in SETS:
+        assert together["all runs", sensors] == 122  # 10 + 7 * 16
+    assert together["squats alone", "full"] == together["squats alone", "contacts"] == 122
+    assert together["squats alone", "joints"] == 98  # a standing foot's inertia cannot be told from the floor's wrench
+    assert error("white noise", "squats alone", "joints", "base_force") > 5.0 * error(
+        "white noise", "all runs", "joints", "base_force"
+    )
+
+
+def test_sample_counts_of_the_contact_states_add_up(study: tuple[Path, str]) -> None:
+    for ranks in json.loads((study[0] / "results.json").read_text())["ranks"]:
+        *states, together = ranks["states"]
+        assert together["name"] == "together"
+        assert together["samples"] == sum(state["samples"] for state in states)
+        assert {state["name"] for state in states} <= {"l_sole + r_sole", "l_sole", "r_sole"}
+
+
+def test_tables_fit_100_columns_and_are_printed(study: tuple[Path, str]) -> None:
+    folder, out = study
+    text = (folder / "tables.txt").read_text()
+    assert max(map(len, text.splitlines())) <= 100
+    for line in text.splitlines():
+        assert line.rstrip() in out
+    for name in (NOMINAL, *SETS, TRUE, *CONDITIONS):
+        assert name in text
+
+
+def test_figures_and_charts_are_written(study: tuple[Path, str]) -> None:
+    folder, _ = study
+    for name in ("rms", "forces", "projected"):
+        assert (folder / f"{name}.png").stat().st_size > 20_000
+    assert {path.name for path in folder.iterdir()} == {
+        "results.json", "tables.txt", "rms.png", "forces.png", "projected.png", "tensorboard", "manifest.json",
+    }  # fmt: skip
+    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"images": 0})
+    events.Reload()
+    assert set(events.Tags()["images"]) == {"rms", "forces", "projected"}
+    joints = EventAccumulator(str(folder / "tensorboard" / "joints"))
+    joints.Reload()
+    assert set(joints.Tags()["scalars"]) == {f"{training}/{group}" for training in TRAINING for group in ROW_GROUPS}
+    assert len(joints.Scalars("all runs/base_force")) == len(CONDITIONS)
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    for overwrite in ([], ["--overwrite"]):
+        status, out, err = call("reproduce_paper", "--quick", "--output", str(tmp_path), *overwrite)
+        assert status == 2
+        assert not out
+        assert len(err.splitlines()) == 1
+        assert str(tmp_path) in err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+# ------------------------------------------------------------------------------------------------------------ findings
+
+
+def results(**errors: tuple[float, float, float, float]) -> Results:
+    """Results of one condition with the given errors by sensors, in the order of `ROW_GROUPS`."""
+
+    def record(sensors: str, values: tuple[float, ...], draw: int, scale: float) -> Record:
+        rms: dict[str, Any] = {group: value * scale for group, value in zip(ROW_GROUPS, values, strict=True)}
+        metrics = Metrics(rms, rms, {}, {}, 1.0)
+        return Record("noise", "all", sensors, draw, 0, metrics, metrics)
+
+    draws = ((0, 1.0), (1, 0.5), (2, 100.0))  # the median is the first
+    return Results([record(s, v, number, scale) for s, v in errors.items() for number, scale in draws], [])
+
+
+PAPER = results(
+    nominal=(10.0, 10.0, 10.0, 10.0),
+    full=(0.5, 0.1, 0.2, 0.3),
+    contacts=(8.0, 0.1, 0.2, 3.0),
+    joints=(2.0, 3.0, 3.0, 0.1),
+    true=(0.01, 0.01, 0.01, 0.01),
+)  # fmt: skip
+
+
+def changed(sensors: str, group: str, value: float) -> Results:
+    def of(record: Record) -> Record:
+        if record.sensors != sensors:
+            return record
+        metrics = replace(record.exact, rms=record.exact.rms | {group: value})
+        return replace(record, exact=metrics)
+
+    return Results([of(record) for record in PAPER.records], [])
+
+
+def holds(found: Results) -> list[bool]:
+    return [finding.holds for finding in findings(found, "noise", "all")]
+
+
+def test_the_papers_own_pattern_confirms_all_three_findings() -> None:
+    assert holds(PAPER) == [True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("sensors", "group", "value", "expected"),
+    [
+        ("full", "joint_torque", 3.0, [False, True, True]),
+        ("contacts", "base_moment", 3.0, [True, False, True]),
+        ("contacts", "joint_torque", 0.6, [True, False, True]),
+        ("joints", "nullspace", 0.4, [True, True, False]),
+        ("full", "nullspace", 0.05, [True, True, False]),
+    ],
+)
+def test_a_finding_falls_with_the_figure_it_rests_on(
+    sensors: str, group: str, value: float, expected: list[bool]
+) -> None:
+    found = holds(changed(sensors, group, value))
+    assert found == expected
+
+
+def test_an_error_at_the_floor_is_good_whatever_the_nominal_one() -> None:
+    assert holds(changed("full", "joint_torque", 3.0))[0] is False
+    records = [
+        replace(r, exact=replace(r.exact, rms=r.exact.rms | {"joint_torque": 2.0})) if r.sensors == TRUE else r
+        for r in changed("full", "joint_torque", 3.0).records
+    ]
+    assert holds(Results(records, []))[0] is True

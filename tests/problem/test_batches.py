@@ -1,0 +1,317 @@
+"""Mini-batches: the same equations as the compressed problem's, every sample once per epoch, mixed and reproducible."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from simulated import BIPED, QUADRUPED
+from synthetic import DRONE, G1, PANDA, ROBOTS, Array, load, random_states
+from torch import Tensor
+
+from torchid.problem import Batch, MiniBatches, RowBuilder, Samples, compress, linear_problem
+from torchid.problem.base_motion import BaseMotion
+from torchid.regressor import FrameJacobian, Regressor
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors
+
+TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
+NOISE = SensorNoise(joint_torque=0.3, contact_force=1.5, contact_moment=0.1, base_force=0.7, base_moment=0.05)
+LEGS = ("front_left", "front_right", "rear_left", "rear_right")
+KINDS = {
+    "G1": (G1, None, False, [Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right")]),
+    "biped": (BIPED, None, False, [Contact("l_sole", "flat"), Contact("r_sole", "line", "x")]),
+    "quadruped": (QUADRUPED, None, False, [Contact(f"{leg}_foot", "point") for leg in LEGS]),
+    "mimic fingers": (TALOS_FULL, None, False, [Contact("left_sole_link", "flat"), Contact("right_sole_link", "flat")]),
+    "bolted arm": (PANDA, None, True, [Contact("panda_rightfinger", "point"), Contact("panda_hand", "line")]),
+    "bolted arm in free motion": (PANDA, None, True, []),
+    "drone": (DRONE, None, False, [Contact("base_link", "flat"), Contact("base_link", "point")]),
+}
+CASES = [
+    *(("G1", "full"), ("biped", "contacts"), ("quadruped", "joints"), ("quadruped", "mixed")),
+    *(("mimic fingers", "mixed"), ("bolted arm", "full"), ("bolted arm", "mixed")),
+]
+cases = pytest.mark.parametrize(("kind", "sensors"), CASES, ids=[" ".join(case) for case in CASES])
+
+
+def recorded(robot: Robot, contacts: Sequence[Contact], count: int, seed: int, world: bool = False) -> Samples:
+    """Unrelated random motion and forces in three contact states: rows do not mind whether the dynamics close."""
+    rng = np.random.default_rng(seed)
+    q, v, a = map(torch.from_numpy, random_states(rng, robot.n, count, robot.fixed_base))
+    torque, wrench = 20.0 * rng.normal(size=(count, robot.n)), 20.0 * rng.normal(size=(count, len(contacts), 6))
+    return Samples(
+        source=f"{seed}.npz",
+        time=torch.arange(count, dtype=torch.float64) * 0.01,
+        joint_position=q[:, q.shape[1] - robot.n :],
+        joint_velocity=v[:, v.shape[1] - robot.n :],
+        joint_acceleration=a[:, a.shape[1] - robot.n :],
+        base=BaseMotion.from_coordinates(q, v, a, robot.fixed_base),
+        torque=torch.from_numpy(torque),
+        wrench=torch.from_numpy(wrench),
+        wrench_in_world=world,
+        active=torch.from_numpy(rng.integers(0, 2, (3, len(contacts))).astype(bool)[np.arange(count) % 3]),
+    )
+
+
+def sensor_set(name: str, robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
+    """A named set; or every other torque, the first contact's wrench and part of the last one's."""
+    if name != "mixed":
+        return named_sensors(name, robot.n, len(contacts), NOISE)
+    torque, wrench = np.zeros(robot.n, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
+    torque[::2], wrench[:1], wrench[-1:, 1:3] = True, True, True
+    return SensorSet(torque, wrench, NOISE)
+
+
+@dataclass(frozen=True)
+class World:
+    """A robot with its sensors, and two logs, one with wrenches along world axes if the base floats."""
+
+    robot: Robot
+    contacts: list[Contact]
+    builder: RowBuilder
+    logs: list[Samples]
+
+    def random_phi(self, seed: int) -> Array:
+        """Parameters (12 L,) of no robot; the base has no friction."""
+        phi = np.random.default_rng(seed).normal(size=self.robot.nominal.shape)
+        phi[0, 10:] = 0.0
+        return phi.flatten()
+
+
+@cache
+def world(kind: str, sensors: str, samples: tuple[int, ...] = (30, 21)) -> World:
+    urdf, base_link, fixed_base, contacts = KINDS[kind]
+    robot = load(urdf, base_link, fixed_base)
+    turned = (False, not fixed_base)
+    logs = [recorded(robot, contacts, n, k, turned[k % 2]) for k, n in enumerate(samples)]
+    return World(robot, contacts, RowBuilder(robot, contacts, sensor_set(sensors, robot, contacts)), logs)
+
+
+@cache
+def many() -> World:
+    """Three logs of a drone, whose rows are cheap, in four contact states: enough samples for two chunks."""
+    w = world("drone", "full", (620, 1, 410))
+    for log in w.logs:
+        log.active[:] = torch.arange(len(log))[:, None] // torch.tensor([1, 2]) % 2 == 0
+    return w
+
+
+TOTAL = 1031
+
+
+def marks(log: Samples) -> list[float]:
+    """What tells the samples of a log apart: an acceleration."""
+    return log.coordinates()[2][:, -1].tolist()
+
+
+def keys(batch: Batch) -> list[float]:
+    """The same of a batch."""
+    return batch.a[:, -1].tolist()
+
+
+def order(batches: MiniBatches, epoch: int) -> list[float]:
+    return [key for batch in batches.epoch(epoch) for key in keys(batch)]
+
+
+def equal(one: Batch, other: Batch) -> bool:
+    """Bit for bit."""
+    return all(torch.equal(x, y) for x, y in zip(vars(one).values(), vars(other).values(), strict=True))
+
+
+# ------------------------------------------------------------------------------------------------------------- epochs
+
+
+@pytest.mark.parametrize("batch_size", [1, 7, 256, 1000, 5000])
+def test_an_epoch_has_every_sample_of_every_log_once(batch_size: int) -> None:
+    w = many()
+    batches = MiniBatches(w.logs, w.builder, batch_size)
+    expected = Counter(key for log in w.logs for key in marks(log))
+    assert set(expected.values()) == {1}
+    assert batches.samples == TOTAL
+    for epoch in (1, 2):
+        assert Counter(order(batches, epoch)) == expected
+    assert Counter(key for batch in batches.chunks() for key in keys(batch)) == expected
+
+
+@pytest.mark.parametrize("batch_size", [7, 200, 1000])
+def test_all_batches_but_one_are_full(batch_size: int) -> None:
+    w = many()
+    sizes = Counter(len(batch) for batch in MiniBatches(w.logs, w.builder, batch_size).epoch(1))
+    assert sizes == Counter({batch_size: TOTAL // batch_size, TOTAL % batch_size: 1})
+
+
+def test_logs_and_contact_states_are_mixed_in_every_batch() -> None:
+    """Of 100 samples, 40 are expected from the shorter log and 25 in each contact state; four standard deviations."""
+    w = many()
+    log_of, state_of = {}, {}
+    for number, log in enumerate(w.logs):
+        for key, state in zip(marks(log), log.active.tolist(), strict=True):
+            log_of[key], state_of[key] = number, tuple(state)
+    batches = [batch for batch in MiniBatches(w.logs, w.builder, 100).epoch(3) if len(batch) == 100]
+    assert len(batches) == 10
+    for batch in batches:
+        assert Counter(log_of[key] for key in keys(batch))[2] == pytest.approx(40, abs=4.0 * np.sqrt(40 * 0.6))
+        states = Counter(state_of[key] for key in keys(batch))
+        assert list(states.values()) == pytest.approx([25] * 4, abs=4.0 * np.sqrt(25 * 0.75))
+
+
+def test_the_order_depends_on_the_seed_and_the_number_of_the_epoch_and_nothing_else() -> None:
+    w = many()
+    torch.manual_seed(1)
+    first = MiniBatches(w.logs, w.builder, 64, seed=5)
+    orders = {epoch: order(first, epoch) for epoch in (1, 2, 3)}
+    torch.manual_seed(2)
+    before = torch.get_rng_state()
+    again = MiniBatches(w.logs, w.builder, 64, seed=5)
+    assert order(again, 3) == orders[3], "whatever epochs were asked for before"
+    assert order(again, 1) == orders[1]
+    assert order(again, 1) == orders[1]
+    assert torch.equal(torch.get_rng_state(), before)
+    assert orders[1] != orders[2] != orders[3]
+    for seed in (0, 4, 6):
+        assert order(MiniBatches(w.logs, w.builder, 64, seed=seed), 1) not in orders.values()
+
+
+@pytest.mark.parametrize("memory", [0, 500_000, 10**9])
+def test_rows_are_the_same_to_the_last_bit_whether_kept_or_computed_anew(
+    memory: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    w = many()
+    expected = [list(MiniBatches(w.logs, w.builder, 256, memory=0).epoch(epoch)) for epoch in (1, 2)]
+    computed = []
+    plain = RowBuilder.rows_by_sample
+    monkeypatch.setattr(RowBuilder, "rows_by_sample", lambda *a: computed.append(len(a[1])) or plain(*a))
+    batches = MiniBatches(w.logs, w.builder, 256, memory=memory)
+    counts = []
+    for epoch in (1, 2):
+        computed.clear()
+        for batch, other in zip(batches.epoch(epoch), expected[epoch - 1], strict=True):
+            assert equal(batch, other)
+        counts.append(sum(computed))
+    kept = [TOTAL - count for count in counts]
+    if memory == 0:
+        assert kept == [0, 0]
+    elif memory == 10**9:
+        assert kept == [0, TOTAL]
+    else:
+        assert kept[0] == 0
+        assert 0 < kept[1] < TOTAL
+        size = sum(batch.nbytes for batch in batches.chunks()) / TOTAL
+        assert kept[1] * size <= memory
+
+
+def test_a_batch_of_no_samples_is_refused() -> None:
+    w = many()
+    with pytest.raises(ValueError, match="batch_size: found 0; accepted: at least 1"):
+        MiniBatches(w.logs, w.builder, 0)
+
+
+# --------------------------------------------------------------------------------------------------------------- rows
+
+
+@cases
+def test_squared_residuals_of_an_epoch_add_up_to_the_compressed_problems_cost(kind: str, sensors: str) -> None:
+    w = world(kind, sensors)
+    problem = linear_problem(compress(w.logs, w.builder), w.builder, w.robot)
+    batches = MiniBatches(w.logs, w.builder, 8, seed=1)
+    for seed in range(3):
+        phi = w.random_phi(seed)
+        total, rows = 0.0, 0
+        for batch in batches.epoch(seed + 1):
+            misfit = batch.K @ (batches.columns @ torch.from_numpy(phi)) - batch.f
+            total, rows = total + float(misfit.square().sum()), rows + batch.rows
+        assert rows == problem.rows
+        assert total == pytest.approx(problem.cost(phi), rel=1e-12)
+
+
+def dense(w: World, log: Samples, phi: Array) -> Tensor:
+    """K phi, (B, nv), by the regressor at the samples' coordinates."""
+    return Regressor(w.robot)(*log.coordinates()) @ torch.from_numpy(phi)
+
+
+def pushed(w: World, log: Samples) -> Tensor:
+    """S^T tau + J_C^T lambda, (B, nv), of all recorded forces, by frame Jacobians."""
+    q, _, _ = log.coordinates()
+    force = torch.nn.functional.pad(log.torque, (w.robot.base_rows, 0))
+    for place, contact in enumerate(w.contacts):
+        wrench = log.wrench[:, place]
+        if log.wrench_in_world:
+            poses = w.robot.link_poses(log.joint_position)
+            R = log.rotation_world_base @ poses[contact.frame][:, :3, :3]
+            wrench = (wrench.unflatten(1, (2, 3)) @ R).flatten(1)
+        used = list(contact.components)
+        pushing = (wrench * log.active[:, place, None])[:, used]
+        force += (FrameJacobian(w.robot, contact.frame)(q)[:, used].mT @ pushing[..., None])[..., 0]
+    return force
+
+
+@cases
+def test_rows_are_projections_of_the_dense_regressor_and_of_all_forces(kind: str, sensors: str) -> None:
+    """W kills what is not measured: projecting every recorded force gives what the measured ones alone gave."""
+    w, phi = world(kind, sensors), world(kind, sensors).random_phi(7)
+    predicted, measured = {}, {}
+    for log in w.logs:
+        predicted |= dict(zip(marks(log), dense(w, log, phi), strict=True))
+        measured |= dict(zip(marks(log), pushed(w, log), strict=True))
+    batches = MiniBatches(w.logs, w.builder, 16)
+    for batch in batches.epoch(1):
+        W = batch.W.mT
+        for found, force in ((batch.K @ (batches.columns @ torch.from_numpy(phi)), predicted), (batch.f, measured)):
+            force = torch.stack([force[key] for key in keys(batch)])
+            expected = (W @ force[..., None])[..., 0]
+            size = float((W.norm(dim=2) * force.norm(dim=1, keepdim=True)).max())
+            np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13 * size)
+
+
+@pytest.mark.parametrize("kind", ["biped", "bolted arm"])
+def test_batches_say_in_which_state_of_the_robot_their_rows_were_recorded(kind: str) -> None:
+    w = world(kind, "joints")
+    known = {}
+    for log in w.logs:
+        for q, v, a in zip(*log.coordinates(), strict=True):
+            known[a[-1].item()] = (q, v, a)
+    for batch in MiniBatches(w.logs, w.builder, 16).epoch(1):
+        assert batch.q.shape[1] == w.robot.n + (0 if w.robot.fixed_base else 7)
+        for q, v, a in zip(batch.q, batch.v, batch.a, strict=True):
+            for found, expected in zip((q, v, a), known[a[-1].item()], strict=True):
+                assert torch.equal(found, expected)
+
+
+def test_a_tilted_bolted_arm_feels_gravity_along_its_own_axes() -> None:
+    w, phi = world("bolted arm in free motion", "joints"), world("bolted arm in free motion", "joints").random_phi(3)
+    tilt = torch.tensor([0.3, -0.5, 0.2, 0.0], dtype=torch.float64)
+    tilt[3] = (1.0 - tilt.square().sum()).sqrt()
+    log = replace(w.logs[0], base=BaseMotion(tilt.expand(len(w.logs[0]), 4)))
+    assert log.base.rotation is not None
+    gravity = log.base.rotation[0].mT @ torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
+    regressor = Regressor(w.robot, tuple(gravity.tolist()))
+    batches = MiniBatches([log], w.builder, 16)
+    for batch in batches.epoch(1):
+        force = regressor(batch.q, batch.v, batch.a) @ torch.from_numpy(phi)
+        expected = (batch.W.mT @ force[..., None])[..., 0]
+        found = batch.K @ (batches.columns @ torch.from_numpy(phi))
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13 * float(expected.abs().max()))
+
+
+@cases
+def test_forces_that_no_sensor_of_the_set_measures_do_not_matter(kind: str, sensors: str) -> None:
+    w = world(kind, sensors)
+    spoilt = []
+    for log, junk in zip(w.logs, (torch.nan, 1e300), strict=True):
+        torque, wrench = log.torque.clone(), log.wrench.clone()
+        torque[:, ~torch.from_numpy(w.builder.sensors.torque)] = junk
+        hidden = torch.from_numpy(~w.builder.sensors.wrench)
+        if log.wrench_in_world:  # components along world axes make up all those along the frame's
+            hidden = hidden.unflatten(1, (2, 3)).all(dim=2).repeat_interleave(3, dim=1)
+        wrench[:, hidden] = junk
+        wrench[~log.active] = junk
+        spoilt.append(replace(log, torque=torque, wrench=wrench))
+    plain, other = (MiniBatches(logs, w.builder, 16).epoch(1) for logs in (w.logs, spoilt))
+    for batch, found in zip(plain, other, strict=True):
+        assert equal(batch, found)
+        assert torch.isfinite(batch.f).all()

@@ -1,0 +1,219 @@
+"""Offsets and scales of sensors and terms of actuators, unknown beside the bodies' parameters: found exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from misread import CONTACTS, WIDTH, World, with_actuators, world
+from recordings import Miscalibration, with_imu
+from synthetic import G1, Oracle, load, make_log, random_states
+from true_robots import predicted, true_parameters, worst
+from unknowns import Fit, fit
+from welded import SENSORS
+
+from torchid.estimators import Consistent
+from torchid.identifiability.base_parameters import base_parameters
+from torchid.identifiability.structure import structural_problem
+from torchid.problem import ExtraTerms, bind_log
+from torchid.problem.extras import CHANNELS, list_extras
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
+
+EXACT = 1e-7
+
+
+def sensors_of(robot: Robot, name: str) -> SensorSet:
+    """Named sets with two sensors in limbs; with all of them; these alone; and some axes of some sensors."""
+    F = len(robot.ft_names)
+    torques, wrenches, welds = [], {}, ["thigh_ft", "tail_ft"]
+    if name == "mixed":
+        torques = [joint for joint in robot.joint_names if joint != "knee"]
+        wrenches = {"sole": ("fx", "fz", "my"), "fin": ("fx", "fy", "fz")}
+    if name in ("mixed", "limbs"):
+        sensors = chosen_sensors(robot.joint_names, CONTACTS, torques, wrenches, ft=F)
+    else:
+        sensors = named_sensors(name.split("+")[0], robot.n, len(CONTACTS), ft=F)
+    return with_ft_sensors(sensors, robot, SENSORS if "limbs" in name else welds)
+
+
+def fitted(w: World, sensors: SensorSet, terms: ExtraTerms) -> Fit:
+    return fit(w.robot, CONTACTS, sensors, terms, [bind_log(log, w.robot, CONTACTS) for log in w.logs])
+
+
+def assert_recovered(w: World, found: Fit, terms: ExtraTerms) -> None:
+    """Every unknown, and every force that the sensors see."""
+    true = w.true(found.builder, terms)
+    assert set(found.values) == set(true)
+    for key, expected in true.items():
+        assert found.values[key] == pytest.approx(expected, rel=EXACT, abs=1e-9), key
+    assert all(x.separable and np.isfinite(x.standard_error) and not x.confounded_with for x in found.extras)
+    state = random_states(np.random.default_rng(99), w.robot.n, 100)
+    seen = np.append(np.ones(6, dtype=bool), found.builder.sensors.torque)
+    forces, expected = predicted(w.robot, found.estimate.phi, *state), w.oracle.forces(*state)
+    assert worst(forces[:, seen], expected[:, seen]) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "scope"),
+    [
+        *((name, "log") for name in ("full", "contacts", "joints", "mixed", "limbs")),
+        ("full+limbs", "all"),
+        ("mixed", "all"),
+    ],
+)
+def test_offsets_of_every_channel_are_found_for_each_log_or_for_all(name: str, scope: str) -> None:
+    terms, w = ExtraTerms(offsets=dict.fromkeys(CHANNELS, scope)), world(scope == "log")
+    assert_recovered(w, fitted(w, sensors_of(w.robot, name), terms), terms)
+
+
+SCALED = {
+    "plates beside torques": ("full", ("contact_force", "contact_moment")),
+    "torques beside plates": ("full", ("joint_torque",)),
+    "limbs beside torques and plates": ("full+limbs", ("ft_force", "ft_moment")),
+    "moments beside forces": ("limbs", ("ft_moment",)),
+    "all but the torques": ("full+limbs", ("contact_force", "contact_moment", "ft_force", "ft_moment")),
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "scope"), [(case, "all" if place % 2 else "log") for place, case in enumerate(SCALED)]
+)
+def test_scales_are_found_beside_offsets_where_some_sensor_is_true_to_scale(case: str, scope: str) -> None:
+    name, scaled = SCALED[case]
+    terms = ExtraTerms(dict.fromkeys(CHANNELS, "log"), dict.fromkeys(scaled, scope))
+    w = world(scope == "log", scaled)
+    assert_recovered(w, fitted(w, sensors_of(w.robot, name), terms), terms)
+
+
+def test_where_no_sensor_is_true_to_scale_none_can_be_told_from_the_masses() -> None:
+    """All forces twice as large and a robot twice as heavy would read the same."""
+    every = dict.fromkeys(CHANNELS, "all")
+    terms, w = ExtraTerms(every, every), world(False, CHANNELS)
+    found = fitted(w, sensors_of(w.robot, "full+limbs"), terms)
+    assert found.extras
+    for x in found.extras:
+        assert not x.separable
+        assert x.standard_error == np.inf
+        assert x.confounded_with
+
+
+@pytest.mark.parametrize("name", ["contacts", "mixed"])
+def test_offsets_of_plates_that_read_along_world_axes_are_constant_along_these(name: str) -> None:
+    terms, w = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log")), world(axes="world")
+    found = fitted(w, sensors_of(w.robot, name), terms)
+    assert_recovered(w, found, terms)
+    if name == "mixed":
+        assert ("a.npz", "offset of sole fy") in found.values, "measured fx and fz are made of all three readings"
+
+
+# ------------------------------------------------------------------------------------------------- actuators
+
+
+def test_a_contact_and_a_limb_sensor_of_one_name_have_unknowns_of_their_own() -> None:
+    """As links and joints of a URDF may."""
+    robot = world().robot
+    contacts = (Contact(SENSORS[0], "flat"),)
+    sensors = with_ft_sensors(named_sensors("full", robot.n, 1, ft=len(SENSORS)), robot, SENSORS)
+    labels = [
+        extra.label for extra in list_extras(robot, contacts, sensors, ExtraTerms(dict.fromkeys(CHANNELS, "log")))
+    ]
+    assert len(set(labels)) == len(labels) == robot.n + 6 * len(SENSORS) + 6
+
+
+@pytest.mark.parametrize("kinds", ["asymmetric_coulomb", "all"])
+def test_terms_of_actuators_are_found_with_friction_that_turns_over_smoothly(kinds: str) -> None:
+    every = ("armature", "torque_offset", "asymmetric_coulomb")
+    terms = ExtraTerms(sign_width=WIDTH, **dict.fromkeys(every if kinds == "all" else (kinds,), True))
+    w = world()
+    logs, true = with_actuators(w, terms)
+    found = fit(
+        w.robot, CONTACTS, sensors_of(w.robot, "full"), terms, [bind_log(log, w.robot, CONTACTS) for log in logs]
+    )
+    assert set(found.values) == set(true)
+    for key, expected in true.items():
+        assert found.values[key] == pytest.approx(expected, rel=EXACT, abs=1e-9), key
+    assert found.estimate.residual_std < 1e-9
+    without = replace(terms, armature=False, torque_offset=False, asymmetric_coulomb=False)
+    plain = fit(w.robot, CONTACTS, sensors_of(w.robot, "full"), without, [bind_log(x, w.robot, CONTACTS) for x in logs])
+    assert plain.estimate.residual_std > 1e-3, "the terms must matter"
+    sharp = fit(w.robot, CONTACTS, sensors_of(w.robot, "full"), replace(terms, sign_width=None),
+                [bind_log(x, w.robot, CONTACTS) for x in logs])  # fmt: skip
+    assert sharp.estimate.residual_std > 1e-3, "and so must the width"
+
+
+# --------------------------------------------------------------------------------- a humanoid on Monday morning
+
+LEGS = ("left", "right")
+ANKLES = tuple(f"{side}_ankle_ft" for side in LEGS)
+FEET = tuple(Contact(f"{side}_foot", "flat") for side in LEGS)
+
+
+def with_ankle_sensors(folder: Path) -> Path:
+    """G1 with a skew force/torque sensor in each ankle, a foot of 0.6 kg beyond it, and a skew IMU on the pelvis."""
+    root = ElementTree.parse(G1).getroot()
+
+    def weld(name: str, parent: str, child: str, pose: str, mass: str = "") -> None:
+        link = ElementTree.SubElement(root, "link", name=child)
+        if mass:
+            link.append(ElementTree.fromstring(mass))
+        joint = ElementTree.SubElement(root, "joint", name=name, type="fixed")
+        joint.append(ElementTree.fromstring(f"<origin {pose}/>"))
+        ElementTree.SubElement(joint, "parent", link=parent)
+        ElementTree.SubElement(joint, "child", link=child)
+
+    foot = """<inertial><origin xyz="0.03 0.002 -0.02" rpy="0.2 0.1 -0.3"/><mass value="0.6"/>
+        <inertia ixx="0.0009" ixy="0.0001" ixz="-0.0002" iyy="0.0021" iyz="0.0001" izz="0.0024"/></inertial>"""
+    poses = 'xyz="0.01 0 -0.02" rpy="0.3 -0.2 0.7"', 'xyz="0 0.01 -0.03" rpy="-0.4 0.1 2"'
+    for side, pose in zip(LEGS, poses, strict=True):
+        weld(f"{side}_ankle_ft", f"{side}_ankle_roll_link", f"{side}_foot", pose, foot)
+    weld("imu_weld", "pelvis", "imu", 'xyz="-0.1 0.05 0.2" rpy="0.5 -0.9 2.1"')
+    path = folder / "g1.urdf"
+    ElementTree.ElementTree(root).write(path)
+    return path
+
+
+def test_a_humanoid_with_ankle_sensors_and_an_imu_is_found_with_all_offsets_that_change_from_log_to_log(
+    tmp_path: Path,
+) -> None:
+    robot, rng = load(with_ankle_sensors(tmp_path), None, False, ANKLES), np.random.default_rng(11)
+    oracle = Oracle.of(robot)
+    oracle.perturb(rng, 0.2)
+    states = [[True, True], [True, False], [False, True]]
+    contacts, logs, misread = [(foot.frame, 6) for foot in FEET], [], []
+    for name in ("a.npz", "b.npz", "c.npz"):
+        log = make_log(oracle, contacts, states, 300, rng, name)
+        misread.append(Miscalibration.random(log, rng))
+        log = with_imu(oracle, misread[-1].read(log), "imu")
+        logs.append(bind_log(log, robot, FEET))
+        assert logs[-1].base.quat_xyzw is None
+    sensors = with_ft_sensors(named_sensors("joints", robot.n, 2, ft=2), robot, ANKLES)
+    terms = ExtraTerms(offsets={"joint_torque": "log", "ft_force": "log", "ft_moment": "log"})
+    found = fit(robot, FEET, sensors, terms, logs)
+
+    assert len(found.extras) == 3 * (robot.n + 12)
+    for log, own in zip(logs, misread, strict=True):
+        offsets = dict(zip(robot.dof_names, np.append(own.torque, own.ft), strict=True))
+        for name, expected in offsets.items():
+            label = f"offset of {'limb sensor ' if '.' in name else ''}{' '.join(name.rsplit('.', 1))}"
+            assert found.values[log.source, label] == pytest.approx(expected, rel=EXACT), (log.source, label)
+    assert all(x.separable for x in found.extras)
+
+    state = random_states(np.random.default_rng(99), robot.n, 100)
+    assert worst(predicted(robot, found.estimate.phi, *state), oracle.forces(*state)) < 1e-9
+    true = true_parameters(oracle, robot).ravel()
+    base = base_parameters(structural_problem(robot, FEET, sensors, [tuple(state) for state in states]))
+    assert found.estimate.rank == base.rank
+    expected, units = base.of(true), np.abs(base.combination) @ base.scale
+    np.testing.assert_allclose((base.of(found.estimate.phi) - expected) / units, 0.0, rtol=0.0, atol=EXACT)
+
+
+def test_parameters_bound_to_be_physical_are_found_with_the_offsets_too() -> None:
+    terms, w = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log")), world()
+    logs = [bind_log(log, w.robot, CONTACTS) for log in w.logs]
+    found = fit(w.robot, CONTACTS, sensors_of(w.robot, "full+limbs"), terms, logs, Consistent())
+    for key, expected in w.true(found.builder, terms).items():
+        assert found.values[key] == pytest.approx(expected, abs=1.5e-3), key  # 4.2e-4: where the interior point stops

@@ -1,0 +1,49 @@
+"""Memory of a fit: that of the log's arrays and a constant, however long the log."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+from repository import DEMO
+
+URDF = DEMO / "quadruped.urdf"
+FIT = """
+import json, resource, sys, torch, torchid
+from torchid.problem import Samples
+from torchid.problem.base_motion import BaseMotion
+robot, count = torchid.load_robot(sys.argv[1]), int(sys.argv[2])
+contacts = [torchid.Contact(f"{leg}_foot", "point") for leg in ("front_left", "front_right", "rear_left", "rear_right")]
+generator = torch.Generator().manual_seed(0)
+normal = lambda *shape: torch.randn(count, *shape, generator=generator, dtype=torch.float64)
+base = BaseMotion(torch.nn.functional.normalize(normal(4)), normal(3), normal(3), normal(3))
+time, active = torch.arange(count, dtype=torch.float64), torch.rand(count, 4, generator=generator) < 0.9
+samples = Samples("random", time, normal(12), normal(12), normal(12), base, normal(12), None, False, active)
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+arrays = peak()
+builder = torchid.RowBuilder(robot, contacts, torchid.named_sensors("joints", robot.n, 4))
+factor = torchid.compress([samples], builder, threads=2)
+estimate = torchid.LeastSquares().solve(torchid.linear_problem(factor, builder, robot))
+print(json.dumps({"arrays": arrays, "all": peak(), "rows": factor.rows, "rank": estimate.rank}))
+"""
+
+
+def fit(samples: int) -> dict[str, float]:
+    """Peak resident memory [MiB] before and after a joints-only fit of an 18-dof quadruped in a process of its own."""
+    command = [sys.executable, "-c", FIT, str(URDF), str(samples)]
+    found = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
+    assert found["rank"] == 118
+    assert found["rows"] >= 6 * samples
+    return dict(found)
+
+
+def test_five_times_the_samples_need_no_more_memory_beside_their_arrays() -> None:
+    short, long = fit(20_000), fit(100_000)
+    assert long["all"] - long["arrays"] < short["all"] - short["arrays"] + 80.0  # allocators keep some slack
+
+
+@pytest.mark.slow
+def test_a_million_samples_of_a_quadruped_fit_in_two_gibibytes() -> None:
+    assert fit(1_000_000)["all"] < 2048.0

@@ -1,0 +1,300 @@
+"""The fast path's rows against the plain one: dense regressor, frame Jacobians and the projection's null space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from synthetic import ANYMAL, DRONE, G1, PANDA, ROBOTS, SOLO12, Array, load, random_states
+
+from torchid.logs import Log
+from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
+from torchid.problem.base_motion import BaseMotion
+from torchid.problem.predict import force_series
+from torchid.regressor import FrameJacobian, Regressor
+from torchid.robot import Robot
+from torchid.sensing import Contact, Projection, SensorNoise, SensorSet, named_sensors
+
+TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
+NOISE = SensorNoise(joint_torque=0.3, contact_force=1.5, contact_moment=0.1, base_force=0.7, base_moment=0.05)
+State = tuple[Array, Array, Array]
+
+
+@pytest.fixture(scope="module")
+def walker(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two legs and a tail that mimics a hip; five frames on the left foot, one on the right and on the tail, turned."""
+    inertia = '<inertia ixx="0.3" ixy="0.01" ixz="-0.02" iyy="0.4" iyz="0.03" izz="0.5"/>'
+    inertial = f'<inertial><origin xyz="0.1 -0.2 0.3" rpy="0.4 0.5 -0.6"/><mass value="2"/>{inertia}</inertial>'
+    elements = [f'<link name="trunk">{inertial}</link>']
+
+    def add(link: str, parent: str, kind: str, pose: str, rest: str = "") -> None:
+        body = "" if kind == "fixed" else inertial
+        ends = f'<parent link="{parent}"/><child link="{link}"/>{rest}'
+        elements.append(f'<link name="{link}">{body}</link>')
+        elements.append(f'<joint name="{link}_joint" type="{kind}"><origin {pose}/>{ends}</joint>')
+
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        pose = 'xyz="0.05 {y} -0.3" rpy="0.2 -0.1 0.3"'
+        add(f"{side}_hip", "trunk", "revolute", pose.format(y=y), '<axis xyz="1 0.3 0"/>')
+        add(f"{side}_knee", f"{side}_hip", "revolute", pose.format(y=0.1), '<axis xyz="0.1 1 0"/>')
+        add(f"{side}_foot", f"{side}_knee", "prismatic", pose.format(y=0.0), '<axis xyz="0 0.2 1"/>')
+    mimic = '<axis xyz="0 1 1"/><mimic joint="left_hip_joint" multiplier="-1.3" offset="0.2"/>'
+    add("tail", "trunk", "revolute", 'xyz="-0.3 0 0.1" rpy="0.1 0.2 0"', mimic)
+    for corner, (x, y) in enumerate([(0.1, 0.05), (0.1, -0.05), (-0.1, 0.05), (-0.1, -0.05)]):
+        add(f"corner_{corner}", "left_foot", "fixed", f'xyz="{x} {y} -0.03" rpy="0.{corner} -0.2 0.7"')
+    add("left_sole", "left_foot", "fixed", 'xyz="0.02 0.01 -0.03" rpy="0.5 0.6 -0.4"')
+    add("right_sole", "right_foot", "fixed", 'xyz="0.02 -0.01 -0.03" rpy="-0.3 0.2 1.4"')
+    add("tail_tip", "tail", "fixed", 'xyz="-0.4 0 0.1" rpy="1.0 0.1 0.2"')
+    path = tmp_path_factory.mktemp("walker") / "walker.urdf"
+    path.write_text(f'<robot name="walker">{"".join(elements)}</robot>')
+    return path
+
+
+loaded = cache(lambda urdf, fixed_base: load(urdf, fixed_base=fixed_base))
+
+
+def recorded(
+    robot: Robot, contacts: Sequence[Contact], rng: np.random.Generator, samples: int = 40, world: bool = False
+) -> tuple[Samples, State]:
+    """Unrelated random motion, forces and contact states: rows know nothing of whether the dynamics close."""
+    q, v, a = random_states(rng, robot.n, samples, robot.fixed_base)
+    rows, base = robot.base_rows, {}
+    if rows:
+        acceleration = Rotation.from_quat(q[:, 3:7]).apply(a[:, :3] + np.cross(v[:, 3:6], v[:, :3]))
+        base = {
+            "base_quat_xyzw": q[:, 3:7],
+            "base_linear_acceleration_world": acceleration,
+            "base_angular_velocity_base": v[:, 3:6],
+            "base_angular_acceleration_base": a[:, 3:6],
+        }
+    wrench = 20.0 * rng.normal(size=(samples, len(contacts), 6))
+    log = Log(
+        source="random.npz",
+        time=np.arange(samples) * 0.01,
+        joint_names=robot.joint_names,
+        joint_position=q[:, q.shape[1] - robot.n :],
+        joint_velocity=v[:, rows:],
+        joint_acceleration=a[:, rows:],
+        joint_torque=20.0 * rng.normal(size=(samples, robot.n)),
+        contact_names=tuple(contact.frame for contact in contacts),
+        contact_active=rng.integers(0, 2, (samples, len(contacts))).astype(bool),
+        **{"contact_wrench_world" if world else "contact_wrench_local": wrench},
+        **base,
+    )
+    return bind_log(log, robot, contacts), (q, v, a)
+
+
+def local_wrenches(robot: Robot, contacts: Sequence[Contact], samples: Samples) -> torch.Tensor:
+    """Wrenches (B, C, 6) along the contact frames' axes, turned by pytorch-kinematics' poses."""
+    assert samples.wrench is not None
+    if not samples.wrench_in_world:
+        return samples.wrench
+    poses = robot.link_poses(samples.joint_position)
+    R = torch.stack([samples.rotation_world_base @ poses[c.frame][:, :3, :3] for c in contacts], dim=1)
+    return (samples.wrench.unflatten(2, (2, 3)) @ R).flatten(2)
+
+
+def reference(
+    robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, samples: Samples, state: State
+) -> tuple[Array, Array, int]:
+    """Gram matrix of all whitened rows [K | f], (12 L + 1, 12 L + 1), the size of each column, and the rows' number."""
+    tensors = [torch.from_numpy(x) for x in state]
+    rows = [(c, k) for c, contact in enumerate(contacts) for k in contact.components]
+    places, components = [c for c, _ in rows], [k for _, k in rows]
+    J = torch.zeros(len(samples), 0, 6, robot.nv, dtype=torch.float64)
+    if contacts:
+        J = torch.stack([FrameJacobian(robot, contact.frame)(tensors[0]) for contact in contacts], dim=1)
+    noise = sensors.noise
+    project = Projection(
+        sensors.torque,
+        sensors.wrench[places, components],
+        robot.base_rows,
+        noise.joint_torque,
+        torch.from_numpy(noise.wrench_std[components]),
+        torch.from_numpy(noise.base_std[: robot.base_rows]),
+    )
+    K = Regressor(robot)(*tensors).contiguous()
+    torque = torch.where(torch.from_numpy(sensors.torque), samples.torque, torch.nan)
+    wrench = local_wrenches(robot, contacts, samples)[:, places, components]
+    groups = project(J[:, places, components], samples.active[:, places], K, torque, wrench)
+    assert sum(len(group.index) for group in groups) == len(samples)
+    X = torch.cat([torch.cat([group.K, group.f[..., None]], dim=2).flatten(0, 1) for group in groups]).numpy()
+    least = min(noise.joint_torque, *noise.wrench_std, *noise.base_std)
+    force = np.hypot(np.linalg.norm(samples.torque), np.linalg.norm(samples.wrench))
+    size = np.append(np.linalg.norm(K.flatten(0, 1).numpy(), axis=0), force) / least
+    return X.T @ X, np.maximum(size, 1e-3 * size.max()), len(X)
+
+
+def assert_same_rows(
+    robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, samples: Samples, state: State
+) -> None:
+    """`R^T R` of the factor is the Gram matrix of the plain path's rows: the same equations but for a rotation."""
+    builder = RowBuilder(robot, contacts, sensors)
+    factor = compress([samples], builder, chunk=16)
+    problem = linear_problem(factor, builder, robot)
+    left_over = np.append(np.zeros(problem.A.shape[1]), np.sqrt(problem.residual))
+    X = np.vstack([np.column_stack([problem.A, problem.b]), left_over])
+    gram, size, rows = reference(robot, contacts, sensors, samples, state)
+    assert factor.rows == rows
+    np.testing.assert_allclose(X.T @ X / np.outer(size, size), gram / np.outer(size, size), rtol=0.0, atol=1e-13)
+
+
+def sensor_set(name: str, robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
+    if name in ("full", "contacts", "joints"):
+        return named_sensors(name, robot.n, len(contacts), NOISE)
+    torque, wrench = np.zeros(robot.n, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
+    if name == "mixed":
+        torque[::2], wrench[:1], wrench[-1:, 1:3] = True, True, True
+    return SensorSet(torque, wrench, NOISE)
+
+
+SETS = ("full", "contacts", "joints", "mixed", "nothing")
+REAL = {
+    "point feet": (ANYMAL, None, False, [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]),
+    "flat feet": (G1, None, False, [Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right")]),
+    "mimic fingers": (TALOS_FULL, None, False, [Contact("left_sole_link", "flat"), Contact("right_sole_link", "line")]),
+    "finger of a floating arm": (
+        PANDA,
+        None,
+        False,
+        [Contact("panda_rightfinger", "point"), Contact("panda_hand", "flat")],
+    ),
+    "arm held by the hand": (PANDA, "panda_hand", False, [Contact("panda_link0", "flat")]),
+    "humanoid held by the torso": (
+        G1,
+        "torso_link",
+        False,
+        [Contact("pelvis", "point"), Contact("left_ankle_roll_link", "flat")],
+    ),
+    "bolted arm": (PANDA, None, True, [Contact("panda_rightfinger", "point"), Contact("panda_hand", "line", "x")]),
+    "bolted humanoid": (G1, None, True, [Contact("left_ankle_roll_link", "flat")]),
+    "bolted arm without contacts": (PANDA, None, True, []),
+    "flight only": (SOLO12, None, False, []),
+    "no joints": (DRONE, None, False, [Contact("base_link", "flat")]),
+}
+
+
+@pytest.mark.parametrize("sensors", SETS)
+@pytest.mark.parametrize("case", REAL)
+def test_fast_rows_are_the_plain_ones(case: str, sensors: str) -> None:
+    urdf, base_link, fixed_base, contacts = REAL[case]
+    robot = load(urdf, base_link, fixed_base)
+    samples, state = recorded(robot, contacts, np.random.default_rng(1))
+    assert_same_rows(robot, contacts, sensor_set(sensors, robot, contacts), samples, state)
+
+
+CONTACTS = [
+    *(Contact(f"corner_{corner}", "point") for corner in range(4)),
+    Contact("left_sole", "flat"),
+    Contact("right_sole", "line", "x"),
+    Contact("tail_tip", "line", "z"),
+    Contact("right_foot", "point"),
+]
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), fixed_base=st.booleans(), world=st.booleans())
+def test_fast_rows_are_the_plain_ones_whatever_is_measured_touches_and_however_frames_are_turned(
+    walker: Path, seed: int, fixed_base: bool, world: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    robot = loaded(walker, fixed_base)
+    kinds = ("point", "line", "flat")
+    chosen = [c for c in CONTACTS if rng.random() < 0.6]
+    contacts = [Contact(c.frame, kinds[rng.integers(3)], "xyz"[rng.integers(3)]) for c in chosen]
+    share = rng.random(2)
+    sensors = SensorSet(rng.random(robot.n) < share[0], rng.random((len(contacts), 6)) < share[1], NOISE)
+    samples, state = recorded(robot, contacts, rng, 30, world and not fixed_base)
+    assert_same_rows(robot, contacts, sensors, samples, state)
+
+
+@pytest.mark.parametrize("sensors", SETS)
+def test_four_points_on_one_rigid_foot_count_once(walker: Path, sensors: str) -> None:
+    """Twelve unmeasured forces on a foot push in six directions: as many equations are left as with a flat foot."""
+    robot, rows = load(walker), {}
+    for feet in (CONTACTS[:4], CONTACTS[4:5]):
+        samples, state = recorded(robot, feet, np.random.default_rng(2))
+        samples.active[:] = True
+        chosen = sensor_set(sensors if sensors != "mixed" else "joints", robot, feet)
+        assert_same_rows(robot, feet, chosen, samples, state)
+        rows[len(feet)] = compress([samples], RowBuilder(robot, feet, chosen)).rows
+    assert rows[4] == rows[1]
+
+
+def test_straight_legs_among_bent_ones_give_the_rows_of_their_own_rank() -> None:
+    robot = load(SOLO12)
+    contacts = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
+    samples, (q, v, a) = recorded(robot, contacts, np.random.default_rng(7))
+    q[::3, 7:] = 0.0
+    samples.joint_position[:] = torch.from_numpy(q[:, 7:])
+    samples.active[:20] = True
+    torque = np.array(["HAA" not in name for name in robot.joint_names])
+    assert_same_rows(robot, contacts, SensorSet(torque, np.zeros((4, 6), bool), NOISE), samples, (q, v, a))
+
+
+def test_a_foot_below_unmeasured_joints_of_a_bolted_robot_says_nothing() -> None:
+    robot = load(SOLO12, fixed_base=True)
+    contacts = [Contact("FL_FOOT", "point"), Contact("FR_FOOT", "point")]
+    torque = np.array([name.startswith("FR_") for name in robot.joint_names])
+    samples, state = recorded(robot, contacts, np.random.default_rng(5))
+    for wrench in (True, False):
+        sensors = SensorSet(torque, np.full((2, 6), wrench), NOISE)
+        assert_same_rows(robot, contacts, sensors, samples, state)
+
+
+def test_a_tilted_bolted_arm_feels_gravity_along_its_own_axes() -> None:
+    robot = load(PANDA, fixed_base=True)
+    samples, state = recorded(robot, [], np.random.default_rng(3))
+    tilt = Rotation.from_rotvec([0.4, -0.7, 0.2])
+    mounted = BaseMotion(torch.from_numpy(np.tile(tilt.as_quat(), (len(samples), 1))))
+    builder = RowBuilder(robot, [], named_sensors("joints", robot.n, 0, NOISE))
+    A = linear_problem(compress([replace(samples, base=mounted)], builder), builder, robot).A
+    gravity = tilt.inv().apply([0.0, 0.0, -9.81])
+    K = Regressor(robot, tuple(gravity.tolist()))(*map(torch.from_numpy, state)).flatten(0, 1).numpy()
+    K /= NOISE.joint_torque
+    np.testing.assert_allclose(A.T @ A, K.T @ K, rtol=0.0, atol=1e-12 * np.abs(K.T @ K).max())
+
+
+@pytest.mark.parametrize("world", [False, True], ids=["local", "world"])
+def test_evaluation_measures_and_predicts_what_the_plain_path_does(walker: Path, world: bool) -> None:
+    robot, rng = load(walker), np.random.default_rng(4)
+    samples, state = recorded(robot, CONTACTS, rng, world=world)
+    builder = RowBuilder(robot, CONTACTS, named_sensors("full", robot.n, len(CONTACTS)))
+    phi = rng.normal(size=(3, robot.nominal.size))
+    phi.reshape(3, -1, 12)[:, 0, 10:] = 0.0  # the base has no joint
+    measured, predicted = force_series(builder, samples, phi)
+    q, v, a = map(torch.from_numpy, state)
+    expected = torch.nn.functional.pad(samples.torque, (6, 0))
+    wrench = local_wrenches(robot, CONTACTS, samples)
+    for place, contact in enumerate(CONTACTS):
+        used = list(contact.components)
+        pushing = (wrench[:, place] * samples.active[:, place, None])[:, used]
+        expected += (FrameJacobian(robot, contact.frame)(q)[:, used].mT @ pushing[..., None])[..., 0]
+    np.testing.assert_allclose(measured, expected, rtol=0.0, atol=1e-13 * float(expected.abs().max()))
+    K = Regressor(robot)(q, v, a).numpy()
+    expected_forces = np.einsum("bip,mp->mbi", K, phi)
+    np.testing.assert_allclose(predicted, expected_forces, rtol=0.0, atol=1e-13 * np.abs(expected_forces).max())
+
+
+def test_an_unmeasured_wrench_leaves_the_joints_that_it_does_not_load_measured() -> None:
+    robot = load(G1)
+    contacts = [Contact("left_ankle_roll_link", "flat"), Contact("right_ankle_roll_link", "flat")]
+    samples, _ = recorded(robot, contacts, np.random.default_rng(6))
+    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, 2))
+    known, _ = force_series(builder, samples, robot.nominal.reshape(1, -1))
+    samples.wrench[:, 0] = torch.nan
+    measured, _ = force_series(builder, samples, robot.nominal.reshape(1, -1))
+    leg = [f"left_{part}_joint" for part in ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")]
+    loaded = np.concatenate([np.ones(6, bool), np.isin(robot.joint_names, leg)])
+    on_ground = samples.active[:, 0].numpy()
+    assert np.isnan(measured[np.ix_(on_ground, loaded)]).all()
+    np.testing.assert_array_equal(measured[on_ground][:, ~loaded], known[on_ground][:, ~loaded])
+    np.testing.assert_array_equal(measured[~on_ground], known[~on_ground])

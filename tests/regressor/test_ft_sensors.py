@@ -1,0 +1,279 @@
+"""Force/torque sensors at the fixed joints of a limb, against Pinocchio with these joints free and at rest."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from regressors import base_kinds, by_joints_of, seen_from, tensors
+from synthetic import Array, Oracle, load, make_log, random_states
+from true_robots import hide, true_parameters, worst
+from urdfs import BASE, inertial, joint, link, write
+from welded import REAL, SENSORS, machine
+
+from torchid import parameters
+from torchid.errors import LogError, UnknownNameError
+from torchid.estimators import LeastSquares
+from torchid.identifiability.base_rank import state_reports
+from torchid.parameters import WRENCH_COMPONENTS
+from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
+from torchid.problem.chunks import chunks_by_state
+from torchid.problem.predict import force_series
+from torchid.regressor import FrameJacobian, Regressor
+from torchid.robot import Robot, load_robot
+from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
+
+EXACT = 1e-14  # of the largest number; 3e-15 measured
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return machine(tmp_path_factory.mktemp("welded"))
+
+
+def dense(robot: Robot, *state: Array) -> Array:
+    """K, (B, nv + 6 F, L, 12)."""
+    K = Regressor(robot)(*tensors(*state)).numpy()
+    return K.reshape(len(state[0]), robot.nv + 6 * len(robot.ft_names), len(robot.bodies), parameters.PER_BODY)
+
+
+def assert_oracles(robot: Robot, seed: int) -> None:
+    """Columns of K, nominal forces and Jacobians of many links are Pinocchio's."""
+    oracle = Oracle.of(robot)
+    state = random_states(np.random.default_rng(seed), robot.n, 3, robot.fixed_base)
+    K, expected = dense(robot, *state), oracle.regressor(robot, *state)
+    np.testing.assert_allclose(K[..., :10], expected, rtol=0.0, atol=EXACT * np.abs(expected).max())
+    forces, nominal = oracle.frictionless_forces(*state), robot.nominal[:, :10]
+    found = np.einsum("bilk,lk->bi", K[..., :10], nominal)
+    np.testing.assert_allclose(found, forces, rtol=0.0, atol=EXACT * np.abs(forces).max())
+    assert np.abs(forces[:, robot.nv :]).max() > 1e-3 * np.abs(forces).max(), "the sensors must read something"
+    frames = list(robot.links)
+    for frame in {frames[-1], *frames[:: 1 + len(frames) // 4]}:
+        J = FrameJacobian(robot, frame)(torch.from_numpy(state[0])).numpy()
+        np.testing.assert_allclose(J, oracle.jacobian(state[0], frame), rtol=0.0, atol=EXACT, err_msg=frame)
+
+
+@pytest.mark.parametrize(("name", "fixed_base"), [(name, place % 2 == 1) for place, name in enumerate(REAL)])
+def test_the_wrench_through_a_weld_is_that_of_a_free_joint_at_rest(name: str, fixed_base: bool) -> None:
+    path, welds = REAL[name]
+    robot = load(path, None, fixed_base, welds)
+    assert set(robot.ft_names) == set(welds)
+    assert_oracles(robot, 0)
+
+
+@base_kinds
+@pytest.mark.parametrize("sensors", [SENSORS, SENSORS[:1], SENSORS[1:3]], ids="+".join)
+def test_skew_welds_in_a_row_above_a_slide_at_the_base_and_beyond_a_mimic_joint(
+    urdf: Path, sensors: tuple[str, ...], fixed_base: bool
+) -> None:
+    assert_oracles(load(urdf, None, fixed_base, sensors), 1)
+
+
+def test_a_sensor_under_a_hanging_mass_reads_its_weight_and_beside_the_lever_its_moment(tmp_path: Path) -> None:
+    turned = '<origin xyz="1 2 3" rpy="3.141592653589793 0 0"/>'  # the child's y and z point backwards and down
+    parts = (
+        BASE,
+        link("tool", inertial("2", '<origin xyz="0.3 0 0"/>')),
+        joint("flange", "base", "tool", "fixed", turned),
+    )
+    robot = load_robot(write(tmp_path, *parts), ft_joints=["flange"])
+    q, still = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 6))
+    (reading,) = np.einsum("bilk,lk->bi", dense(robot, q, still, still), robot.nominal)[:, 6:]
+    weight = 2.0 * 9.81  # the parent holds the tool up, along -z of the child
+    np.testing.assert_allclose(reading, [0, 0, -weight, 0, 0.3 * weight, 0], rtol=0.0, atol=1e-12)
+
+
+def test_without_sensors_the_robot_is_the_lumped_one(urdf: Path) -> None:
+    lumped, split = load(urdf), load(urdf, None, False, SENSORS)
+    assert lumped.ft_names == ()
+    assert lumped.dof_names == lumped.joint_names == split.joint_names
+    state = random_states(np.random.default_rng(2), lumped.n, 5)
+    np.testing.assert_array_equal(dense(load(urdf, ft_joints=()), *state), dense(lumped, *state))
+    forces = np.einsum("bilk,lk->bi", dense(lumped, *state)[..., :10], lumped.nominal[:, :10])
+    found = np.einsum("bilk,lk->bi", dense(split, *state)[..., :10], split.nominal[:, :10])[:, : split.nv]
+    np.testing.assert_allclose(found, forces, rtol=0.0, atol=EXACT * np.abs(forces).max())
+
+
+@pytest.mark.parametrize("base_link", ["hips", "hand", "sole", "fin"])
+def test_a_sensor_reads_the_same_wrench_whichever_link_is_the_base(urdf: Path, base_link: str) -> None:
+    """Held by one foot alone, so that no other force depends on what is called the base."""
+    from_root, from_other = load(urdf, None, False, SENSORS), load(urdf, base_link, False, SENSORS)
+    state = random_states(np.random.default_rng(3), from_root.n, 6)
+    moved = seen_from(Oracle.of(load(urdf)), base_link, *state)
+    moved = tuple(by_joints_of(from_root, from_other, k, x) for k, x in zip((7, 6, 6), moved, strict=True))
+    readings = []
+    for robot, motion in ((from_root, state), (from_other, moved)):
+        needed = np.einsum("bilk,lk->bi", dense(robot, *motion)[..., :10], robot.nominal[:, :10])
+        J = FrameJacobian(robot, "foot")(torch.from_numpy(motion[0])).numpy()
+        wrench = np.linalg.solve(J[:, :, :6].transpose(0, 2, 1), needed[:, :6, None])[..., 0]
+        left = needed - np.einsum("bki,bk->bi", J, wrench)
+        order = [robot.base_rows + robot.dof_names.index(name) for name in from_root.dof_names]
+        readings.append(left[:, order])
+    np.testing.assert_allclose(readings[1], readings[0], rtol=0.0, atol=1e-12 * np.abs(readings[0]).max())
+
+
+# ------------------------------------------------------------------------------------------------ rows and fits
+
+CONTACTS = (Contact("sole", "flat"), Contact("thigh", "point"), Contact("fin", "line", "z"))
+STATES = [[True, False, False], [False, True, True], [True, True, True], [False, False, False]]
+SETS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "limbs alone": ("none", SENSORS),
+    "the base's and the tail's": ("none", ("mount_ft", "tail_ft")),
+    "torques, the base's and the tail's": ("joints", ("mount_ft", "tail_ft")),
+    "contacts and thigh": ("contacts", ("thigh_ft",)),
+    "everything": ("full", SENSORS),
+}
+
+
+def sensors_of(robot: Robot, name: str) -> SensorSet:
+    """One of `SETS`."""
+    beside, welds = SETS[name]
+    if beside == "none":
+        sensors = chosen_sensors(robot.joint_names, CONTACTS, [], {}, ft=len(SENSORS))
+    else:
+        sensors = named_sensors(beside, robot.n, len(CONTACTS), ft=len(SENSORS))
+    return with_ft_sensors(sensors, robot, welds)
+
+
+def recorded(robot: Robot, seed: int, samples: int = 200) -> tuple[Oracle, Samples]:
+    """A robot that differs from its URDF, and what was recorded of it in contact before, beyond and between sensors."""
+    oracle, rng = Oracle.of(robot), np.random.default_rng(seed)
+    oracle.perturb(rng, 0.2)
+    contacts = [(contact.frame, len(contact.components)) for contact in CONTACTS]
+    return oracle, bind_log(make_log(oracle, contacts, STATES, samples, rng), robot, CONTACTS)
+
+
+def jacobian(oracle: Oracle, samples: Samples, contact: Contact) -> Array:
+    """Of the components that a contact can exert, (B, k, nv + 6 F)."""
+    q = samples.coordinates()[0].numpy()
+    return oracle.jacobian(q, contact.frame)[:, list(contact.components)]
+
+
+@base_kinds
+@pytest.mark.parametrize("seed", range(2))
+def test_rows_are_whitened_combinations_of_k_that_no_unmeasured_force_enters(
+    urdf: Path, fixed_base: bool, seed: int
+) -> None:
+    robot = load(urdf, None, fixed_base, SENSORS)
+    oracle, samples = recorded(robot, 4, 40)
+    rng = np.random.default_rng(seed)  # components of sensors in limbs, one by one
+    sensors = SensorSet(rng.random(robot.n_dofs) < 0.7, rng.random((3, 6)) < 0.5)
+    builder = RowBuilder(robot, CONTACTS, sensors)
+    M, base, noise = builder.columns.parameter_map(), robot.base_rows, sensors.noise
+    std = np.append(noise.base_std[:base], noise.dof_std(robot.n, robot.n_dofs))
+    for state, index in chunks_by_state(hide(samples, sensors)):
+        part = hide(samples, sensors)[index]
+        rows, W = (x.numpy() for x in builder.rows_by_sample(part, state))
+        K = dense(robot, *(x.numpy() for x in part.coordinates())).reshape(len(part), len(std), -1)
+        np.testing.assert_allclose(rows[..., :-1] @ M, W.transpose(0, 2, 1) @ K, rtol=0.0, atol=1e-12 * np.abs(K).max())
+        f, cov = np.zeros(K.shape[:2]), np.tile(np.diag(std**2), (len(part), 1, 1))
+        assert samples.torque is not None
+        assert samples.wrench is not None
+        f[:, base:] = np.where(sensors.torque, samples.torque[index], 0.0)
+        unmeasured = [np.tile(np.eye(len(std))[base:][~sensors.torque], (len(part), 1, 1))]
+        for c, contact in enumerate(CONTACTS):
+            if state[c]:
+                J = jacobian(oracle, part, contact)
+                seen = sensors.wrench[c, list(contact.components)]
+                force = samples.wrench[index][:, c, list(contact.components)].numpy()
+                f += np.einsum("bki,bk->bi", J[:, seen], force[:, seen])
+                var = noise.wrench_std[list(contact.components)][seen] ** 2
+                cov += np.einsum("bki,k,bkj->bij", J[:, seen], var, J[:, seen])
+                unmeasured.append(J[:, ~seen])
+        A = np.concatenate(unmeasured, axis=1)
+        np.testing.assert_allclose(A @ W, 0.0, rtol=0.0, atol=1e-11)
+        np.testing.assert_allclose(rows[..., -1], (W.transpose(0, 2, 1) @ f[..., None])[..., 0], rtol=1e-9, atol=1e-9)
+        kept = np.abs(W).max(axis=1) > 0.0
+        assert (kept.sum(1) == len(std) - np.linalg.matrix_rank(A)).all()
+        white = W.transpose(0, 2, 1) @ cov @ W
+        np.testing.assert_allclose(white, kept[:, None] * np.eye(len(std)), rtol=0.0, atol=1e-10)
+
+
+@base_kinds
+@pytest.mark.parametrize("name", SETS)
+def test_limb_sensors_mixed_with_others_find_all_that_they_can_see(urdf: Path, name: str, fixed_base: bool) -> None:
+    robot = load(urdf, None, fixed_base, SENSORS)
+    oracle, samples = recorded(robot, 5)
+    sensors = sensors_of(robot, name)
+    builder = RowBuilder(robot, CONTACTS, sensors)
+    estimate = LeastSquares().solve(linear_problem(compress([hide(samples, sensors)], builder), builder, robot))
+    assert estimate.residual_std < 1e-11
+    if not fixed_base:
+        assert {report.base_rank for report in state_reports([samples], builder)} == {6}
+    state = random_states(np.random.default_rng(99), robot.n, 100, fixed_base)
+    found = np.einsum("bilk,lk->bi", dense(robot, *state), estimate.phi.reshape(-1, parameters.PER_BODY))
+    seen = np.append(np.ones(robot.base_rows, dtype=bool), sensors.torque)
+    true = oracle.forces(*state)
+    assert worst(found[:, seen], true[:, seen]) < 1e-11
+    nominal = np.einsum("bilk,lk->bi", dense(robot, *state), robot.nominal)
+    assert worst(nominal[:, seen], true[:, seen]) > 0.01
+
+
+@base_kinds
+def test_measured_and_predicted_series_hold_the_limbs_wrenches(urdf: Path, fixed_base: bool) -> None:
+    robot = load(urdf, None, fixed_base, SENSORS)
+    oracle, samples = recorded(robot, 6, 60)
+    builder = RowBuilder(robot, CONTACTS, sensors_of(robot, "everything"))
+    measured, (predicted,) = force_series(builder, samples, true_parameters(oracle, robot).reshape(1, -1))
+    assert measured.shape == (60, robot.nv + 6 * len(SENSORS))
+    np.testing.assert_allclose(predicted, measured, rtol=0.0, atol=1e-12 * np.abs(measured).max())
+
+
+def test_the_bodies_on_both_sides_of_a_sensor_are_found_apart(urdf: Path) -> None:
+    """What no joint separates, a sensor does: all ten parameters of the sole, beyond the last weld."""
+    robot = load(urdf, None, False, SENSORS)
+    oracle, samples = recorded(robot, 7)
+    sensors = sensors_of(robot, "everything")
+    builder = RowBuilder(robot, CONTACTS, sensors)
+    estimate = LeastSquares().solve(linear_problem(compress([samples], builder), builder, robot))
+    true, sole = oracle.inertial_parameters(robot), robot.body_names.index("sole")
+    found = estimate.phi.reshape(-1, parameters.PER_BODY)[sole, :10]
+    assert estimate.identifiable.reshape(-1, parameters.PER_BODY)[sole, :10].all()
+    np.testing.assert_allclose(found, true[sole], rtol=0.0, atol=1e-10 * np.abs(true[sole]).max())
+
+
+# ----------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("name", "what"), [("hip", "a revolute joint, not"), ("sole", "a link, not"), ("ankle", "a"), ("ankl", "unknown")]
+)
+def test_a_sensor_can_sit_at_a_fixed_joint_only(urdf: Path, name: str, what: str) -> None:
+    with pytest.raises(UnknownNameError, match=f"'{name}'.*accepted: .*ankle_ft") as caught:
+        load_robot(urdf, ft_joints=[name])
+    assert what in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ({"ft_names": (), "ft_wrench": None}, "ft_wrench: missing; accepted: the field, or "),
+        ({"ft_wrench": None}, "ft_wrench: missing; accepted: the field, or "),
+        ({"ft_names": ("x", "y", *SENSORS[2:])}, f"ft_names: {SENSORS[0]}, {SENSORS[1]} missing; accepted: "),
+    ],
+    ids=["not in the log", "no readings", "other names"],
+)
+def test_a_sensor_that_was_not_recorded_is_refused_where_it_is_needed(urdf: Path, change: dict, found: str) -> None:
+    robot = load(urdf, None, False, SENSORS)
+    log = make_log(Oracle.of(robot), [], [[]], 5, np.random.default_rng(8))
+    sensors = with_ft_sensors(named_sensors("joints", robot.n, 0, ft=len(SENSORS)), robot, SENSORS)
+    with pytest.raises(LogError) as caught:
+        bind_log(replace(log, **change), robot, (), sensors)
+    assert str(caught.value).startswith(f"synthetic.npz: {found}")
+
+
+def test_one_reading_that_is_not_a_number_is_named_with_its_sensor_and_sample(urdf: Path) -> None:
+    robot = load(urdf, None, False, SENSORS)
+    log = make_log(Oracle.of(robot), [], [[]], 5, np.random.default_rng(9))
+    assert log.ft_wrench is not None
+    log.ft_wrench[3, log.ft_names.index("ankle_ft"), WRENCH_COMPONENTS.index("my")] = np.nan
+    sensors = with_ft_sensors(named_sensors("joints", robot.n, 0, ft=len(SENSORS)), robot, ["ankle_ft"])
+    with pytest.raises(LogError, match=r"ft_wrench 'ankle_ft.my'.*sample 3 \(1 in all\)"):
+        bind_log(log, robot, (), sensors)
+    bind_log(log, robot, (), named_sensors("joints", robot.n, 0, ft=len(SENSORS)))

@@ -1,0 +1,199 @@
+"""The regressor and the Jacobians as modules: shapes, precision, gradients, and the regrouped columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from regressors import assert_close, base_kinds, of_robots, regressor, tensors
+from synthetic import (
+    ANYMAL,
+    BAXTER,
+    DRONE,
+    G1,
+    PANDA,
+    ROMEO,
+    SOLO12,
+    TALOS,
+    TIAGO,
+    TIAGO_PRO,
+    UR5,
+    Array,
+    load,
+    random_states,
+)
+
+from torchid import parameters
+from torchid.errors import UnknownNameError
+from torchid.regressor import FrameJacobian, Regressor, motion_from_state
+from torchid.regressor.columns import reduced_layout, reduction_matrix
+from torchid.regressor.kinematics import body_states, joint_motion
+from torchid.regressor.regressor import all_wrench_columns, joint_row, joint_rows, joint_screw_axes
+from torchid.regressor.tree import KinematicTree
+from torchid.robot import Robot
+
+
+@base_kinds
+def test_a_robot_without_joints_has_the_base_rows_only(fixed_base: bool) -> None:
+    robot = load(DRONE, fixed_base=fixed_base)
+    state = tensors(*random_states(np.random.default_rng(13), 0, 4, fixed_base))
+    rows = 0 if fixed_base else 6
+    assert Regressor(robot)(*state).shape == (4, rows, 12)
+    assert FrameJacobian(robot, robot.base_link)(state[0]).shape == (4, 6, rows)
+
+
+@pytest.mark.parametrize("samples", [0, 1, 5])
+def test_shapes_follow_the_batch(small: Robot, samples: int) -> None:
+    q, v, a = tensors(*random_states(np.random.default_rng(14), small.n, samples))
+    assert Regressor(small)(q, v, a).shape == (samples, 9, 60)
+    assert FrameJacobian(small, "c")(q).shape == (samples, 6, 9)
+
+
+@of_robots(TALOS, PANDA)
+def test_a_sample_does_not_see_its_batch(urdf: Path) -> None:
+    robot = load(urdf)
+    state = tensors(*random_states(np.random.default_rng(15), robot.n, 37))
+    jacobian, K = FrameJacobian(robot, list(robot.links)[-1]), Regressor(robot)
+    whole, J = K(*state), jacobian(state[0])
+    for part in (slice(0, 1), slice(11, 12), slice(20, 37)):
+        piece = [x[part] for x in state]
+        assert_close(K(*piece).numpy(), whole[part].numpy(), 1e-15)
+        assert_close(jacobian(piece[0]).numpy(), J[part].numpy(), 1e-15)
+
+
+def test_a_motion_knows_all_that_the_regressor_needs(small: Robot) -> None:
+    state = tensors(*random_states(np.random.default_rng(16), small.n, 3))
+    K = Regressor(small)
+    torch.testing.assert_close(K.from_motion(motion_from_state(*state, n=small.n)), K(*state), rtol=0.0, atol=0.0)
+
+
+@base_kinds
+@of_robots(G1, PANDA)
+def test_single_precision_stays_single_and_agrees_to_its_digits(urdf: Path, fixed_base: bool) -> None:
+    robot = load(urdf, fixed_base=fixed_base)
+    state = tensors(*random_states(np.random.default_rng(17), robot.n, 8, fixed_base))
+    frame = list(robot.links)[-1]
+    K, J = Regressor(robot), FrameJacobian(robot, frame)
+    exact, exact_J = K(*state).numpy(), J(state[0]).numpy()
+    single = [x.to(torch.float32) for x in state]
+    found, found_J = K.to(torch.float32)(*single), J.to(torch.float32)(single[0])
+    assert found.dtype == found_J.dtype == torch.float32
+    for module in (K, J):
+        assert all(x.dtype == torch.float32 for x in module.buffers() if x.is_floating_point())
+    assert_close(found.numpy(), exact, 1e-5)
+    assert_close(found_J.numpy(), exact_J, 1e-5)
+
+
+def test_a_module_moved_to_single_precision_and_back_still_runs_in_double(small: Robot) -> None:
+    state = tensors(*random_states(np.random.default_rng(18), small.n, 2))
+    K = Regressor(small)
+    exact = K(*state)
+    back = K.to(torch.float32).to(torch.float64)(*state)
+    assert back.dtype == torch.float64
+    assert_close(back.numpy(), exact.numpy(), 1e-5)  # the constants have lost their digits
+
+
+WRONG_SHAPES = {
+    "q without the base": lambda q, v, a: (q[:, 7:], v, a),
+    "q without a joint": lambda q, v, a: (q[:, :-1], v, a),
+    "v without the base": lambda q, v, a: (q, v[:, 6:], a),
+    "a without a joint": lambda q, v, a: (q, v, a[:, :-1]),
+    "all without a joint": lambda q, v, a: (q[:, :-1], v[:, :-1], a[:, :-1]),
+    "a joint too many": lambda q, v, a: tuple(torch.cat([x, x[:, -1:]], 1) for x in (q, v, a)),
+    "more v than q": lambda q, v, a: (q[:2], v, a),
+    "one v for all": lambda q, v, a: (q, v[:1], a[:1]),
+    "one q for all": lambda q, v, a: (q[:1], v, a),
+    "no batch": lambda q, v, a: (q[0], v[0], a[0]),
+}
+
+
+@pytest.mark.parametrize("spoil", WRONG_SHAPES.values(), ids=WRONG_SHAPES.keys())
+def test_shapes_that_do_not_belong_together_are_refused(small: Robot, spoil: object) -> None:
+    state = tensors(*random_states(np.random.default_rng(19), small.n, 3))
+    assert callable(spoil)
+    with pytest.raises(ValueError, match="accepted"):
+        Regressor(small)(*spoil(*state))
+
+
+@pytest.mark.parametrize("columns", [slice(1, None), slice(7, None), slice(0, 5)], ids=["narrow", "no base", "few"])
+def test_a_jacobian_refuses_coordinates_of_another_robot(small: Robot, columns: slice) -> None:
+    q, _, _ = tensors(*random_states(np.random.default_rng(20), small.n, 3))
+    with pytest.raises(ValueError, match="accepted"):
+        FrameJacobian(small, "c")(q[:, columns])
+
+
+def test_another_precision_than_the_modules_is_refused_by_both_names(small: Robot) -> None:
+    state = [x.float() for x in tensors(*random_states(np.random.default_rng(23), small.n, 2))]
+    for module, arguments in ((Regressor(small), state), (FrameJacobian(small, "c"), state[:1])):
+        with pytest.raises(TypeError, match=r"found torch.float32; accepted: torch.float64"):
+            module(*arguments)
+        module.float()(*arguments)
+
+
+def test_a_jacobian_of_no_link_is_refused_by_the_nearest_names() -> None:
+    with pytest.raises(UnknownNameError, match="unknown name 'left_anklle_roll_link'; accepted: left_ankle_roll_link"):
+        FrameJacobian(load(G1), "left_anklle_roll_link")
+
+
+def test_the_regressor_is_differentiable_by_motion(small: Robot) -> None:
+    state = [x.requires_grad_() for x in tensors(*random_states(np.random.default_rng(21), small.n, 2))]
+    K = Regressor(small)
+    weights = torch.from_numpy(np.random.default_rng(22).normal(size=(12 * len(small.bodies), 3)))
+    assert torch.autograd.gradcheck(lambda q, v, a: K(q, v, a) @ weights, state)
+    assert torch.autograd.gradcheck(K, state, fast_mode=True)
+
+
+def test_a_jacobian_is_differentiable_by_coordinates(small: Robot) -> None:
+    q, _, _ = tensors(*random_states(np.random.default_rng(23), small.n, 2))
+    assert torch.autograd.gradcheck(FrameJacobian(small, "c"), q.requires_grad_())
+
+
+def reduced_regressor(robot: Robot, *state: Array) -> Array:
+    """K's inertial part in the columns that are left after regrouping, (B, nv, columns)."""
+    tree = KinematicTree(robot)
+    layout = reduced_layout(tree)
+    joints = joint_motion(tree, motion := motion_from_state(*tensors(*state), robot.n, robot.fixed_base))
+    states = body_states(tree, motion, joints)
+    wrenches = all_wrench_columns(states, layout)
+    directions = joint_screw_axes(tree, states)
+    rows = [wrenches] if tree.base_rows else []
+    for row in joint_rows(tree, layout):
+        full = wrenches.new_zeros(1, layout.count, wrenches.shape[-1])
+        full[0, row.start : row.end] = joint_row(row, tree, layout, directions, wrenches)
+        rows.append(full)
+    return torch.cat(rows).permute(2, 0, 1).numpy()
+
+
+@base_kinds
+@of_robots(ANYMAL, BAXTER, DRONE, G1, PANDA, ROMEO, TALOS, TIAGO, TIAGO_PRO, UR5)
+def test_all_columns_follow_from_the_regrouped_ones(urdf: Path, fixed_base: bool) -> None:
+    robot = load(urdf, fixed_base=fixed_base)
+    if not robot.nv:
+        return
+    state = random_states(np.random.default_rng(24), robot.n, 3, fixed_base)
+    full = regressor(robot, *state)[..., parameters.INERTIAL]
+    B = reduction_matrix(KinematicTree(robot))
+    assert_close(reduced_regressor(robot, *state) @ B, full.reshape(*full.shape[:2], -1))
+
+
+@of_robots(ANYMAL, DRONE, G1, SOLO12, TALOS, TIAGO, UR5)
+def test_a_floating_base_has_10_columns_a_hinge_7_and_a_slide_4_all_independent(urdf: Path) -> None:
+    robot = load(urdf)
+    slides = int(robot.geometry.prismatic.sum())
+    count = 10 + 7 * (robot.n - slides) + 4 * slides
+    samples = 3 * count // robot.nv + 10
+    K = reduced_regressor(robot, *random_states(np.random.default_rng(25), robot.n, samples))
+    stacked = K.reshape(-1, K.shape[2])
+    assert stacked.shape[1] == count == reduction_matrix(KinematicTree(robot)).shape[0]
+    values = np.linalg.svd(stacked / np.linalg.norm(stacked, axis=0), compute_uv=False)
+    assert values[-1] > 1e-6 * values[0]
+
+
+def test_a_mimic_joint_keeps_the_columns_of_its_own_body() -> None:
+    robot = load(BAXTER)
+    slides = int(robot.geometry.prismatic.sum())
+    assert len(robot.bodies) - 1 - robot.n == 2
+    count = 10 + 7 * (len(robot.bodies) - 1 - slides) + 4 * slides
+    assert reduction_matrix(KinematicTree(robot)).shape == (count, 10 * len(robot.bodies))

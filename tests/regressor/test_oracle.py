@@ -1,0 +1,211 @@
+"""The regressor and the Jacobians against Pinocchio and MuJoCo; friction."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from regressors import assert_close, base_kinds, of_robots, regressor, tensors, without_shapes
+from scipy.spatial.transform import Rotation
+from synthetic import (
+    ANYMAL,
+    BAXTER,
+    DRONE,
+    G1,
+    PANDA,
+    ROBOTS,
+    ROMEO,
+    SOLO12,
+    TALOS,
+    TIAGO,
+    TIAGO_PRO,
+    UR5,
+    Oracle,
+    load,
+    random_states,
+)
+from torch import Tensor
+
+from torchid import parameters
+from torchid.regressor import FrameJacobian, Regressor
+from torchid.robot import Robot
+
+REFUSED = ("ur3.urdf", "alex_psyonic_hands.urdf")
+REAL = [path for path in sorted(ROBOTS.rglob("*.urdf")) if path.name not in REFUSED]
+
+
+XARM = ROBOTS / "xarm_description/urdf/xarm7.urdf"
+
+
+# ------------------------------------------------------------------------------------------------------- Pinocchio
+
+
+@base_kinds
+@of_robots(*REAL)
+def test_every_inertial_column_is_pinocchios(urdf: Path, fixed_base: bool) -> None:
+    robot = load(urdf, fixed_base=fixed_base)
+    state = random_states(np.random.default_rng(0), robot.n, 3, fixed_base)
+    expected = Oracle.of(robot).regressor(robot, *state)
+    assert_close(regressor(robot, *state)[..., parameters.INERTIAL], expected)
+
+
+@base_kinds
+@of_robots(*REAL)
+def test_nominal_forces_are_pinocchios(urdf: Path, fixed_base: bool) -> None:
+    robot = load(urdf, fixed_base=fixed_base)
+    state = random_states(np.random.default_rng(1), robot.n, 3, fixed_base)
+    found = np.einsum("bilk,lk->bi", regressor(robot, *state)[..., :10], robot.nominal[:, :10])
+    assert_close(found, Oracle.of(robot).frictionless_forces(*state))
+
+
+@base_kinds
+@of_robots(PANDA, BAXTER, TIAGO_PRO)
+def test_forces_of_a_robot_with_mimic_joints_are_those_of_pinocchios_own_mimic_joints(
+    urdf: Path, fixed_base: bool
+) -> None:
+    robot = load(urdf, fixed_base=fixed_base)
+    root = () if fixed_base else (pin.JointModelFreeFlyer(),)
+    model = pin.buildModelFromUrdf(str(urdf), *root, mimic=True)
+    data = model.createData()
+    q, v, a = random_states(np.random.default_rng(2), robot.n, 4, fixed_base)
+    places = [model.joints[model.getJointId(name)] for name in robot.joint_names]
+    assert model.nv == robot.nv
+    full, expected = pin.neutral(model), []
+    rows = [*range(robot.base_rows), *(joint.idx_v for joint in places)]
+    extra = 0 if fixed_base else 7
+    for sample in range(4):
+        full[:extra] = q[sample, :extra]
+        for joint, value in zip(places, q[sample, extra:], strict=True):
+            full[joint.idx_q : joint.idx_q + joint.nq] = value if joint.nq == 1 else (np.cos(value), np.sin(value))
+        velocity, acceleration = np.zeros(model.nv), np.zeros(model.nv)
+        velocity[rows], acceleration[rows] = v[sample], a[sample]
+        expected.append(pin.rnea(model, data, full, velocity, acceleration)[rows])
+    found = np.einsum("bilk,lk->bi", regressor(robot, q, v, a)[..., :10], robot.nominal[:, :10])
+    assert_close(found, np.array(expected))
+
+
+@base_kinds
+@of_robots(ANYMAL, BAXTER, DRONE, G1, PANDA, ROMEO, SOLO12, TALOS, TIAGO, TIAGO_PRO, UR5)
+def test_frame_jacobians_are_pinocchios(urdf: Path, fixed_base: bool) -> None:
+    robot = load(urdf, fixed_base=fixed_base)
+    oracle = Oracle.of(robot)
+    q, _, _ = random_states(np.random.default_rng(3), robot.n, 3, fixed_base)
+    frames = list(robot.links)
+    for frame in {frames[0], frames[-1], *frames[:: 1 + len(frames) // 8]}:
+        J = FrameJacobian(robot, frame)(torch.from_numpy(q)).numpy()
+        assert J.shape == (3, 6, robot.nv)
+        np.testing.assert_allclose(J, oracle.jacobian(q, frame), rtol=0.0, atol=1e-14, err_msg=frame)
+
+
+def test_the_derivative_of_force_by_acceleration_is_pinocchios_mass_matrix() -> None:
+    robot = load(SOLO12)
+    q, v, a = random_states(np.random.default_rng(4), robot.n, 1)
+    phi = torch.from_numpy(robot.nominal).flatten()
+
+    def force(acceleration: Tensor) -> Tensor:
+        return (Regressor(robot)(*tensors(q, v), acceleration) @ phi)[0]
+
+    (found,) = torch.autograd.functional.jacobian(force, (torch.from_numpy(a),))
+    oracle = Oracle.of(robot)
+    M = oracle.expand.T @ pin.crba(oracle.model, oracle.data, oracle.coordinates(q[0])) @ oracle.expand
+    assert_close(found[:, 0].numpy(), M)
+
+
+# ---------------------------------------------------------------------------------------------------------- MuJoCo
+
+
+def mujoco_model(urdf: Path, base_link: str, fixed_base: bool) -> mujoco.MjModel:
+    """The URDF as MuJoCo reads it, in free flight unless its base is fixed; viscous friction only."""
+    root = ElementTree.parse(urdf).getroot()
+    if not fixed_base:
+        ElementTree.SubElement(root, "link", name="the ground")
+        flight = ElementTree.SubElement(root, "joint", name="free flight", type="floating")
+        ElementTree.SubElement(flight, "parent", link="the ground")
+        ElementTree.SubElement(flight, "child", link=base_link)
+    model = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode")).compile()
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.dof_armature[:], model.dof_frictionloss[:], model.dof_damping[:] = 0.0, 0.0, 0.0
+    return model
+
+
+@pytest.mark.parametrize(
+    ("urdf", "fixed_base"),
+    [(G1, False), (PANDA, False), (PANDA, True), (XARM, True)],
+    ids=["humanoid", "floating arm with slides", "arm with slides", "arm"],
+)
+def test_forces_are_mujocos(urdf: Path, fixed_base: bool, tmp_path: Path) -> None:
+    path = without_shapes(urdf, tmp_path)
+    robot = load(path, fixed_base=fixed_base)
+    model = mujoco_model(path, robot.base_link, fixed_base)
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(5)
+    q, v, a = random_states(rng, robot.n, 5, fixed_base)
+    phi = robot.nominal.copy()
+    phi[:, parameters.COULOMB] = 0.0
+    phi[1:, parameters.VISCOUS] = rng.uniform(0.5, 2.0, robot.n)
+    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in robot.joint_names]
+    joint_q, joint_v = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
+    model.dof_damping[joint_v] = phi[1:, parameters.VISCOUS]
+    extra, base, expected = 0 if fixed_base else 7, robot.base_rows, []
+    for sample in range(5):
+        data.qpos[joint_q] = q[sample, extra:]
+        data.qvel[joint_v], data.qacc[joint_v] = v[sample, base:], a[sample, base:]
+        R = np.eye(3)
+        if not fixed_base:  # MuJoCo: linear parts along world axes, angular along the body's, quaternion w x y z
+            R = Rotation.from_quat(q[sample, 3:7]).as_matrix()
+            linear, angular = v[sample, :3], v[sample, 3:6]
+            data.qpos[:7] = [*q[sample, :3], q[sample, 6], *q[sample, 3:6]]
+            data.qvel[:6] = [*(R @ linear), *angular]
+            data.qacc[:6] = [*(R @ (a[sample, :3] + np.cross(angular, linear))), *a[sample, 3:6]]
+        mujoco.mj_inverse(model, data)
+        force = data.qfrc_inverse
+        expected.append([*(R.T @ force[:3]), *force[3:6], *force[joint_v]][6 - base :])
+    found = np.einsum("bilk,lk->bi", regressor(robot, q, v, a), phi)
+    assert_close(found, np.array(expected), 1e-12)  # MuJoCo turns every inertia into its principal axes
+
+
+# -------------------------------------------------------------------------------------------------------- friction
+
+
+def test_friction_takes_torque_in_the_direction_of_motion(small: Robot) -> None:
+    q, v, a = random_states(np.random.default_rng(6), small.n, 8)
+    K = regressor(small, q, v, a)
+    hinge, branch = small.joint_names.index("hinge"), small.joint_names.index("branch")
+    for name, joint in (("a", hinge), ("d", branch)):
+        body, velocity = small.body_names.index(name), v[:, 6 + joint]
+        np.testing.assert_array_equal(K[:, 6 + joint, body, parameters.COULOMB], np.where(velocity > 0.0, 1.0, -1.0))
+        np.testing.assert_array_equal(K[:, 6 + joint, body, parameters.VISCOUS], velocity)
+
+
+def test_friction_of_a_mimic_joint_reaches_its_master_through_the_ratio(small: Robot) -> None:
+    q, v, a = random_states(np.random.default_rng(7), small.n, 8)
+    K = regressor(small, q, v, a)
+    slide, body = small.joint_names.index("slide"), small.body_names.index("c")
+    speed = np.abs(v[:, 6 + slide])
+    power = v[:, 6 + slide, None] * K[:, 6 + slide, body, parameters.FRICTION]
+    np.testing.assert_allclose(power[:, 0], 1.5 * speed, rtol=1e-15)  # the follower runs at -1.5 times the speed
+    np.testing.assert_allclose(power[:, 1], 1.5**2 * speed**2, rtol=1e-15)
+
+
+@base_kinds
+@of_robots(ROMEO, BAXTER, SOLO12)
+def test_friction_acts_on_its_own_joint_alone_and_never_on_the_base(urdf: Path, fixed_base: bool) -> None:
+    robot = load(urdf, fixed_base=fixed_base)
+    state = random_states(np.random.default_rng(8), robot.n, 4, fixed_base)
+    K = regressor(robot, *state)[..., parameters.FRICTION]
+    joints = [body.joint for body in robot.bodies]
+    masters = [joint and (joint.mimic.master if joint.mimic else joint.name) for joint in joints]
+    expected = np.zeros(K.shape, dtype=bool)
+    for body, master in enumerate(masters[1:], start=1):
+        expected[:, robot.base_rows + robot.joint_names.index(str(master)), body] = True
+    np.testing.assert_array_equal(K != 0.0, expected)
+
+
+def test_a_joint_at_rest_has_no_friction(small: Robot) -> None:
+    q, v, a = random_states(np.random.default_rng(9), small.n, 2)
+    assert not regressor(small, q, 0.0 * v, a)[..., parameters.FRICTION].any()

@@ -1,0 +1,201 @@
+"""Left and right of a robot: paired by name, checked by geometry, and mirrored matter is where it should be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from physical import of_points
+from repository import DEMO
+from scipy.spatial.transform import Rotation
+from synthetic import ANYMAL, G1, ROBOTS, ROMEO, SOLO8, SOLO12, TALOS, Array, load
+from urdfs import joint, link, table, words, write
+
+from torchid.errors import ConfigError
+from torchid.estimators.conditions import mirror_matrix
+from torchid.problem.linear import parameter_scale
+from torchid.robot import Robot, mirror_pairs
+
+GO1 = ROBOTS / "go1_description/urdf/go1.urdf"
+HUMAN = ROBOTS / "human_description/robots/human.urdf"
+PR2 = ROBOTS / "pr2_description/urdf/pr2.urdf"
+TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
+
+
+def names(robot: Robot, *tokens: str, **options: object) -> set[tuple[str, str]]:
+    """The pairs, by name."""
+    pairs = mirror_pairs(robot, *tokens, **options)  # type: ignore[arg-type]
+    return {(robot.body_names[pair.body], robot.body_names[pair.image]) for pair in pairs}
+
+
+# ------------------------------------------------------------------------------------------------------ real robots
+
+
+@table({
+    "G1": (G1, "left", "right", 13, 0.003),
+    "Talos": (TALOS, "left", "right", 14, None),  # its URDF has different arms
+    "ANYmal": (ANYMAL, "L", "R", 6, 0.015),
+    "Solo12": (SOLO12, "L_", "R_", 6, 3e-4),
+    "Solo12, front": (SOLO12, "FL_", "FR_", 3, 3e-4),
+    "Solo8": (SOLO8, "L_", "R_", 4, 3e-4),
+    "Go1": (GO1, "L_", "R_", 6, 0.015),
+    "Romeo": (ROMEO, "L", "R", 23, None),  # one elbow's inertia is another
+    "PR2": (PR2, "l_", "r_", 13, None),
+    "biped": (DEMO / "biped.urdf", "l_", "r_", 7, 1e-12),
+    "quadruped": (DEMO / "quadruped.urdf", "left", "right", 6, 1e-12),
+})  # fmt: skip
+def test_the_limbs_of_real_robots_are_mirror_images_and_so_is_their_matter(case: tuple) -> None:
+    urdf, left, right, count, tolerance = case
+    robot = load(urdf)
+    pairs = mirror_pairs(robot, left, right)
+    assert len(pairs) == count
+    scale, off = parameter_scale(robot.nominal), []
+    for pair in pairs:
+        np.testing.assert_allclose(pair.reflection @ pair.reflection.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(pair.reflection) == pytest.approx(-1.0)
+        image = mirror_matrix(pair.reflection) @ robot.nominal[pair.body]
+        off.append(float(np.abs((image - robot.nominal[pair.image]) / scale[pair.image])[:10].max()))
+    assert np.median(off) < 0.03
+    assert tolerance is None or max(off) < tolerance
+
+
+def test_pairs_are_named_as_people_mean_them() -> None:
+    assert ("LF_HIP", "RF_HIP") in names(load(ANYMAL), "L", "R")
+    assert ("l_foot", "r_foot") in names(load(DEMO / "biped.urdf"), "l_", "r_")
+    assert names(load(DEMO / "biped.urdf"), "l_", "r_") == names(load(DEMO / "biped.urdf"), "r_", "l_")
+    fingers = [pair for pair in names(load(PR2), "l_", "r_") if "r_gripper_l_finger_link" in pair]
+    assert fingers == [("r_gripper_l_finger_link", "l_gripper_r_finger_link")], "not grippel_"
+
+
+# ------------------------------------------------------------------------------------------------- mirrored matter
+
+
+def mirrored_robot(folder: Path, rng: np.random.Generator, normal: int = 1, **shift: Array) -> Robot:
+    """A trunk with two arms of two links, the right one's frames turned any way, everything else mirrored."""
+    D = np.eye(3)
+    D[normal, normal] = -1.0
+    elements, T = [link("trunk")], {}
+    for side in ("left", "right"):
+        parent, R_parent, p_parent = "trunk", np.eye(3), np.zeros(3)
+        for part in ("upper", "lower"):
+            name = f"{side}_{part}"
+            if side == "left":
+                R, p = Rotation.random(random_state=rng).as_matrix(), p_parent + rng.normal(size=3)
+                axis = R @ rng.normal(size=3)
+            else:
+                R, (_, p, axis) = Rotation.random(random_state=rng).as_matrix(), T[f"left_{part}"]
+                p, axis = D @ p + shift.get(part, np.zeros(3)), D @ axis * rng.choice([-1.0, 1.0])
+                axis = axis + shift.get(f"{part}_axis", np.zeros(3))
+            T[name] = (R, p, axis)
+            xyz, rpy = R_parent.T @ (p - p_parent), Rotation.from_matrix(R_parent.T @ R).as_euler("xyz")
+            origin = f'<origin xyz="{words(xyz)}" rpy="{words(rpy)}"/><axis xyz="{words(R.T @ axis)}"/>'
+            elements += [link(name), joint(f"{name}_joint", parent, name, extra=origin)]
+            parent, R_parent, p_parent = name, R, p
+    robot = load(write(folder, *elements))
+    assert robot.body_names == ("trunk", "left_upper", "left_lower", "right_upper", "right_lower")
+    return robot
+
+
+@pytest.mark.parametrize("normal", ["x", "y", "z"])
+def test_points_of_the_right_arm_are_those_of_the_left_seen_in_a_mirror(normal: str, tmp_path: Path) -> None:
+    """However the right arm's frames are turned: made of mass points in the base frame, independent of the package."""
+    rng, axis = np.random.default_rng(1), "xyz".index(normal)
+    robot = mirrored_robot(tmp_path, rng, axis)
+    pairs = mirror_pairs(robot, "left", "right", normal)
+    assert [(pair.body, pair.image) for pair in pairs] == [(1, 3), (2, 4)]
+    poses = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
+    for pair in pairs:
+        mass, in_left = rng.uniform(0.1, 1.0, 6), rng.normal(size=(6, 3))
+        T_left, T_right = (poses[robot.body_names[i]][0].numpy() for i in (pair.body, pair.image))
+        in_base = in_left @ T_left[:3, :3].T + T_left[:3, 3]
+        in_base[:, axis] *= -1.0
+        in_right = (in_base - T_right[:3, 3]) @ T_right[:3, :3]
+        left, right = of_points(mass, in_left), of_points(mass, in_right)
+        left[10:] = right[10:] = [0.3, 0.7]
+        np.testing.assert_allclose(mirror_matrix(pair.reflection) @ left, right, rtol=0.0, atol=1e-9)
+
+
+# --------------------------------------------------------------------------------------------------------- refusals
+
+
+def refusal(robot: Robot, *tokens: str, **options: object) -> str:
+    """The one line, of a file called experiment.yaml."""
+    with pytest.raises(ConfigError) as caught:
+        mirror_pairs(robot, *tokens, source="experiment.yaml", **options)  # type: ignore[arg-type]
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith("experiment.yaml: symmetry: ")
+    assert "; accepted: " in message
+    return message
+
+
+def test_a_pair_that_is_not_mirrored_is_refused_with_the_distance(tmp_path: Path) -> None:
+    robot = mirrored_robot(tmp_path, np.random.default_rng(2), lower=np.array([0.0, 0.03, 0.04]))
+    message = refusal(robot, "left", "right")
+    assert "left_lower and right_lower are 0.05 m from being mirror images along y in a robot of " in message
+    assert "left_upper and right_upper are " in refusal(robot, "left", "right", normal="z")
+    near = mirrored_robot(tmp_path, np.random.default_rng(2), lower=np.array([0.0, 0.0, 1e-4]))
+    assert len(mirror_pairs(near, "left", "right")) == 2
+
+
+def test_joints_that_are_not_mirrored_are_refused_with_the_angle(tmp_path: Path) -> None:
+    robot = mirrored_robot(tmp_path, np.random.default_rng(3), upper_axis=np.array([0.5, 0.0, 0.0]))
+    assert "the joints of left_upper and right_upper are " in refusal(robot, "left", "right")
+
+
+def test_real_grippers_that_are_copies_of_each_other_are_refused_unless_they_stay_apart() -> None:
+    robot = load(TALOS_FULL)
+    message = refusal(robot, "left", "right")
+    assert "gripper_left_fingertip_1_link and gripper_right_fingertip_1_link are 0.064 m from being" in message
+    grippers = [name for name in robot.body_names if name.startswith("gripper")]
+    found = names(robot, "left", "right", apart=grippers)
+    assert ("arm_left_7_link", "arm_right_7_link") in found
+    assert not [pair for pair in found if "gripper" in pair[0]]
+    assert len(names(robot, "leg_left", "leg_right")) == 6
+
+
+def test_the_human_whose_left_is_along_z_is_refused_along_y_and_taken_along_z() -> None:
+    robot = load(HUMAN)
+    assert "m from being mirror images along y" in refusal(robot, "left", "right")
+    assert len(mirror_pairs(robot, "left", "right", "z")) > 5
+
+
+def arms(folder: Path, *bodies: str) -> Robot:
+    """A trunk with a body on each side, two metres apart, and more on its middle."""
+    elements = [link("shell_link")]
+    for name in bodies:
+        y = 1.0 if name.startswith("l_") else -1.0 if name.startswith("r_") else 0.0
+        elements.append(link(name))
+        origin = f'<origin xyz="0.5 {y} 0"/><axis xyz="0 0 1"/>'
+        elements.append(joint(f"{name}_joint", "shell_link", name, extra=origin))
+    return load(write(folder, *elements))
+
+
+@table({
+    "nothing": (["l_arm", "r_arm"], ("links", "rechts"),
+                "no two bodies differ in 'links' and 'rechts'; accepted: parts of names: shell_link, l_arm, r_arm"),
+    "equal": (["l_arm", "r_arm"], ("l_", "l_"), "'l_' on both sides"),
+    "alone": (["l_arm", "r_arm", "l_leg"], ("l_", "r_"), "l_leg has no counterpart; accepted: a body named r_leg"),
+    "alone, right": (["l_arm", "r_arm", "r_leg"], ("l_", "r_"), "r_leg has no counterpart"),
+    "two": (["l_l", "r_l", "l_r"], ("l", "r"), "l_l answers to r_l and to l_r"),
+})  # fmt: skip
+def test_names_that_do_not_answer_to_each_other_are_refused(case: tuple, tmp_path: Path) -> None:
+    bodies, tokens, found = case
+    assert found in refusal(arms(tmp_path, *bodies), *tokens)
+
+
+def test_a_token_inside_a_word_needs_no_counterpart_and_neither_do_bodies_that_stay_apart(tmp_path: Path) -> None:
+    assert names(arms(tmp_path, "l_arm", "r_arm"), "l_", "r_") == {("l_arm", "r_arm")}  # the trunk is shell_link
+    robot = arms(tmp_path, "l_arm", "r_arm", "l_leg")
+    assert names(robot, "l_", "r_", apart=["l_leg"]) == {("l_arm", "r_arm")}
+    assert names(robot, "l_", "r_", apart=["l_leg", "l_arm"]) == {("l_arm", "r_arm")}, "one side may be known"
+    assert names(robot, "l_", "r_", apart=["l_leg", "l_arm", "r_arm"]) == set()
+
+
+def test_a_pair_of_which_one_has_no_mass_is_refused(tmp_path: Path) -> None:
+    origin = '<origin xyz="0 {} 0"/><axis xyz="0 0 1"/>'
+    elements = [link("trunk"), link("l_arm"), link("r_arm", "")]
+    joints = [joint(f"{s}_joint", "trunk", f"{s}_arm", extra=origin.format(y)) for s, y in (("l", 1), ("r", -1))]
+    assert "of l_arm and r_arm one has no mass" in refusal(load(write(tmp_path, *elements, *joints)), "l_", "r_")

@@ -1,0 +1,80 @@
+"""Types that settings are made of, with the check that files and constructors share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
+
+
+def _no_flag(value: object) -> object:
+    """The value, unless it is true or false, which pydantic takes for 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError("a number")  # and not 1.0 for `true`
+    return value
+
+
+def _with_name(value: dict[str, Any]) -> dict[str, Any]:
+    if not isinstance(value.get("name"), str):
+        raise ValueError("a mapping with the name of a class, and its options")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_no_flag), Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
+BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
+Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]
+Count = Annotated[int, BeforeValidator(_no_flag), Field(ge=1)]
+Seed = Annotated[int, BeforeValidator(_no_flag), Field(ge=0)]
+NamedClass = Annotated[dict[str, Any], AfterValidator(_with_name)]
+"""A class of another package by its name, and its options: `{name: Adam, lr: 0.05}`."""
+
+
+def validate_settings(settings: object) -> None:
+    """Check the fields of a dataclass whose types have a range, a choice or another check; for its `__post_init__`.
+
+    Raises:
+        ValueError: names the field, what was found and what is accepted.
+    """
+    for name, adapter in _adapters(type(settings)).items():  # type: ignore[arg-type]  # mypy: no type is hashable
+        value = getattr(settings, name)
+        try:
+            adapter.validate_python(value)
+        except ValidationError as error:
+            raise ValueError(f"{name}: found {value!r}; accepted: {accepted_values(error.errors()[0])}") from None
+
+
+def accepted_values(error: ErrorDetails) -> str:
+    """What a type accepts, in words, by the error that a value raised."""
+    count = error.get("ctx", {}).get("min_length", 1)
+    plain: Mapping[str, str] = {
+        "float_parsing": "a number",
+        "float_type": "a number",
+        "int_parsing": "a whole number",
+        "int_type": "a whole number",
+        "int_from_float": "a whole number",
+        "bool_parsing": "true or false",
+        "bool_type": "true or false",
+        "string_type": "a text",
+        "path_type": "a path",
+        "list_type": "a list",
+        "dict_type": "a mapping",
+        "too_short": f"at least {count} items",
+        "string_too_short": "a name",
+    }
+    described = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return plain.get(error["type"], described)
+
+
+@cache
+def _adapters(settings: type) -> dict[str, TypeAdapter[Any]]:
+    hints = get_type_hints(settings, include_extras=True)
+    return {name: TypeAdapter(hint) for name, hint in hints.items() if _is_checked(hint)}
+
+
+def _is_checked(hint: Any) -> bool:
+    return get_origin(hint) in (Annotated, Literal) or any(map(_is_checked, get_args(hint)))
