@@ -258,10 +258,10 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
     named = {"Chosen sensors": plan.observability}
     if scenario.proposed is not None and scenario.proposed is not plan.observability:
         named["Proposed sensors"] = scenario.proposed
-    for title, checks in named.items():
-        if checks:
-            print_tables(observability_table(title, checks))
-        for line in describe_losses(checks) if title != "Chosen sensors" or plan.parts else []:
+    for title, states in named.items():
+        if states:
+            print_tables(observability_table(title, states))
+        for line in describe_losses(states) if title != "Chosen sensors" or plan.parts else []:
             print(fill(line, 100, subsequent_indent="  "))
     if plan.removals:
         print_tables(removal_table(plan))
