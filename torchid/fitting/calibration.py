@@ -169,7 +169,7 @@ def warn_of_confounded(extras: Sequence[ExtraEstimate], source: object = "logs")
         if confounded:
             named = _grouped(x.extra.label for x in confounded)
             others = _grouped(name for x in confounded for name in x.confounded_with if " of " not in name)
-            message = f"{log or source}: {named} are confounded with {others or 'each other'}; do not trust either"
+            message = f"{log or source}: {named}: confounded with {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
             warn(f"{message}; {advice}", ConfoundedWarning)
 

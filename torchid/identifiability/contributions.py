@@ -166,7 +166,16 @@ def leave_one_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float
         rank = _rank(data.singular_values(factor), rank_tolerance)
         rank_lost = _rank(everything, rank_tolerance) - _rank(rest, rank_tolerance)
         samples = sum(data.parts[i].samples for i in chosen)
-        out.append(PartContribution(name, lost.bits, lost.determined, samples, rank, rank_lost))
+        out.append(
+            PartContribution(
+                name=name,
+                bits=lost.bits,
+                determined=lost.determined,
+                samples=samples,
+                rank=rank,
+                rank_lost=rank_lost,
+            )
+        )
     return out
 
 

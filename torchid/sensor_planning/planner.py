@@ -247,7 +247,15 @@ def contact_requirements(
         least = cheapest_set([demand], channels)
         joints = tuple(robot.joint_names[j] for j in demand.joints)
         through = tuple(limb.name for limb in limbs if not set(limb.joints).isdisjoint(joints))
-        out.append(ContactRequirement(demand.frames, joints, through, round(least.lower_bound), least.proven))
+        out.append(
+            ContactRequirement(
+                contacts=demand.frames,
+                joints=joints,
+                branches=through,
+                fewest_readings=round(least.lower_bound),
+                proven=least.proven,
+            )
+        )
     return tuple(out)
 
 
