@@ -22,7 +22,7 @@ from torchid.problem.metrics import ADVICE, WorseThanNominal, describe_worse
 from torchid.robot import Robot
 from torchid.rounding import is_significant
 
-OFF = 10.0
+LARGEST_FACTOR = 10.0
 """Factor that no model of a robot is off by: units are by a thousand, a gear by 50 to 160."""
 
 _GRAVITY = 9.81  # m/s^2
@@ -119,7 +119,7 @@ def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: R
 
 def is_implausible_factor(ratio: float) -> bool:
     """Whether no model of a robot is off by this factor."""
-    return not 1.0 / OFF <= ratio <= OFF
+    return not 1.0 / LARGEST_FACTOR <= ratio <= LARGEST_FACTOR
 
 
 @one_thread()
@@ -148,16 +148,16 @@ def _sign_note(ratio: float) -> str:
 
 
 def _beyond_bounds(phi: Array, robot: Robot) -> Iterator[str]:
-    """Parameters, (L, 12), that are beyond what `OFF` whole robots at full reach could make of one body."""
+    """Parameters, (L, 12), that are beyond what `LARGEST_FACTOR` whole robots at full reach could make of one body."""
     total = float(robot.nominal[:, parameters.MASS].sum())
     reach = _reach(robot)
     bound = np.empty(PER_BODY)
     bound[parameters.MASS], bound[parameters.FIRST_MOMENT] = total, total * reach
     bound[parameters.INERTIA], bound[parameters.FRICTION] = total * reach**2, total * _GRAVITY * max(reach, 1.0)
-    beyond = ~(np.abs(phi) <= OFF * np.maximum(bound, np.abs(robot.nominal)))
+    beyond = ~(np.abs(phi) <= LARGEST_FACTOR * np.maximum(bound, np.abs(robot.nominal)))
     for body, parameter in np.argwhere(beyond):
         found = f"{robot.body_names[body]} has {PARAMETERS[parameter]} = {phi[body, parameter]:.3g}"
-        yield f"the fit's {found}, beyond {OFF:g} times the whole URDF's {bound[parameter]:.3g}"
+        yield f"the fit's {found}, beyond {LARGEST_FACTOR:g} times the whole URDF's {bound[parameter]:.3g}"
 
 
 def _reach(robot: Robot) -> float:

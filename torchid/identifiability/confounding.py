@@ -107,7 +107,7 @@ class Disagreement:
         """How many of them the two are apart."""
         return abs(self.in_the_air - self.in_contact) / self.standard_error
 
-    def is_significant(self, noise: Array) -> bool:
+    def exceeds_noise(self, noise: Array) -> bool:
         """Whether the two contradict each other, beside the noise (6,) of contact sensors [N, N m]."""
         axis = 0 if self.extra.contact is None else self.extra.contact[1]
         apart = abs(self.in_the_air - self.in_contact)
@@ -147,7 +147,7 @@ def disagreements(
                     )
                 )
     sensors = builder.sensors.noise.wrench_std
-    return sorted((x for x in out if x.is_significant(sensors)), key=lambda x: -x.standard_errors)
+    return sorted((x for x in out if x.exceeds_noise(sensors)), key=lambda x: -x.standard_errors)
 
 
 @dataclass(frozen=True)
