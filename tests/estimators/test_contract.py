@@ -12,7 +12,7 @@ import torch
 from physical import active_case, data, nothing_seen, random_bodies
 from synthetic import Array
 
-from torchid.estimators import BoundEstimate, Consistent, Estimate, LeastSquares, Sgd, SgdEstimate, Trainer
+from torchid.estimators import ConstrainedEstimate, Consistent, Estimate, LeastSquares, Sgd, SgdEstimate, Trainer
 from torchid.estimators.consistent import ConsistentEstimate, Method, Prior
 from torchid.estimators.least_squares import FIXED, VERDICTS
 from torchid.problem import Batch, LinearProblem
@@ -70,7 +70,7 @@ class EstimatorContract(ABC):
 
     def test_bound_estimates_state_their_objective_above_the_unconstrained_one(self) -> None:
         estimate = self.solve(usual_problem())
-        if isinstance(estimate, BoundEstimate):
+        if isinstance(estimate, ConstrainedEstimate):
             assert np.isfinite([estimate.objective, estimate.distance]).all()
             assert estimate.eigenvalues.shape == (2,)
             assert estimate.unconstrained is None or estimate.objective > estimate.unconstrained
