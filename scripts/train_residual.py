@@ -91,7 +91,7 @@ def compare(options: argparse.Namespace) -> None:
         with RunEvents(options.curves / name.replace(" ", "_"), robot.body_names, descent=True) as events:
             for _ in track(range(options.epochs), description=name):
                 epoch = trainer.run_epoch()
-                events.epoch(epoch)
+                events.write_epoch(epoch)
         seen, unseen = (trainer.loss.mean_square(MiniBatches(logs, builder)) ** 0.5 for logs in (train, test))
         shares = (f"{100.0 * epoch.shares.get(of, 0.0):.3g} %" for of in ("rigid_body", "residual"))
         table.add_row(name, f"{seen:.3f}", f"{unseen:.3f}", *shares)

@@ -168,8 +168,10 @@ def _print_fit(run: Identification) -> None:
         print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
     print(f"total mass    {_mass_text(run.mass)} (URDF: {run.mass.nominal:.3f} kg)")
     if run.robust is not None:
-        found = run.robust
-        print(f"robust        {found.loss}, {100 * found.mean_weight:.3g} % of the weight kept, {found.passes} passes")
+        robust = run.robust
+        print(
+            f"robust        {robust.loss}, {100 * robust.mean_weight:.3g} % of the weight kept, {robust.passes} passes"
+        )
     if robot.massless:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
 
@@ -184,14 +186,12 @@ def _print_headline(worse: list[WorseThanNominal]) -> None:
         print(fill(line, 100, subsequent_indent="  "))
 
 
-def _print_validation(found: CrossValidation) -> None:
+def _print_validation(validation: CrossValidation) -> None:
     from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 
-    texts = (
-        describe_errors(group, found.identified.rms.get(group), found.nominal.rms.get(group))
-        for group in DECISIVE_GROUPS
-    )
-    text = f"held out      each of {found.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
+    identified, nominal = validation.identified.rms, validation.nominal.rms
+    texts = (describe_errors(group, identified.get(group), nominal.get(group)) for group in DECISIVE_GROUPS)
+    text = f"held out      each of {validation.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
     print(fill(text, 100, subsequent_indent=" " * 14))
 
 
@@ -205,12 +205,12 @@ def _mass_text(mass: TotalMass) -> str:
     return f"not determined by the data{known}"
 
 
-def _print_noise(found: NoiseSummary) -> None:
+def _print_noise(noise: NoiseSummary) -> None:
     from torchid.report.tables import noise_advice, noise_table, print_tables
 
-    print_tables(noise_table([asdict(one) for one in found.groups]))
-    if found.suggested:
-        print(noise_advice(found.suggested))
+    print_tables(noise_table([asdict(one) for one in noise.groups]))
+    if noise.suggested:
+        print(noise_advice(noise.suggested))
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -218,9 +218,9 @@ def _evaluate(options: argparse.Namespace) -> None:
         from torchid.commands.evaluate import evaluate
         from torchid.report.tables import error_tables, print_tables
 
-    found = evaluate(options.run, options.log, options.device)
-    print_tables(*error_tables(found.metrics))
-    print(f"written to    {found.output}")
+    evaluated = evaluate(options.run, options.log, options.device)
+    print_tables(*error_tables(evaluated.metrics))
+    print(f"written to    {evaluated.output}")
 
 
 def _analyze(options: argparse.Namespace) -> None:
@@ -230,12 +230,12 @@ def _analyze(options: argparse.Namespace) -> None:
         from torchid.report.analysis import accuracy_table
         from torchid.report.tables import print_tables
 
-    found = analyze(load_analysis(options.file, options.overrides), options.file)
-    for scenario in found.scenarios:
+    analysis = analyze(load_analysis(options.file, options.overrides), options.file)
+    for scenario in analysis.scenarios:
         _print_scenario(scenario)
-    if found.accuracies:
-        print_tables(accuracy_table(found.accuracies))
-    print(f"written to    {found.output}")
+    if analysis.accuracies:
+        print_tables(accuracy_table(analysis.accuracies))
+    print(f"written to    {analysis.output}")
 
 
 def _print_scenario(scenario: ScenarioAnalysis) -> None:
@@ -258,10 +258,10 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
     named = {"Chosen sensors": plan.observability}
     if scenario.proposed is not None and scenario.proposed is not plan.observability:
         named["Proposed sensors"] = scenario.proposed
-    for title, checks in named.items():
-        if checks:
-            print_tables(observability_table(title, checks))
-        for line in describe_losses(checks) if title != "Chosen sensors" or plan.parts else []:
+    for title, states in named.items():
+        if states:
+            print_tables(observability_table(title, states))
+        for line in describe_losses(states) if title != "Chosen sensors" or plan.parts else []:
             print(fill(line, 100, subsequent_indent="  "))
     if plan.removals:
         print_tables(removal_table(plan))
@@ -307,6 +307,6 @@ def _simulate(options: argparse.Namespace) -> None:
         from torchid.report.tables import print_tables, stability_table
 
     config = load_simulation(options.file, options.overrides)
-    found = simulate(config, options.file)
-    print_tables(stability_table({name: asdict(stability) for name, stability in found.items()}))
+    stabilities = simulate(config, options.file)
+    print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
     print(f"written to    {config.output}")

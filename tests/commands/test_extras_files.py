@@ -148,7 +148,7 @@ def test_outliers_do_not_move_the_offsets_of_a_new_log_where_fits_are_robust(run
             values=shared,
             loss=experiment.loss,
         )
-        (read,) = calibration.logs([bind_log(new, experiment.robot, CONTACTS)])
+        (read,) = calibration.calibrate([bind_log(new, experiment.robot, CONTACTS)])
         expected = torque - run.off[str(run.folder / "new.npz")].torque
         errors[robust] = np.abs(value(read.torque)[:, : len(expected[0])].numpy() - expected).max()
     assert errors["null"] > 1.0

@@ -398,7 +398,7 @@ def test_the_end_of_a_training_takes_and_removes_what_is_its_own(tmp_path: Path)
     training.copy_curves(tmp_path)
     assert [path.name for path in tmp_path.glob("events*")] == ["events.out.tfevents.1.host.7.0"]
     with pytest.warns(TorchidWarning, match="run.training: stays: it holds what torchid did not write"):
-        training.forget()
+        training.remove_checkpoint()
     left = {"notes.txt", "events.out.tfevents.mine", "more", "more/checkpoint.pt"}
     assert set(everything(training.folder)) == left
 

@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import torchid
 from torchid.cli import main
-from torchid.commands.plausibility import beyond_models, force_gain, implausibility
+from torchid.commands.plausibility import force_gain, implausibility, is_implausible_factor
 from torchid.config import load_config
 from torchid.errors import BaseLostError
 from torchid.estimators import LeastSquares
@@ -331,9 +331,9 @@ def test_a_total_mass_counts_where_the_data_determine_it(mass: TotalMass, determ
 
 
 def test_a_ratio_that_is_no_number_is_absurd() -> None:
-    assert beyond_models(float("nan"))
-    assert beyond_models(float("inf"))
-    assert not beyond_models(1.0)
+    assert is_implausible_factor(float("nan"))
+    assert is_implausible_factor(float("inf"))
+    assert not is_implausible_factor(1.0)
 
 
 # ------------------------------------------------------------------------------------------------------------- the base

@@ -53,7 +53,7 @@ def test_a_person_whose_feet_never_leave_the_plates_is_told_that_offset_and_mass
     overrides = f"logs.train=[{path}]", "logs.test=[]", choice
     metrics, parameters = identified(tmp_path / "run", "human_squats.yaml", *overrides)
     (message,) = [line for line in capsys.readouterr().err.splitlines() if ConfoundedWarning.__name__ in line]
-    sensors, parameters_named = message.split(" are confounded with ")
+    sensors, parameters_named = message.split(": confounded with ")
     for plate in ("calcn_l", "calcn_r"):
         (own,) = [part for part in sensors.split("; ") if plate in part]
         assert "fz" in own

@@ -81,7 +81,7 @@ def test_a_warning_of_what_cannot_be_told_apart_lists_sensors_and_parameters_by_
     with pytest.warns(ConfoundedWarning) as caught:
         warn_of_confounded([*joints, off], "a.yaml")
     message = str(caught.list[0].message)
-    assert message.startswith("a.yaml: scale of hip0, hip1, hip2, hip3, hip4, hip5 and 2 more; offset of sole fz are")
+    assert message.startswith("a.yaml: scale of hip0, hip1, hip2, hip3, hip4, hip5 and 2 more; offset of sole fz: ")
     assert "confounded with m, Izz of trunk; mcy of thigh; do not trust" in message
 
 

@@ -40,7 +40,7 @@ from torchid.report.tree_figure import tree_figure
 from torchid.sensing import Contact, SensorSet
 from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
 from torchid.sensor_planning.observability import BaseObservability
-from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, assess_set, plan_sensors
+from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, plan_sensors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,11 +136,11 @@ def analyze(config: AnalyzeConfig, source: object = "experiment") -> Analysis:
         if train:
             scene = with_noise(scene, scene.estimate_noise(train))
             request = AnalysisRequest.of(scene)
-        found = tuple(
+        results = tuple(
             _analyze_scenario(request, name, states, train, bars) for name, states in scenarios(scene, train).items()
         )
-        compared = accuracies(scene, _sets_to_compare(request, found, train), train, test, bars) if train else {}
-        analysis = Analysis(scene, found, compared, output)
+        compared = accuracies(scene, _sets_to_compare(request, results, train), train, test, bars) if train else {}
+        analysis = Analysis(scene, results, compared, output)
         bars.add_task("writing", total=None)
         write_analysis(analysis)
     return analysis
@@ -229,16 +229,16 @@ def _assess_proposed(
     problem: PlanningProblem, proposed: SensorSet, planned: SensorSet, of_planned: tuple[BaseObservability, ...]
 ) -> tuple[BaseObservability, ...]:
     """Observability of the base with the proposed set, which may be the planned one."""
-    return of_planned if same_sensors(proposed, planned, problem.contacts) else tuple(assess_set(problem, proposed))
+    return of_planned if same_sensors(proposed, planned, problem.contacts) else tuple(problem.assess(proposed))
 
 
 def _sets_to_compare(
-    request: AnalysisRequest, found: Sequence[ScenarioAnalysis], train: Sequence[Samples]
+    request: AnalysisRequest, results: Sequence[ScenarioAnalysis], train: Sequence[Samples]
 ) -> dict[str, SensorSet]:
     """Sensor sets to compare by accuracy: those with a name, and those planned for contact states of the logs."""
     scene, sets = request.scene, dict(request.compared)
     recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
-    for scenario in found:
+    for scenario in results:
         planned = sensor_set(scene.robot, scene.contacts, scenario.plan.chosen, scene.noise)
         if recorded & set(scenario.states) and not any(
             same_sensors(planned, other, scene.contacts) for other in sets.values()

@@ -15,7 +15,7 @@ from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
-from torchid.commands.training import Training, check_training, descent_settings, training_folder
+from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, warn
 from torchid.estimators import Conditions, Estimate, LeastSquares, violations
@@ -61,7 +61,7 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
     """
     trains = config.estimator.name == "sgd"
     with claim_folder(training_folder(config.output)) if trains else nullcontext():
-        check_training(config, resume, source)
+        require_trainable(config, resume, source)
         check_free(config.output, config.overwrite, RUN, (source, *inputs_of(config)))
         return _identify(config, source, resume)
 
@@ -217,12 +217,12 @@ def _robust(
     if loss is None:
         return fit, None
     bar = bars.add_task("weighing outliers down", total=loss.passes * sum(map(len, train)))
-    found = fit_robustly(train, fitter, loss, first=fit, progress=lambda n: bars.advance(bar, n))
+    robust = fit_robustly(train, fitter, loss, first=fit, progress=lambda n: bars.advance(bar, n))
     bars.update(bar, total=1, completed=1)
-    if not found.summary.converged:
-        settled = f"estimator.robust: not settled after {found.summary.passes} passes; accepted: more passes"
+    if not robust.summary.converged:
+        settled = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"
         warn(f"{experiment.source}: {settled}", NumericalWarning)
-    return found.fit, found.summary
+    return robust.fit, robust.summary
 
 
 def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
@@ -248,9 +248,9 @@ def _contributions(
     """What each log, contact state and sensor adds."""
     leaving_out = bars.add_task("leaving out each in turn", total=None)
     tolerance, names = experiment.config.estimator.rank_tolerance, experiment.robot.dof_names
-    found = contributions(parts, train, builder, problem, names, tolerance, lambda n: bars.advance(leaving_out, n))
+    out = contributions(parts, train, builder, problem, names, tolerance, lambda n: bars.advance(leaving_out, n))
     bars.update(leaving_out, total=1, completed=1)
-    return found
+    return out
 
 
 def _metrics(

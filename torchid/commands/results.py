@@ -150,7 +150,7 @@ def write_run(
             training.copy_curves(folder)
         _write_curves(run, folder, {name: folder / f"{name}.png" for name in figures})
     if training is not None:
-        training.forget()
+        training.remove_checkpoint()
 
 
 def draw_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> Figure:
@@ -160,7 +160,7 @@ def draw_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[C
     """
     measured, predicted = [], []
     for one in compared:
-        (read,) = one.logs([samples])
+        (read,) = one.calibrate([samples])
         part = read[:_PLOTTED_SAMPLES]
         readings, (forces,) = force_series(evaluation.builder, part, one.parameters(evaluation)[None])
         measured.append(readings)
@@ -209,32 +209,33 @@ def metrics_document(run: Identification) -> dict[str, object]:
 
 def _validation_document(run: Identification) -> dict[str, object] | None:
     """Errors on blocks of the training logs of what was fitted without them."""
-    found = run.validation
-    if found is None:
+    validation = run.validation
+    if validation is None:
         return None
-    return {"folds": found.folds, "nominal": found.nominal.as_dict(), "identified": found.identified.as_dict()}
+    nominal, identified = validation.nominal.as_dict(), validation.identified.as_dict()
+    return {"folds": validation.folds, "nominal": nominal, "identified": identified}
 
 
 def _identifiability_document(run: Identification) -> dict[str, object]:
     """What the data determine, and what each log and sensor adds; contact states have a list of their own."""
-    estimate, found = run.estimate, run.contributions
+    estimate, contributions = run.estimate, run.contributions
     return {
         "singular_values": estimate.singular_values.tolist(),
         "condition_number": estimate.condition_number if estimate.rank else None,
         "oversampling": estimate.oversampling,
-        **asdict(found.total),
+        **asdict(contributions.total),
         "verdicts": estimate.verdict_counts(),
-        "logs": [asdict(log) for log in found.logs],
-        "sensors": [asdict(sensor) for sensor in found.sensors],
+        "logs": [asdict(log) for log in contributions.logs],
+        "sensors": [asdict(sensor) for sensor in contributions.sensors],
     }
 
 
-def _bits(found: Contributions) -> dict[str, list[tuple[str, float]]]:
+def _bits(contributions: Contributions) -> dict[str, list[tuple[str, float]]]:
     """Names and bits, by kind."""
     return {
-        "logs": [(Path(log.name).name, log.bits) for log in found.logs],
-        "contact states": [(state.name, state.bits) for state in found.states],
-        "sensors": [(sensor.name, sensor.bits) for sensor in found.sensors],
+        "logs": [(Path(log.name).name, log.bits) for log in contributions.logs],
+        "contact states": [(state.name, state.bits) for state in contributions.states],
+        "sensors": [(sensor.name, sensor.bits) for sensor in contributions.sensors],
     }
 
 
@@ -253,18 +254,18 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
     with RunEvents(folder, robot.body_names, epochs is not None) as events:
         if epochs is None:
             for step, phi in enumerate((robot.nominal.flatten(), estimate.phi)):
-                events.errors(step, {name: pair[step] for name, pair in run.metrics.items()})
-                events.eigenvalues(step, body_eigenvalues(robot, phi))
-            events.solution(estimate, run.samples / run.seconds["compress"])
+                events.write_errors(step, {name: pair[step] for name, pair in run.metrics.items()})
+                events.write_eigenvalues(step, body_eigenvalues(robot, phi))
+            events.write_solution(estimate, run.samples / run.seconds["compress"])
         else:  # what was not worked out by epoch
             for step, which in ((0, 0), (epochs, 1)):
-                events.errors(step, {name: pair[which] for name, pair in run.metrics.items()}, (WHITENED,))
+                events.write_errors(step, {name: pair[which] for name, pair in run.metrics.items()}, (WHITENED,))
         if run.validation is not None:
-            events.errors(0, {"left_out": run.validation.nominal})
-            events.errors(last, {"left_out": run.validation.identified})
-        events.verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
-        events.fit(last, estimate)
-        events.identifiability(
+            events.write_errors(0, {"left_out": run.validation.nominal})
+            events.write_errors(last, {"left_out": run.validation.identified})
+        events.write_verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
+        events.write_fit(last, estimate)
+        events.write_identifiability(
             last, estimate, run.contributions.total, table_text(verdict_counts_table(run.by_state, estimate))
         )
         final = {
@@ -276,7 +277,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
         }
         price = estimate.relative_increase if isinstance(estimate, ConstrainedEstimate) else 0.0
         final |= {"rank": float(estimate.rank)} | ({} if price is None else {"objective_above_least": price})
-        events.close_with(dump_config(config), _hyperparameters(config), final, figures, last)
+        events.write_summary(dump_config(config), _hyperparameters(config), final, figures, last)
 
 
 def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:

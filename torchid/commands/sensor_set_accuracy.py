@@ -67,9 +67,9 @@ class _Reference:
         """For parameters (12 L,)."""
         assembly = self.assembly
         values = {
-            (found.log, extra.label): float(value)
-            for found, own in zip(assembly.eliminations, assembly.extras_at(phi), strict=True)
-            for extra, value in zip(found.extras, own, strict=True)
+            (elimination.log, extra.label): float(value)
+            for elimination, own in zip(assembly.eliminations, assembly.extras_at(phi), strict=True)
+            for extra, value in zip(elimination.extras, own, strict=True)
         }
         robot, loss = self.scene.robot, self.scene.loss
         return Calibration(robot=robot, builder=self.builder, phi=phi, values=values, loss=loss)
@@ -115,11 +115,11 @@ def _accuracy(
     variance = noise**2 * problem.oversampling
     prior_error = scene.config.analysis.prior_error
     directions = error_directions(problem, settings.numeric_ridge, variance, prior_error, settings.rank_tolerance)
-    found = scene.noise.scaled(noise)
+    scaled_noise = scene.noise.scaled(noise)
     bodies = Evaluation(robot, scene.contacts, scene.config.device, ExtraTerms(sign_width=scene.terms.sign_width))
-    expected = expected_errors(bodies.builder, test or train, directions, found)
+    expected = expected_errors(bodies.builder, test or train, directions, scaled_noise)
     calibration = (reference or _Reference(scene, builder, fit.assembly)).calibration(estimate.phi)
     phi = calibration.parameters(evaluation)
-    measured = evaluation.metrics(calibration.logs(test), phi[None])[0] if test else None
+    measured = evaluation.metrics(calibration.calibrate(test), phi[None])[0] if test else None
     possible = measured_components(scene.contacts, sensors)
     return SetAccuracy(int(sensors.torque.sum() + possible.sum()), estimate.rank, expected, measured)

@@ -50,11 +50,11 @@ def simulate(config: SimulationConfig, source: object = "simulation") -> dict[st
         (folder / "logs").mkdir()
         (folder / "exact").mkdir()
         bar = bars.add_task("simulating [s]", total=sum(LEAD_S + motion.duration_s for motion in config.motions))
-        found = _in_processes(config, source, folder, lambda seconds: bars.update(bar, completed=seconds))
+        stabilities = _in_processes(config, source, folder, lambda seconds: bars.update(bar, completed=seconds))
         (folder / "simulation.yaml").write_text(dump(config))
-        write_json(folder / "stability.json", {name: asdict(stability) for name, stability in found.items()})
+        write_json(folder / "stability.json", {name: asdict(stability) for name, stability in stabilities.items()})
         (folder / "nominal.urdf").write_bytes(identified_urdf(robot, nominal_parameters(robot, config.nominal)))
-    return found
+    return stabilities
 
 
 def nominal_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -> Array:

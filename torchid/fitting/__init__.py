@@ -1,1 +1,4 @@
-"""From an experiment's logs to a fit: problem, solution, noise, robust weights, ridge, calibration of new logs."""
+"""From logs to a fit: problem, solution, noise, robust weights, ridge, cross-validation, calibration of new logs.
+
+Only `experiment` and `estimator` know experiment files; the other modules take a robot, a row builder and an estimator.
+"""

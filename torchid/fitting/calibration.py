@@ -47,7 +47,7 @@ class Calibration:
     Readings of other logs of the same robot, as calibrated sensors would have recorded them::
 
         calibration = torchid.calibrations(fit, robot, builder).identified
-        corrected = calibration.logs(new_logs)  # offsets of each log are fitted, scales of all logs are known
+        corrected = calibration.calibrate(new_logs)  # offsets of each log are fitted, scales of all logs are known
 
     Attributes:
         robot: the robot.
@@ -69,7 +69,7 @@ class Calibration:
         """Whether readings have offsets or scales."""
         return any(extra.what in ("offset", "scale") for extra in self.builder.extras)
 
-    def logs(self, logs: Sequence[Samples]) -> list[Samples]:
+    def calibrate(self, logs: Sequence[Samples]) -> list[Samples]:
         """The logs with calibrated readings; extra parameters of a new log are fitted to it first.
 
         Warns:
@@ -154,22 +154,22 @@ def calibrations(
 _NAMED = 6  # sensors or bodies that a warning names
 
 
-def warn_of_confounded(found: Sequence[ExtraEstimate], source: object = "logs") -> None:
+def warn_of_confounded(extras: Sequence[ExtraEstimate], source: object = "logs") -> None:
     """Name sensors whose offset or scale is confounded with other parameters, and these parameters.
 
     Args:
-        found: extra parameters of a fit.
+        extras: extra parameters of a fit.
         source: named in warnings of what all logs have in common.
 
     Warns:
         ConfoundedWarning: one for each log that has some.
     """
-    for log in dict.fromkeys(x.log for x in found):
-        mixed = [x for x in found if x.log == log and not x.separable]
-        if mixed:
-            named = _grouped(x.extra.label for x in mixed)
-            others = _grouped(name for x in mixed for name in x.confounded_with if " of " not in name)
-            message = f"{log or source}: {named} are confounded with {others or 'each other'}; do not trust either"
+    for log in dict.fromkeys(x.log for x in extras):
+        confounded = [x for x in extras if x.log == log and not x.separable]
+        if confounded:
+            named = _grouped(x.extra.label for x in confounded)
+            others = _grouped(name for x in confounded for name in x.confounded_with if " of " not in name)
+            message = f"{log or source}: {named}: confounded with {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
             warn(f"{message}; {advice}", ConfoundedWarning)
 
@@ -199,9 +199,9 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
     estimate = LeastSquares(estimator.ridge, rank_tolerance=estimator.rank_tolerance).solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, fitter.robot.body_names, estimator.rank_tolerance)
     noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
-    found = disagreements(fit.parts, builder, extras, noise)
-    for log in dict.fromkeys(x.log for x in found):
-        own = [x for x in found if x.log == log]
+    contradictions = disagreements(fit.parts, builder, extras, noise)
+    for log in dict.fromkeys(x.log for x in contradictions):
+        own = [x for x in contradictions if x.log == log]
         named = "; ".join(
             f"{x.extra.name} {x.extra.component} reads {x.in_the_air:.4g} {x.extra.unit} in the air, where "
             f"{x.in_contact:.4g} +- {x.standard_error:.2g} fits the rest of the data"

@@ -238,7 +238,7 @@ class Scorer:
                 with warnings.catch_warnings():
                     if number != 1:  # the identified ones say the same
                         warnings.simplefilter("ignore", TorchidWarning)
-                    readings = one.logs(logs)
+                    readings = one.calibrate(logs)
                 measured, error = self.evaluation.force_sums(
                     readings, phi[number : number + 1], progress if number else None
                 )

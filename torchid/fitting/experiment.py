@@ -1,4 +1,4 @@
-"""An experiment file brought to life: robot, contacts, sensors, and what fits its logs; shared by all commands."""
+"""Robot, contacts, sensors and fitter of an experiment file, which all commands share."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from torchid.sensing import (
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Robot and contacts of an experiment file, and what its settings say of them.
+    """Robot and contacts of an experiment file, with its settings.
 
     Attributes:
         config: the settings.
@@ -53,7 +53,7 @@ class Scene:
 
     @property
     def noise(self) -> SensorNoise:
-        """Of the sensors, as stated; a guess where it is not."""
+        """Noise of the sensors, as stated; a guess where it is not."""
         return SensorNoise(**_stated(self.config.sensors.noise))
 
     @property
@@ -65,7 +65,7 @@ class Scene:
 
     @property
     def loss(self) -> RobustLoss | None:
-        """What residuals of a robust fit cost, None for one that is not."""
+        """Loss of a robust fit, None for least squares."""
         robust = self.config.estimator.robust
         return None if robust is None else RobustLoss.named(robust.loss, robust.tuning, robust.passes)
 
@@ -84,15 +84,15 @@ class Scene:
         return with_ft_sensors(sensors, robot, choice.ft_sensors, self.source)
 
     def builder(self, sensors: SensorSet) -> RowBuilder:
-        """Of the rows of some sensors, on the device of the settings."""
+        """Builder of the rows of some sensors, on the device of the settings."""
         return RowBuilder(self.robot, self.contacts, sensors, self.terms).to(self.config.device)
 
     def evaluation(self) -> Evaluation:
-        """Of predicted forces."""
+        """Evaluation of predicted forces, on the device of the settings."""
         return Evaluation(self.robot, self.contacts, self.config.device, self.terms)
 
     def conditions(self) -> Conditions:
-        """On the parameters.
+        """Conditions on the parameters.
 
         Raises:
             InputError: as `conditions_from`.
@@ -111,7 +111,7 @@ class Scene:
         return frozen_parameters(self.robot, self.config.estimator.frozen, self.source, "estimator.frozen")
 
     def fitter(self, builder: RowBuilder, conditions: Conditions) -> LogFitter:
-        """Fits logs as the settings say; with the batch estimator that a descent approaches, instead of that.
+        """Fitter of logs with the estimator of the settings; for a descent, the batch estimator that it approaches.
 
         Raises:
             InputError: a frozen body that the robot does not have, or an estimator that is not installed.
@@ -172,7 +172,7 @@ S = TypeVar("S", bound=Scene)
 
 
 def with_noise(scene: S, summary: NoiseSummary) -> S:
-    """The scene with estimated noise stated in its settings, so that whatever reads them weighs alike."""
+    """The scene with estimated noise stated in its settings, so that every later step uses it."""
     config = scene.config
     keys = {one.group.partition(".")[0] for one in summary.groups}
     estimated = {name: x for name, x in vars(summary.noise).items() if name in keys}

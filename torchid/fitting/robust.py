@@ -23,6 +23,16 @@ from torchid.problem.compression import Part, merge_factors
 TUNING = {"huber": 1.345, "tukey": 4.685}
 """Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
 
+_DECADES, _BINS = (-12.0, 12.0), 4800  # of the histogram that the median of |residual| is read from: 1.2 % a bin
+_LEAST_SLOPE = 0.05  # mean of rho'' below which the loss is flat where the rows are: no standard error
+_NORMAL = 0.6745  # median of |x| of standard normal x
+_CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
+_STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
+_EXACT = 1e-11  # of the predicted rows: less is rounding
+_TINY = float(np.finfo(float).tiny)
+_START = 3  # passes with Huber's loss before Tukey's
+_SAME = 1e-3  # change of the extra parameters of one log
+
 
 @dataclass(frozen=True)
 class RobustLoss:
@@ -165,11 +175,6 @@ def fit_extras_robustly(
     return values
 
 
-_DECADES, _BINS = (-12.0, 12.0), 4800  # of the histogram that the median of |residual| is read from: 1.2 % a bin
-_LEAST_SLOPE = 0.05  # mean of rho'' below which the loss is flat where the rows are: their spread says nothing
-_NORMAL = 0.6745  # median of |x| of standard normal x
-
-
 class Reweighting:
     """One pass over the rows: weighs them by their residuals at earlier parameters, and gathers statistics of these."""
 
@@ -235,14 +240,6 @@ class Reweighting:
             return math.nan
         correction = 1.0 + unknowns / rows * (steep - slope**2) / slope**2
         return float(correction * self.scale * np.sqrt(weight * square * rows / (rows - unknowns)) / slope)
-
-
-_CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
-_STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
-_EXACT = 1e-11  # of the predicted rows: less is rounding
-_TINY = float(np.finfo(float).tiny)
-_START = 3  # passes with Huber's loss before Tukey's
-_SAME = 1e-3  # change of the extra parameters of one log
 
 
 def _loss_of_pass(loss: RobustLoss, done: int) -> RobustLoss:

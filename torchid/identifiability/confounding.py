@@ -76,11 +76,11 @@ def estimate_extras(
         _names(assembly.problem.free, body_names),
     )
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
-    shared = next((found for found in assembly.eliminations if not found.log), None)
+    shared = next((elimination for elimination in assembly.eliminations if not elimination.log), None)
     values = zip(assembly.extras_at(estimate.phi), assembly.extras_at(assembly.problem.nominal), strict=True)
     out = []
-    for found, pair in zip(assembly.eliminations, values, strict=True):
-        out += _estimates(found, pair, noise, covariance, names, shared if found.log else None)
+    for elimination, pair in zip(assembly.eliminations, values, strict=True):
+        out += _estimates(elimination, pair, noise, covariance, names, shared if elimination.log else None)
     return out
 
 
@@ -107,7 +107,7 @@ class Disagreement:
         """How many of them the two are apart."""
         return abs(self.in_the_air - self.in_contact) / self.standard_error
 
-    def is_significant(self, noise: Array) -> bool:
+    def exceeds_noise(self, noise: Array) -> bool:
         """Whether the two contradict each other, beside the noise (6,) of contact sensors [N, N m]."""
         axis = 0 if self.extra.contact is None else self.extra.contact[1]
         apart = abs(self.in_the_air - self.in_contact)
@@ -147,7 +147,7 @@ def disagreements(
                     )
                 )
     sensors = builder.sensors.noise.wrench_std
-    return sorted((x for x in out if x.is_significant(sensors)), key=lambda x: -x.standard_errors)
+    return sorted((x for x in out if x.exceeds_noise(sensors)), key=lambda x: -x.standard_errors)
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ class ParameterCovariance:
 
 
 def _estimates(
-    found: Elimination,
+    elimination: Elimination,
     values: tuple[Array, Array],
     noise: float,
     covariance: ParameterCovariance,
@@ -267,36 +267,43 @@ def _estimates(
 ) -> list[ExtraEstimate]:
     """The extra parameters of one elimination, at identified and nominal parameters; `shared`: those they depend on."""
     P = len(covariance.free)
-    sensitivity, own, hidden = found.inverse @ found.C[:, :P], [found.inverse], [found.unobservable]
+    sensitivity, own, unobservable = (
+        elimination.inverse @ elimination.C[:, :P],
+        [elimination.inverse],
+        [elimination.unobservable],
+    )
     if shared is not None:
-        through = found.inverse @ found.C[:, P:]
+        through = elimination.inverse @ elimination.C[:, P:]
         sensitivity = sensitivity - through @ shared.inverse @ shared.C[:, :P]
         own.append(through @ shared.inverse)
-        hidden.append(through @ shared.unobservable)
+        unobservable.append(through @ shared.unobservable)
     G = covariance.scale_sensitivity(sensitivity)
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
     lost = np.linalg.norm(G @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
     through_parameters = ((G @ covariance.root) ** 2).sum(1)
     variance = sum((x**2).sum(1) for x in own) + through_parameters
-    undetermined = lost | ~found.determined | (np.linalg.norm(np.hstack(hidden), axis=1) > UNOBSERVABLE_SHARE)
+    undetermined = (
+        lost | ~elimination.determined | (np.linalg.norm(np.hstack(unobservable), axis=1) > UNOBSERVABLE_SHARE)
+    )
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
-    for k, extra in enumerate(found.extras):
-        if not np.isfinite(found.std_if_known[k]):
+    for k, extra in enumerate(elimination.extras):
+        if not np.isfinite(elimination.std_if_known[k]):
             continue
-        inflation = float(deviation[k] / found.std_if_known[k])
+        inflation = float(deviation[k] / elimination.std_if_known[k])
         confounded: tuple[str, ...] = ()
         if inflation > INFLATION_LIMIT:
             by_bodies = lost[k] or 2.0 * through_parameters[k] > variance[k]
             confounded = _largest(covariance.variance_shares(G[k], noise), names) if by_bodies else ()
-            others = _largest(np.where(np.arange(len(found.extras)) == k, 0.0, found.unobservable[k]), _labels(found))
+            hidden_others = np.where(np.arange(len(elimination.extras)) == k, 0.0, elimination.unobservable[k])
+            others = _largest(hidden_others, _labels(elimination))
             confounded = (*confounded, *others)
         error = noise * float(deviation[k]) if np.isfinite(deviation[k]) else np.inf
         value, nominal = (float(x[k]) for x in values)
         out.append(
             ExtraEstimate(
                 extra=extra,
-                log=found.log,
+                log=elimination.log,
                 value=value,
                 nominal_value=nominal,
                 standard_error=error,
@@ -307,8 +314,8 @@ def _estimates(
     return out
 
 
-def _labels(found: Elimination) -> list[str]:
-    return [extra.label for extra in found.extras]
+def _labels(elimination: Elimination) -> list[str]:
+    return [extra.label for extra in elimination.extras]
 
 
 def _largest(along: Array, names: Sequence[str]) -> tuple[str, ...]:

@@ -131,11 +131,9 @@ class ScaledParts:
         for i in chosen:
             by_source.setdefault(self.parts[i].source if self.nuisance.of_log else "", []).append(self._factors[i])
         nothing = np.empty((0, self._factors[0].shape[1] - len(self.nuisance.of_log)))
-        found = (
-            eliminate_columns(triangular_factor(np.concatenate(same)), self.nuisance.of_log)
-            for same in by_source.values()
-        )
-        return triangular_factor(np.concatenate([nothing, *found]))
+        logs = (triangular_factor(np.concatenate(same)) for same in by_source.values())
+        of_sources = (eliminate_columns(X, self.nuisance.of_log) for X in logs)
+        return triangular_factor(np.concatenate([nothing, *of_sources]))
 
     @cached_property
     def everything(self) -> Array:
@@ -168,7 +166,16 @@ def leave_one_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float
         rank = _rank(data.singular_values(factor), rank_tolerance)
         rank_lost = _rank(everything, rank_tolerance) - _rank(rest, rank_tolerance)
         samples = sum(data.parts[i].samples for i in chosen)
-        out.append(PartContribution(name, lost.bits, lost.determined, samples, rank, rank_lost))
+        out.append(
+            PartContribution(
+                name=name,
+                bits=lost.bits,
+                determined=lost.determined,
+                samples=samples,
+                rank=rank,
+                rank_lost=rank_lost,
+            )
+        )
     return out
 
 
@@ -217,8 +224,8 @@ def _sensor_information(
         return sensor_information(logs, builder, done=done).map(scaled)
     sources = {samples.source: [other for other in logs if other.source == samples.source] for samples in logs}
     most = max(SAMPLES // len(sources), 1)
-    found = (sensor_information(same, builder, most, done).map(scaled) for same in sources.values())
-    return add_information([information.marginal(nuisance.of_log) for information in found])
+    of_logs = (sensor_information(same, builder, most, done).map(scaled) for same in sources.values())
+    return add_information([information.marginal(nuisance.of_log) for information in of_logs])
 
 
 def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Sequence[str]) -> list[SensorContribution]:
@@ -233,7 +240,7 @@ def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Seq
         for place, H in lost.items():
             gone = everything - _gain(information.total - H)
             out.append(SensorContribution(names[place], gone.bits, gone.determined, kind))
-    return sorted(out, key=lambda found: -found.bits)
+    return sorted(out, key=lambda sensor: -sensor.bits)
 
 
 def _gain(H: Array) -> InformationGain:

@@ -70,8 +70,8 @@ def expected_errors(
             sums.rows.add(_together(errors), weight)
             for inside in null_space_components(builder, samples, state, without_contacts):
                 sums.projected.add(_together(inside).flatten()[:, None], weight)
-    found = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
-    return ExpectedErrors(*({group: finite_or_none(rms[group]) for group in ROW_GROUPS} for rms in found))
+    errors_rms = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
+    return ExpectedErrors(*({group: finite_or_none(rms[group]) for group in ROW_GROUPS} for rms in errors_rms))
 
 
 @one_thread()

@@ -21,6 +21,11 @@ from torchid.rounding import KINEMATIC_TOLERANCE
 DEPENDENT = 1e-9
 """A direction that moves the whitened rows by less than this share of its size does so by rounding."""
 
+SAMPLES = 2000
+"""Number of samples, about, whose rows represent those of all."""
+
+_CHUNK = 256  # samples whose rows are computed together
+
 
 @dataclass(frozen=True)
 class InformationGain:
@@ -43,67 +48,6 @@ class InformationGain:
 
     def __sub__(self, other: InformationGain) -> InformationGain:
         return InformationGain(self.bits - other.bits, self.determined - other.determined)
-
-
-def prior_directions(builder: RowBuilder, prior: Array) -> Array:
-    """N, (columns, M), so that rows X in the builder's columns have the information `N^T X^T X N`.
-
-    `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
-    `prior`, (12 L,), 0 where they are known, and extras with that of their size.
-    """
-    rigid = triangular_factor((builder.columns.parameter_map() * prior).T).T
-    return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
-
-
-def triangular_factor(X: Array) -> Array:
-    """Triangular R, (min(M, N), N), with `R^T R = X^T X`."""
-    return np.asarray(np.linalg.qr(X, mode="r"))
-
-
-def marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
-    """Information about the other columns where some are unknown: the Schur complement, as `elimination.without`.
-
-    Args:
-        H: (N, N), X^T X.
-        unknown: places of M columns.
-        size: (M,), squared norms of these; what is below the share `KINEMATIC_TOLERANCE` of them is rounding.
-    """
-    if not unknown:
-        return H
-    scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
-    crossed = np.delete(H[list(unknown)], unknown, axis=1) * scale[:, None]
-    values, V = np.linalg.eigh(H[np.ix_(unknown, unknown)] * scale * scale[:, None])
-    along = V[:, values > KINEMATIC_TOLERANCE].T @ crossed
-    rest = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
-    return np.asarray(rest - along.T @ (along / values[values > KINEMATIC_TOLERANCE, None]))
-
-
-def rows_information(rows: Tensor, weight: float) -> Tensor:
-    """`weight X^T X`, (c, c), of the rows X of all samples together, (B, r, c)."""
-    X = rows.flatten(0, 1)
-    return weight * (X.T @ X)
-
-
-def reading_directions(ways: Tensor, W: Tensor) -> Tensor:
-    """Rows `ways W`, (B, c, nv), of norm 1, or zero where they are rounding.
-
-    A sensor that enters the generalized force of a sample by `way^T` times its reading contributes what the whitened
-    rows `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
-
-    Args:
-        ways: (B, c, n_rows) or (c, n_rows).
-        W: (B, n_rows, n_rows), from `RowBuilder.rows_by_sample`.
-    """
-    readings = ways @ W
-    size = torch.linalg.vector_norm(readings, dim=-1, keepdim=True)
-    least = KINEMATIC_TOLERANCE * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
-    return torch.where(size > least, readings / size, 0.0)
-
-
-SAMPLES = 2000
-"""Number of samples, about, whose rows represent those of all."""
-
-_CHUNK = 256  # samples whose rows are computed together
 
 
 @dataclass(frozen=True)
@@ -130,22 +74,8 @@ class SensorInformation:
         """Information about the other columns, where some are unknown."""
         size = np.diag(self.total)[list(unknown)]
         total = marginal_information(self.total, unknown, size)
-        found = self.map(lambda H: total - marginal_information(self.total - H, unknown, size))
-        return replace(found, total=total)
-
-
-def add_information(found: Sequence[SensorInformation]) -> SensorInformation:
-    """Of logs together that have no unknown in common but the columns."""
-
-    def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
-        return {place: np.asarray(sum(one[place] for one in matrices)) for place in matrices[0]}
-
-    return SensorInformation(
-        np.asarray(sum(one.total for one in found)),
-        added([one.torques for one in found]),
-        added([one.limbs for one in found]),
-        added([one.wrenches for one in found]),
-    )
+        lost = self.map(lambda H: total - marginal_information(self.total - H, unknown, size))
+        return replace(lost, total=total)
 
 
 @one_thread()
@@ -194,13 +124,82 @@ def sensor_information(
                     total[place] += rows_information(_span(C, W) @ K, weight)
         if done is not None:
             done(len(samples))
-    found = total.cpu().numpy()
+    information = total.cpu().numpy()
     return SensorInformation(
-        found[0],
-        dict(zip(joints, found[1:], strict=False)),
-        dict(zip(limbs, found[1 + len(joints) :], strict=False)),
-        dict(zip(contacts, found[first:], strict=True)),
+        information[0],
+        dict(zip(joints, information[1:], strict=False)),
+        dict(zip(limbs, information[1 + len(joints) :], strict=False)),
+        dict(zip(contacts, information[first:], strict=True)),
     )
+
+
+def add_information(parts: Sequence[SensorInformation]) -> SensorInformation:
+    """Of logs together that have no unknown in common but the columns."""
+
+    def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
+        return {place: np.asarray(sum(one[place] for one in matrices)) for place in matrices[0]}
+
+    return SensorInformation(
+        np.asarray(sum(one.total for one in parts)),
+        added([one.torques for one in parts]),
+        added([one.limbs for one in parts]),
+        added([one.wrenches for one in parts]),
+    )
+
+
+def prior_directions(builder: RowBuilder, prior: Array) -> Array:
+    """N, (columns, M), so that rows X in the builder's columns have the information `N^T X^T X N`.
+
+    `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
+    `prior`, (12 L,), 0 where they are known, and extras with that of their size.
+    """
+    rigid = triangular_factor((builder.columns.parameter_map() * prior).T).T
+    return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
+
+
+def marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
+    """Information about the other columns where some are unknown: the Schur complement, as `elimination.without`.
+
+    Args:
+        H: (N, N), X^T X.
+        unknown: places of M columns.
+        size: (M,), squared norms of these; what is below the share `KINEMATIC_TOLERANCE` of them is rounding.
+    """
+    if not unknown:
+        return H
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
+    crossed = np.delete(H[list(unknown)], unknown, axis=1) * scale[:, None]
+    values, V = np.linalg.eigh(H[np.ix_(unknown, unknown)] * scale * scale[:, None])
+    along = V[:, values > KINEMATIC_TOLERANCE].T @ crossed
+    rest = np.delete(np.delete(H, unknown, axis=0), unknown, axis=1)
+    return np.asarray(rest - along.T @ (along / values[values > KINEMATIC_TOLERANCE, None]))
+
+
+def rows_information(rows: Tensor, weight: float) -> Tensor:
+    """`weight X^T X`, (c, c), of the rows X of all samples together, (B, r, c)."""
+    X = rows.flatten(0, 1)
+    return weight * (X.T @ X)
+
+
+def reading_directions(ways: Tensor, W: Tensor) -> Tensor:
+    """Rows `ways W`, (B, c, nv), of norm 1, or zero where they are rounding.
+
+    A sensor that enters the generalized force of a sample by `way^T` times its reading contributes what the whitened
+    rows `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
+
+    Args:
+        ways: (B, c, n_rows) or (c, n_rows).
+        W: (B, n_rows, n_rows), from `RowBuilder.rows_by_sample`.
+    """
+    readings = ways @ W
+    size = torch.linalg.vector_norm(readings, dim=-1, keepdim=True)
+    least = KINEMATIC_TOLERANCE * torch.linalg.matrix_norm(W)[:, None, None] * ways.norm(dim=-1, keepdim=True)
+    return torch.where(size > least, readings / size, 0.0)
+
+
+def triangular_factor(X: Array) -> Array:
+    """Triangular R, (min(M, N), N), with `R^T R = X^T X`."""
+    return np.asarray(np.linalg.qr(X, mode="r"))
 
 
 def _air_information(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:

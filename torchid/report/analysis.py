@@ -66,26 +66,26 @@ def sensor_plan_document(plan: SensorPlan) -> dict[str, Any]:
     }
 
 
-def observability_document(checks: Sequence[BaseObservability]) -> list[dict[str, Any]]:
+def observability_document(states: Sequence[BaseObservability]) -> list[dict[str, Any]]:
     """Observability of the base, state by state."""
     return [
         {
-            "state": check.name,
-            "random_postures": _values(check.generic),
-            "zero_posture": _values(check.zero),
-            "logs": None if check.recorded is None else _values(check.recorded),
+            "state": state.name,
+            "random_postures": _values(state.generic),
+            "zero_posture": _values(state.zero),
+            "logs": None if state.recorded is None else _values(state.recorded),
             "lost": None
-            if check.lost is None
+            if state.lost is None
             else {
-                "directions": check.lost.directions.T.tolist(),
-                "words": list(check.lost.descriptions),
-                "posture": check.lost.posture.tolist(),
-                "lacking": [{"contacts": list(frames), "sensors": count} for frames, count in check.lost.unmet_groups],
-                "would_help": _names(check.lost.remedies),
+                "directions": state.lost.directions.T.tolist(),
+                "words": list(state.lost.descriptions),
+                "posture": state.lost.posture.tolist(),
+                "lacking": [{"contacts": list(frames), "sensors": count} for frames, count in state.lost.unmet_groups],
+                "would_help": _names(state.lost.remedies),
             },
-            "alike_at_zero_posture": [list(names) for names in check.dependent],
+            "alike_at_zero_posture": [list(names) for names in state.dependent],
         }
-        for check in checks
+        for state in states
     ]
 
 
@@ -157,49 +157,49 @@ def sets_table(parts: Sequence[PartPlan]) -> Table:
     return table
 
 
-def observability_table(title: str, checks: Sequence[BaseObservability]) -> Table:
+def observability_table(title: str, states: Sequence[BaseObservability]) -> Table:
     """rank(S_b V_x) and its smallest singular value over random postures, at position zero and over the logs'."""
     table = _table(f"{title}: rank(S_b V_x), its smallest singular value", "in contact")
     table.columns[0].ratio = 1
     for heading in ("rank", "median", "5 %", "zero\nposture", "logs\nmedian", "logs\nleast"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for check in checks:
-        zero = f"rank {check.zero.rank}" if check.zero.rank < check.generic.rank else f"{check.zero.least:.2g}"
-        logs = ("-", "-") if check.recorded is None else (f"{check.recorded.median:.2g}", f"{check.recorded.least:.2g}")
-        random = (f"{check.generic.rank} of 6", f"{check.generic.median:.2g}", f"{check.generic.low:.2g}")
-        table.add_row(Text(check.name), *random, zero, *logs)
+    for state in states:
+        zero = f"rank {state.zero.rank}" if state.zero.rank < state.generic.rank else f"{state.zero.least:.2g}"
+        logs = ("-", "-") if state.recorded is None else (f"{state.recorded.median:.2g}", f"{state.recorded.least:.2g}")
+        random = (f"{state.generic.rank} of 6", f"{state.generic.median:.2g}", f"{state.generic.low:.2g}")
+        table.add_row(Text(state.name), *random, zero, *logs)
     return table
 
 
-def describe_losses(checks: Sequence[BaseObservability]) -> list[str]:
+def describe_losses(states: Sequence[BaseObservability]) -> list[str]:
     """What of the base is lost and what would bring it back, and where a set is singular."""
     lines = []
     by_loss: dict[tuple[object, ...], list[BaseObservability]] = {}
-    for check in checks:
-        if check.lost is not None:
-            by_loss.setdefault((check.lost.descriptions, check.lost.unmet_groups, check.lost.remedies), []).append(
-                check
+    for state in states:
+        if state.lost is not None:
+            by_loss.setdefault((state.lost.descriptions, state.lost.unmet_groups, state.lost.remedies), []).append(
+                state
             )
     for same in by_loss.values():
-        lost, where = same[0].lost, f"{len(same)} of {len(checks)} contact states"
+        lost, where = same[0].lost, f"{len(same)} of {len(states)} contact states"
         if lost is not None:
             short = " and ".join(f"{' + '.join(frames)} lacks {_count(count)}" for frames, count in lost.unmet_groups)
             lines.append(f"{short} in {where}; lost is the {_words(lost)}")
             remedies = join_names(lost.remedies[:_CURES]) if lost.remedies else "no single candidate"
             lines.append(f"  any of these would help: {remedies}")
-    near = [check for check in checks if check.lost is None and check.recorded and check.recorded.least < _NEARLY]
+    near = [state for state in states if state.lost is None and state.recorded and state.recorded.least < _NEARLY]
     if near:
-        least = min(check.recorded.least for check in near if check.recorded)
+        least = min(state.recorded.least for state in near if state.recorded)
         lines.append(
             f"warning: at some postures of the logs the base is all but lost (smallest singular value {least:.2g})"
         )
-    rare = sum(check.lost is None and check.generic.low < BASE_RANK_TOLERANCE for check in checks)
+    rare = sum(state.lost is None and state.generic.low < BASE_RANK_TOLERANCE for state in states)
     if rare:
-        where = f"{rare} of {len(checks)} contact states"
+        where = f"{rare} of {len(states)} contact states"
         lines.append(f"warning: in {where} the base is nearly lost at one random posture in twenty or more")
-    falling = [check for check in checks if check.lost is None and check.zero.rank < check.generic.rank]
+    falling = [state for state in states if state.lost is None and state.zero.rank < state.generic.rank]
     if falling:
-        alike = dict.fromkeys(names for check in falling for names in check.dependent)
+        alike = dict.fromkeys(names for state in falling for names in state.dependent)
         cause = "; ".join(" = ".join(names) for names in alike)
         lines.append(
             "warning: the base is lost where all joints are at zero, and all but lost near it"

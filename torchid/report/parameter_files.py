@@ -35,13 +35,13 @@ def parameters_document(
         extras: offsets, scales and actuator terms.
     """
     nominal = [{"nominal": _named(phi)} for phi in robot.nominal]
-    found = _bodies(robot, {"identified": estimate.phi} | _judged(estimate))
+    identified = _bodies(robot, {"identified": estimate.phi} | _judged(estimate))
     return {
         "units": dict(zip(PARAMETERS, UNITS, strict=True)),
         "frame": "each body's link frame, inertia about its origin",
         "massless": list(robot.massless),
         "verdicts": estimate.verdict_counts(),
-        "bodies": [{"name": body["name"]} | before | body for body, before in zip(found, nominal, strict=True)],
+        "bodies": [{"name": body["name"]} | before | body for body, before in zip(identified, nominal, strict=True)],
         "extras": [_extra(x) for x in extras],
         "contact_states": [
             {
@@ -72,21 +72,21 @@ def _bodies(robot: Robot, columns: Mapping[str, np.ndarray]) -> list[dict[str, A
     ]
 
 
-def _extra(found: ExtraEstimate) -> dict[str, Any]:
+def _extra(estimate: ExtraEstimate) -> dict[str, Any]:
     """An offset, scale or actuator term; `log` is null for one of all logs."""
-    extra = found.extra
+    extra = estimate.extra
     return {
         "what": extra.what,
         "name": extra.name,
         "component": extra.component or None,
-        "log": found.log or None,
+        "log": estimate.log or None,
         "unit": extra.unit,
-        "value": found.value,
-        "nominal_value": found.nominal_value,
-        "standard_error": _plain(found.standard_error),
-        "inflation": _plain(found.inflation),
-        "told_apart": found.separable,
-        "mixed_with": list(found.confounded_with),
+        "value": estimate.value,
+        "nominal_value": estimate.nominal_value,
+        "standard_error": _plain(estimate.standard_error),
+        "inflation": _plain(estimate.inflation),
+        "told_apart": estimate.separable,
+        "mixed_with": list(estimate.confounded_with),
         "label": extra.label,
     }
 

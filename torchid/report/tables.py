@@ -259,13 +259,13 @@ def extra_table(extras: Sequence[ExtraEstimate]) -> Table:
     return table
 
 
-def _extra_cell(found: ExtraEstimate) -> str:
-    mark = "" if found.separable else " ?"
-    if not math.isfinite(found.standard_error):
-        return f"{found.value:.4g}{mark}"
-    size = float(f"{found.standard_error:.1e}")  # rounded first: 0.0998 is 0.10, with as many decimals
+def _extra_cell(extra: ExtraEstimate) -> str:
+    mark = "" if extra.separable else " ?"
+    if not math.isfinite(extra.standard_error):
+        return f"{extra.value:.4g}{mark}"
+    size = float(f"{extra.standard_error:.1e}")  # rounded first: 0.0998 is 0.10, with as many decimals
     digits = max(0, 1 - math.floor(math.log10(size))) if size > 0.0 else 6
-    return f"{found.value:.{digits}f} ± {size:.{digits}f}{mark}"
+    return f"{extra.value:.{digits}f} ± {size:.{digits}f}{mark}"
 
 
 def progress_bars() -> Progress:

@@ -57,7 +57,7 @@ class RunEvents:
         """Write what is still held in memory."""
         self._writer.flush()
 
-    def errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(ERROR_GROUPS)) -> None:
+    def write_errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(ERROR_GROUPS)) -> None:
         """Errors by group of rows of one parameter vector on sets of logs."""
         for name, metrics in sets.items():
             for group in groups:
@@ -66,16 +66,16 @@ class RunEvents:
                 if metrics.rms.get(group) is not None:
                     self._writer.add_scalar(f"rms_error_{name}/{group}", metrics.rms[group], step)
 
-    def verdict(self, step: int, text: str) -> None:
+    def write_verdict(self, step: int, text: str) -> None:
         """Whether the identified parameters predict held-out blocks and test logs better than the URDF's."""
         self._writer.add_text("verdict", text, step)
 
-    def eigenvalues(self, step: int, least: Mapping[str, float]) -> None:
+    def write_eigenvalues(self, step: int, least: Mapping[str, float]) -> None:
         """Smallest eigenvalue of the scaled pseudo-inertia by body; negative: no such body exists."""
         for body, value in least.items():
             self._writer.add_scalar(f"eigenvalue/{body}", value, step)
 
-    def epoch(self, epoch: Epoch) -> None:
+    def write_epoch(self, epoch: Epoch) -> None:
         """Losses and rates of an epoch of a descent."""
         scalars = {f"loss/{name}": value for name, value in epoch.losses.items()}
         if epoch.held_out is not None:
@@ -89,7 +89,7 @@ class RunEvents:
         for tag, value in scalars.items():
             self._writer.add_scalar(tag, value, epoch.number)
 
-    def solution(self, estimate: Estimate, samples_per_second: float) -> None:
+    def write_solution(self, estimate: Estimate, samples_per_second: float) -> None:
         """Losses of a batch fit, in the charts of a descent.
 
         Args:
@@ -106,7 +106,7 @@ class RunEvents:
             if estimate.relative_increase is not None:
                 self._writer.add_scalar("closed_form/objective_above_least", estimate.relative_increase, 1)
 
-    def fit(self, step: int, estimate: Estimate) -> None:
+    def write_fit(self, step: int, estimate: Estimate) -> None:
         """Statistics of the problem."""
         scalars = {"residual_std": estimate.residual_std, "rank": estimate.rank}
         if estimate.rank:
@@ -114,7 +114,7 @@ class RunEvents:
         for name, value in scalars.items():
             self._writer.add_scalar(f"fit/{name}", value, step)
 
-    def identifiability(self, step: int, estimate: Estimate, gain: InformationGain, table: str) -> None:
+    def write_identifiability(self, step: int, estimate: Estimate, gain: InformationGain, table: str) -> None:
         """What the data determine; in the chart of singular values, steps are their places.
 
         Args:
@@ -131,7 +131,7 @@ class RunEvents:
         for place, value in enumerate(estimate.singular_values):
             self._writer.add_scalar("identifiability/singular_value", value, place)
 
-    def close_with(
+    def write_summary(
         self,
         settings: str,
         hyperparameters: Mapping[str, str | float | bool],

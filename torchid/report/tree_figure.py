@@ -68,13 +68,13 @@ def tree_figure(
 
 def _loaded_welds(robot: Robot, contacts: Sequence[Contact]) -> set[str]:
     """Fixed joints that can carry a sensor, between the base and a contact."""
-    found = set()
+    welds = set()
     for contact in contacts:
         body, _ = robot.link(contact.frame)
         while (joint := robot.bodies[body].joint) is not None:
-            found |= {joint.name} & set(robot.ft_names)
+            welds |= {joint.name} & set(robot.ft_names)
             body = joint.parent
-    return found
+    return welds
 
 
 def _places(robot: Robot, contacts: Sequence[Contact]) -> list[Place]:

@@ -73,44 +73,45 @@ def candidates(
     for name in chosen:
         if name not in robot.joint_names:
             raise UnknownNameError("sensors", "candidates.joint_torques", name, robot.joint_names)
-    found = [
+    offered = [
         Candidate(name, "joint_torque", 1.0, dofs=(j,)) for j, name in enumerate(robot.joint_names) if name in chosen
     ]
     for place, contact in enumerate(contacts):
         if per == "device":
-            found.append(Candidate(contact.frame, "contact", 1.0, contact=place, components=tuple(contact.components)))
+            components = tuple(contact.components)
+            offered.append(Candidate(contact.frame, "contact", 1.0, contact=place, components=components))
         elif per == "axis":
             names = zip(contact.component_names, contact.components, strict=True)
-            found += [
+            offered += [
                 Candidate(f"{contact.frame}.{name}", "contact", 1.0, contact=place, components=(k,))
                 for name, k in names
             ]
-    return _priced([*found, *_in_limbs(robot, ft_sensors, per == "axis")], costs or {})
+    return _priced([*offered, *_in_limbs(robot, ft_sensors, per == "axis")], costs or {})
 
 
 def _in_limbs(robot: Robot, names: Sequence[str], by_axis: bool) -> list[Candidate]:
     """Force/torque sensors at fixed joints, as devices or axis by axis."""
-    found = []
+    offered = []
     for name in names:
         if name not in robot.ft_names:
             raise UnknownNameError("sensors", "candidates.ft_sensors", name, robot.ft_names)
         first = robot.n + 6 * robot.ft_names.index(name)
         if by_axis:
-            found += [Candidate(robot.dof_names[k], "ft_sensor", 1.0, dofs=(k,)) for k in range(first, first + 6)]
+            offered += [Candidate(robot.dof_names[k], "ft_sensor", 1.0, dofs=(k,)) for k in range(first, first + 6)]
         else:
-            found.append(Candidate(name, "ft_sensor", 1.0, dofs=tuple(range(first, first + 6))))
-    return found
+            offered.append(Candidate(name, "ft_sensor", 1.0, dofs=tuple(range(first, first + 6))))
+    return offered
 
 
-def _priced(found: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[Candidate, ...]:
-    known = [*KINDS, *(candidate.name for candidate in found)]
+def _priced(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[Candidate, ...]:
+    known = [*KINDS, *(candidate.name for candidate in offered)]
     for name, cost in costs.items():
         if name not in known:
             raise UnknownNameError("sensors", "costs", name, known)
         if not (math.isfinite(cost) and cost > 0.0):
             raise SensorError("sensors", f"costs.{name}", str(cost), "a positive number")
-    prices = [costs.get(c.name, c.channels * costs.get(c.kind, 1.0)) for c in found]
-    return tuple(replace(c, cost=float(price)) for c, price in zip(found, prices, strict=True))
+    prices = [costs.get(c.name, c.channels * costs.get(c.kind, 1.0)) for c in offered]
+    return tuple(replace(c, cost=float(price)) for c, price in zip(offered, prices, strict=True))
 
 
 def sensor_set(

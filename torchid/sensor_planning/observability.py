@@ -127,12 +127,12 @@ def assess_sensors(
 
 def base_values(builder: RowBuilder, state: ContactState, postures: Array) -> torch.Tensor:
     """Singular values of S_b V_x, (N, 6), at joint positions (N, n) in a contact state."""
-    found = torch.zeros(len(postures), 6, dtype=torch.float64)
+    values = torch.zeros(len(postures), 6, dtype=torch.float64)
     for start in range(0, len(postures), _CHUNK):
         samples = resting_samples(postures[start : start + _CHUNK], state)
         for index, V in builder.null_space_bases(samples, state):
-            found[start : start + _CHUNK][index] = base_singular_values(V)
-    return found
+            values[start : start + _CHUNK][index] = base_singular_values(V)
+    return values
 
 
 def dependent_sensors(generic: Demand, singular: Demand, chosen: Iterable[Candidate]) -> tuple[str, ...]:
@@ -211,7 +211,7 @@ class _Cause:
     def dependent(self) -> tuple[tuple[str, ...], ...]:
         """Sensors that are dependent at position zero only."""
         pairs = zip(self.generic, self.straight, strict=True)
-        return tuple(found for pair in pairs if (found := dependent_sensors(*pair, self.mounted)))
+        return tuple(sensors for pair in pairs if (sensors := dependent_sensors(*pair, self.mounted)))
 
 
 def _assess_state(

@@ -72,6 +72,21 @@ class PlanningProblem:
         """Random motion in the scenario's states, drawn once."""
         return MotionStack(self.robot, self.contacts, self.states, self.candidates, self.seed)
 
+    def assess(self, sensors: SensorSet) -> list[BaseObservability]:
+        """Observability of the base with a sensor set, by contact state, over the postures of the logs as well."""
+        pieces: dict[ContactState, list[Array]] = {}
+        for samples, state, _ in subsample_states(self.logs, _POSTURES):
+            pieces.setdefault(state, []).append(samples.joint_position.numpy())
+        return assess_sensors(
+            robot=self.robot,
+            contacts=self.contacts,
+            states=self.states,
+            sensors=sensors,
+            choice=self.candidates,
+            seed=self.seed,
+            postures={state: np.concatenate(positions) for state, positions in pieces.items()},
+        )
+
 
 @dataclass(frozen=True)
 class PartPlan:
@@ -194,27 +209,10 @@ def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None)
         parts=parts,
         branches=branches(problem.robot, problem.contacts, problem.states),
         requirements=contact_requirements(problem.robot, problem.contacts, problem.states, problem.seed),
-        observability=tuple(assess_set(problem, sensors)),
+        observability=tuple(problem.assess(sensors)),
         stack_rank=stack.rank(chosen),
         stack_full=stack.full,
         removals=tuple(_removals(problem, chosen, tell)),
-    )
-
-
-def assess_set(problem: PlanningProblem, sensors: SensorSet) -> list[BaseObservability]:
-    """Observability of the base with a sensor set, by contact state, over the postures of the logs as well."""
-    pieces: dict[ContactState, list[Array]] = {}
-    for samples, state, _ in subsample_states(problem.logs, _POSTURES):
-        pieces.setdefault(state, []).append(samples.joint_position.numpy())
-    postures = {state: np.concatenate(found) for state, found in pieces.items()}
-    return assess_sensors(
-        problem.robot,
-        problem.contacts,
-        problem.states,
-        sensors,
-        problem.candidates,
-        seed=problem.seed,
-        postures=postures,
     )
 
 
@@ -223,7 +221,7 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[Contact
     used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
     tree = KinematicTree(robot)
     above = {frame: {tree.body_of[node] for node in tree.path(tree.frame(robot, frame)[0])} for frame in used}
-    children, found = robot.children, []
+    children, out = robot.children, []
     for first, body in enumerate(robot.bodies[1:], start=1):
         if body.parent > 0 and len(children[body.parent]) == 1:
             continue
@@ -233,8 +231,8 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[Contact
         names = [joint.name for k in chain if (joint := robot.bodies[k].joint) is not None]
         joints = tuple(name for name in names if name in robot.joint_names)
         if joints:
-            found.append(Branch(joints, tuple(frame for frame in used if first in above[frame])))
-    return tuple(found)
+            out.append(Branch(joints, tuple(frame for frame in used if first in above[frame])))
+    return tuple(out)
 
 
 def contact_requirements(
@@ -244,13 +242,21 @@ def contact_requirements(
     states = tuple(states)
     limbs = branches(robot, contacts, states)
     channels = candidates(robot, contacts, per="axis")
-    found = []
+    out = []
     for demand in demands(robot, contacts, states, channels, seed):
         least = cheapest_set([demand], channels)
         joints = tuple(robot.joint_names[j] for j in demand.joints)
         through = tuple(limb.name for limb in limbs if not set(limb.joints).isdisjoint(joints))
-        found.append(ContactRequirement(demand.frames, joints, through, round(least.lower_bound), least.proven))
-    return tuple(found)
+        out.append(
+            ContactRequirement(
+                contacts=demand.frames,
+                joints=joints,
+                branches=through,
+                fewest_readings=round(least.lower_bound),
+                proven=least.proven,
+            )
+        )
+    return tuple(out)
 
 
 def _best_parts(

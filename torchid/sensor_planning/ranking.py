@@ -189,16 +189,16 @@ def rank_sets(
     """Sets with their bits, most informative first; `done` is called after each, from several threads."""
 
     def run(places: Iterator[int]) -> list[tuple[float, int]]:
-        found = []
+        ranked = []
         for place in places:
-            found.append((-ranking.bits(sets[place]), place))
+            ranked.append((-ranking.bits(sets[place]), place))
             if done is not None:
                 done()
-        return found
+        return ranked
 
     workers = min(worker_count(torch.device("cpu")), max(len(sets), 1))
-    found = sorted(chain.from_iterable(run_in_workers(range(len(sets)), run, workers)))
-    return [RankedSet(-bits, sets[place]) for bits, place in found]
+    ranked = sorted(chain.from_iterable(run_in_workers(range(len(sets)), run, workers)))
+    return [RankedSet(-bits, sets[place]) for bits, place in ranked]
 
 
 def improve_by_exchange(
@@ -220,7 +220,8 @@ def improve_by_exchange(
     best = RankedSet(ranking.bits(first), tuple(first))
     climbed = [best]
     for _ in range(_ROUNDS):
-        neighbours = [RankedSet(ranking.bits(found), found) for found in _neighbours(part, best.sensors, keep, exclude)]
+        others = _neighbours(part, best.sensors, keep, exclude)
+        neighbours = [RankedSet(ranking.bits(chosen), chosen) for chosen in others]
         higher = max(neighbours, key=lambda ranked: ranked.bits, default=best)
         if higher.bits <= best.bits:
             break
@@ -237,9 +238,9 @@ def _neighbours(
         for new in part.candidates:
             same_cost = abs(new.cost - gone.cost) <= _SAME_COST * gone.cost
             if gone not in keep and new not in exclude and new not in chosen and same_cost:
-                found = tuple(c for c in part.candidates if (c in chosen and c is not gone) or c is new)
-                if not any(demand.missing(found) for demand in part.demands):
-                    yield found
+                exchanged = tuple(c for c in part.candidates if (c in chosen and c is not gone) or c is new)
+                if not any(demand.missing(exchanged) for demand in part.demands):
+                    yield exchanged
 
 
 @dataclass(frozen=True)
@@ -254,7 +255,7 @@ class _StateRows:
 
 def _splits(robot: Robot) -> Array:
     """Changes of all parameters, (12 L, M), that take inertia from the body before a weld and add it to that beyond."""
-    found = [np.zeros((robot.nominal.size, 0))]
+    splits = [np.zeros((robot.nominal.size, 0))]
     for index, body in enumerate(robot.bodies):
         joint = body.joint
         if joint is None or joint.kind != "fixed" or body.massless or robot.bodies[joint.parent].massless:
@@ -263,8 +264,8 @@ def _splits(robot: Robot) -> Array:
         changes[index, parameters.INERTIAL] = np.eye(parameters.INERTIAL.stop)
         X = parameters.change_of_frame(joint.T_parent_joint @ joint.T_joint_link)
         changes[joint.parent, parameters.INERTIAL] = -X
-        found.append(changes.reshape(robot.nominal.size, -1))
-    return np.hstack(found)
+        splits.append(changes.reshape(robot.nominal.size, -1))
+    return np.hstack(splits)
 
 
 def _rank_of(changes: Array, problem: LinearProblem) -> int:

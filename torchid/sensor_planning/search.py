@@ -105,15 +105,15 @@ def all_minimal_sets(
     numbers = np.arange(2 ** len(free))
     member = (numbers[:, None] >> np.arange(len(free))) & 1 == 1  # (sets, candidates)
     size = member.sum(1)
-    sufficient, found = np.zeros(len(numbers), dtype=bool), []
+    sufficient, minimal = np.zeros(len(numbers), dtype=bool), []
     for count in range(len(free) + 1):
         same = numbers[size == count]
         for bit in range(len(free)):  # a sufficient set with one more candidate is sufficient, and not minimal
             sufficient[same] |= sufficient[same & ~(1 << bit)]
         same = same[~sufficient[same]]
         sufficient[same] = _sufficient(demands, free, kept, member[same])
-        found += [frozenset(free[k] for k in np.flatnonzero(member[s])) | kept for s in same[sufficient[same]]]
-    return [tuple(c for c in candidates if c in chosen) for chosen in found]
+        minimal += [frozenset(free[k] for k in np.flatnonzero(member[s])) | kept for s in same[sufficient[same]]]
+    return [tuple(c for c in candidates if c in chosen) for chosen in minimal]
 
 
 def usable_candidates(

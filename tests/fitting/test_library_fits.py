@@ -33,7 +33,7 @@ def test_noise_ridge_outliers_and_cross_validation_are_those_of_the_command(tmp_
 
     robot = torchid.load_robot(folder / "quadruped.urdf")
     contacts = [torchid.Contact(foot, "point") for foot in FEET]
-    logs = [torchid.bind(torchid.preprocess(torchid.read_log(folder / "sway_train.npz"), 8.0), robot, contacts)]
+    logs = [torchid.bind_log(torchid.preprocess(torchid.read_log(folder / "sway_train.npz"), 8.0), robot, contacts)]
     stated = torchid.SensorNoise(joint_torque=0.1, contact_force=0.5, contact_moment=0.05)
 
     def fitter(noise: torchid.SensorNoise, ridge: float) -> torchid.LogFitter:
@@ -46,7 +46,7 @@ def test_noise_ridge_outliers_and_cross_validation_are_those_of_the_command(tmp_
         (one["group"], one["used"]) for one in written["noise"]["groups"]
     ]
     loss, unregularized = torchid.RobustLoss.named("huber"), fitter(found.noise, 0.0)
-    blocks = torchid.in_folds(logs, unregularized.builder)
+    blocks = torchid.split_into_folds(logs, unregularized.builder)
     parts = torchid.compress_parts(blocks, unregularized.builder)
     estimators = [torchid.LeastSquares(ridge) for ridge in torchid.RIDGES]
     choice = torchid.choose_ridge(parts, blocks, unregularized, estimators, loss)
@@ -67,7 +67,7 @@ def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path
 
     robot = torchid.load_robot(folder / "quadruped.urdf")
     contacts = [torchid.Contact(foot, "point") for foot in FEET]
-    logs = [torchid.bind(torchid.preprocess(torchid.read_log(folder / "sway_train.npz"), 8.0), robot, contacts)]
+    logs = [torchid.bind_log(torchid.preprocess(torchid.read_log(folder / "sway_train.npz"), 8.0), robot, contacts)]
 
     def fitter_with(noise: torchid.SensorNoise) -> torchid.LogFitter:
         sensors = torchid.named_sensors("joints", robot.n, len(contacts), noise)
@@ -83,7 +83,7 @@ def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path
 
     fit = fitter.fit(torchid.compress_parts(logs, fitter.builder))
     compared = torchid.calibrations(fit, robot, fitter.builder)
-    assert compared.identified.logs(logs) == logs, "without offsets, readings are what they are"
+    assert compared.identified.calibrate(logs) == logs, "without offsets, readings are what they are"
     np.testing.assert_array_equal(compared.nominal.phi, robot.nominal.ravel())
     with pytest.raises(LogError, match="too few to leave blocks"):
         torchid.cross_validate([logs[0][:30]], fitter)
@@ -93,7 +93,7 @@ def test_a_frozen_body_keeps_its_parameters_and_must_exist(tmp_path: Path) -> No
     folder = shortened_demo(tmp_path / "demo", 300)
     robot = torchid.load_robot(folder / "quadruped.urdf")
     contacts = [torchid.Contact(foot, "point") for foot in FEET]
-    logs = [torchid.bind(torchid.preprocess(torchid.read_log(folder / "sway_train.npz"), 8.0), robot, contacts)]
+    logs = [torchid.bind_log(torchid.preprocess(torchid.read_log(folder / "sway_train.npz"), 8.0), robot, contacts)]
     builder = torchid.RowBuilder(robot, contacts, torchid.named_sensors("full", robot.n, len(contacts)))
     name = robot.body_names[1]
     fitter = torchid.LogFitter(
