@@ -11,9 +11,8 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from torchid.errors import BaseLostError, InputError, TorchidWarning, activity_of
+from torchid.errors import BaseLostError, EscapedStream, InputError, TorchidWarning, activity_of, one_line
 from torchid.staging import list_written, reset_written, termination_as_interrupt
-from torchid.text import EscapedStream, one_line
 
 #: What the machine refuses, and not the user's files nor the program: no room, no memory, no permission.
 _MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE)

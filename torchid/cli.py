@@ -294,7 +294,7 @@ def _check(options: argparse.Namespace) -> int:
 
 def _convert(options: argparse.Namespace) -> None:
     with _interrupt_held_back():
-        from torchid.commands.convert import convert
+        from torchid.commands.check import convert
 
     log = convert(options.source, options.target, options.topics, options.overwrite)
     print(f"written to    {options.target}: {len(log)} samples, {', '.join(log.arrays())}")

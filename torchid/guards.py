@@ -13,8 +13,7 @@ import stat
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from torchid.errors import LogError
-from torchid.text import excerpt, is_plain
+from torchid.errors import LogError, excerpt, is_plain
 
 MEBIBYTE = 2**20
 

@@ -20,10 +20,10 @@ from torchid.commands.analyze import analyze
 from torchid.commands.reading import LogReader
 from torchid.config import load_analysis
 from torchid.errors import TorchidWarning
-from torchid.identifiability.expected_error import ExpectedErrors
+from torchid.identifiability.information import ExpectedErrors
 from torchid.problem.metrics import ROW_GROUPS
 from torchid.report.analysis import SetAccuracy, accuracy_figure, describe_losses
-from torchid.report.tree_figure import tree_figure
+from torchid.report.figures import tree_figure
 from torchid.sensor_planning.observability import BaseObservability, PostureSummary
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")

@@ -20,10 +20,9 @@ from rich.text import Text
 from torchid.boundary import run_guarded
 from torchid.cli import main
 from torchid.config.reading import check_yaml
-from torchid.errors import ConfigError, TorchidWarning, during
+from torchid.errors import ConfigError, TorchidWarning, during, is_plain
 from torchid.guards import read_bytes
 from torchid.report.tables import print_tables, table_text, terminal_console
-from torchid.text import is_plain
 
 EVIL = "a\x1b[31m\u202eb\nc\r\x07\u200b$x_{$"
 

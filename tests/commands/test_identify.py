@@ -22,7 +22,7 @@ from torchid.cli import main
 from torchid.config import load_config
 from torchid.errors import TorchidWarning
 from torchid.estimators.least_squares import VERDICTS
-from torchid.identifiability.base_rank import StateReport
+from torchid.identifiability.base_parameters import StateReport
 from torchid.parameters import PARAMETERS
 from torchid.report import identified_urdf
 from torchid.report.tables import print_tables, state_table

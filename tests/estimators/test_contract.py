@@ -12,8 +12,17 @@ import torch
 from physical import active_case, data, nothing_seen, random_bodies
 from synthetic import Array
 
-from torchid.estimators import Consistent, ConstrainedEstimate, Estimate, LeastSquares, Sgd, SgdEstimate, Trainer
-from torchid.estimators.consistent import ConsistentEstimate, Method, Prior
+from torchid.estimators import (
+    Consistent,
+    ConsistentEstimate,
+    ConstrainedEstimate,
+    Estimate,
+    LeastSquares,
+    Sgd,
+    SgdEstimate,
+    Trainer,
+)
+from torchid.estimators.consistent import Method, Prior
 from torchid.estimators.least_squares import FIXED, VERDICTS
 from torchid.problem import Batch, LinearProblem
 from torchid.problem.linear import parameter_scale

@@ -24,7 +24,7 @@ from torchid.errors import BaseLostError
 from torchid.estimators import LeastSquares
 from torchid.fitting.cross_validation import with_all_readings
 from torchid.fitting.experiment import set_up
-from torchid.identifiability.base_rank import StateReport, _of_base, require_base
+from torchid.identifiability.base_parameters import StateReport, _of_base, require_base
 from torchid.identifiability.confounding import TotalMass
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess

@@ -17,7 +17,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values, null_space
-from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
+from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
 
 RANDOM = "random"  # an axis
 

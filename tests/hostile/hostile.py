@@ -18,8 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchid.errors import BaseLostError, InputError, TorchidWarning
-from torchid.text import is_plain
+from torchid.errors import BaseLostError, InputError, TorchidWarning, is_plain
 
 SECONDS, WAITING = 5.0, 30.0  # of work, which other processes do not prolong; and until a case that waits is given up
 BYTES = 2**30

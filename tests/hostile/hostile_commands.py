@@ -15,7 +15,7 @@ from typing import Any
 
 _SERVER = """
 import json, os, resource, signal, sys
-import torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.analyze, torchid.commands.convert
+import torchid.commands.results, torchid.commands.evaluate, torchid.commands.analyze, torchid.commands.analyze, torchid.commands.check
 from matplotlib.figure import Figure
 from torchid.cli import main
 names = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure", "tree_figure",

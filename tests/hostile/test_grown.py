@@ -18,12 +18,11 @@ from torchid.cli import main
 from torchid.commands.training import load_checkpoint
 from torchid.config import load_analysis, load_config, load_simulation
 from torchid.config.experiment import load_topics
-from torchid.errors import InputError
+from torchid.errors import InputError, is_plain
 from torchid.logs import Topics, read_log
 from torchid.parameters import PARAMETERS
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.robot import body_extents, load_robot
-from torchid.text import is_plain
 
 TOPICS = Topics(joint_states="/joint_states")
 COUNTS = [12, pytest.param(220, marks=pytest.mark.slow)]

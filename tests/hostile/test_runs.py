@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from torchid.cli import main
 from torchid.commands.training import CHECKPOINT, load_checkpoint
-from torchid.estimators.training_state import require_same_structure
+from torchid.estimators.sgd import require_same_structure
 from torchid.report.parameter_files import read_parameters
 from torchid.robot import load_robot
 

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 
 from torchid.config import load_analysis, load_config
 from torchid.config.reading import check_yaml
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_NODES
-from torchid.text import excerpt, is_plain
 
 COUNTS = [30, pytest.param(1000, marks=pytest.mark.slow)]
 

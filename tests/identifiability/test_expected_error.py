@@ -10,7 +10,7 @@ import torch
 from synthetic import SOLO12, load
 
 from torchid.estimators import LeastSquares
-from torchid.identifiability.expected_error import error_directions, expected_errors
+from torchid.identifiability.information import error_directions, expected_errors
 from torchid.identifiability.structure import structural_samples
 from torchid.problem import Evaluation, LinearProblem, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.metrics import ROW_GROUPS

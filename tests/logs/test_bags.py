@@ -124,7 +124,7 @@ def test_without_rosbags_the_message_says_what_to_install(tmp_path: Path, monkey
         return load(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", absent)
-    monkeypatch.delitem(sys.modules, "torchid.logs.ros.files", raising=False)
+    monkeypatch.delitem(sys.modules, "torchid.logs.ros_files", raising=False)
     with pytest.raises(LogError, match=r"rosbags is not installed; accepted: pip install '.\[ros\]'"):
         read_log(path, parsed({"joint_states": "/joint_states"}))
 
@@ -145,7 +145,7 @@ def test_every_package_that_is_missing_is_named(
     for name in [*sys.modules, *absent]:
         if name.partition(".")[0] in absent:
             monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, "torchid.logs.ros.files", raising=False)
+    monkeypatch.delitem(sys.modules, "torchid.logs.ros_files", raising=False)
     with pytest.raises(LogError, match=f"a bag, but {found}; accepted: "):
         read_log(path, parsed({"joint_states": "/joint_states"}))
 

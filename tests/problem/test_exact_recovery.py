@@ -26,7 +26,7 @@ from true_robots import (
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
-from torchid.identifiability.base_rank import require_base, state_reports
+from torchid.identifiability.base_parameters import require_base, state_reports
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.linear import parameter_scale
 from torchid.problem.predict import force_series

@@ -9,7 +9,7 @@ import pytest
 from synthetic import ANYMAL, Oracle, load, make_log
 
 from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError
-from torchid.identifiability.base_rank import StateReport, require_base, state_reports
+from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.problem import RowBuilder, bind_log
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, validate_contacts
 

@@ -18,7 +18,7 @@ from welded import REAL, SENSORS, machine
 from torchid import parameters
 from torchid.errors import LogError, UnknownNameError
 from torchid.estimators import LeastSquares
-from torchid.identifiability.base_rank import state_reports
+from torchid.identifiability.base_parameters import state_reports
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
 from torchid.problem.chunks import chunks_by_state

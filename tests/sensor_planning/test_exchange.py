@@ -9,8 +9,7 @@ from synthetic import SOLO12, load
 
 from torchid.identifiability.structure import structural_problem, structural_samples
 from torchid.sensing import Contact, SensorNoise
-from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
-from torchid.sensor_planning.demands import demands
+from torchid.sensor_planning.demands import Candidate, candidates, demands, sensor_set
 from torchid.sensor_planning.ranking import SetRanking, improve_by_exchange, rank_sets
 from torchid.sensor_planning.search import DemandGroup, all_minimal_sets, demand_groups
 

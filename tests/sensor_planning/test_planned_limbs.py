@@ -14,8 +14,7 @@ from torchid import parameters
 from torchid.errors import UnknownNameError
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors, with_ft_sensors
-from torchid.sensor_planning.candidates import candidates, contained_candidates, sensor_set
-from torchid.sensor_planning.demands import demands
+from torchid.sensor_planning.demands import candidates, contained_candidates, demands, sensor_set
 from torchid.sensor_planning.observability import assess_sensors
 from torchid.sensor_planning.planner import PlanningProblem, plan_sensors
 from torchid.sensor_planning.ranking import MotionStack, irredundant_set

@@ -15,7 +15,7 @@ from torchid import parameters
 from torchid.identifiability.structure import standing_samples, standing_states, structural_problem
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.regressor import FrameJacobian
-from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
+from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
 from torchid.sensor_planning.observability import assess_sensors
 from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, plan_sensors
 from torchid.sensor_planning.ranking import MotionStack, irredundant_set

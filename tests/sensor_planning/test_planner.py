@@ -20,8 +20,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, named_sensors
 from torchid.sensing.projection import null_space
-from torchid.sensor_planning.candidates import Candidate, candidates, contained_candidates, sensor_set
-from torchid.sensor_planning.demands import demands
+from torchid.sensor_planning.demands import Candidate, candidates, contained_candidates, demands, sensor_set
 from torchid.sensor_planning.observability import (
     LostBase,
     assess_sensors,

@@ -12,7 +12,7 @@ from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.chunks import one_thread
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise
-from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
+from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
 from torchid.sensor_planning.ranking import SetRanking, rank_sets
 
 NOISE = SensorNoise(joint_torque=0.7, contact_force=3.0, contact_moment=0.4, base_force=5.0, base_moment=1.0)

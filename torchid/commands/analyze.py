@@ -34,11 +34,10 @@ from torchid.report.analysis import (
     observability_document,
     sensor_plan_document,
 )
-from torchid.report.figures import save_figure
+from torchid.report.figures import save_figure, tree_figure
 from torchid.report.tables import progress_bars
-from torchid.report.tree_figure import tree_figure
 from torchid.sensing import Contact, SensorSet
-from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set
+from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
 from torchid.sensor_planning.observability import BaseObservability
 from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, plan_sensors
 

@@ -1,4 +1,4 @@
-"""`torchid check`: checks of logs before they are fitted."""
+"""`torchid check` and `torchid convert`, the commands that need logs alone."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from torchid.errors import ConfigError, LogError
 from torchid.fitting.experiment import set_up_scene
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
-from torchid.logs import Log, Topics, read_log
-from torchid.logs.containers import atomic_output
+from torchid.logs import Log, Topics, read_log, write_log
+from torchid.logs.containers import atomic_output, new_log_kind
 from torchid.report.figures import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
@@ -154,3 +154,31 @@ def write_check_outputs(checked: Sequence[Checked], document: str | None, figure
     if figure is not None:
         with atomic_output(Path(figure)) as new:
             save_figure(log_check_figure(checked), new, Path(figure).suffix[1:].lower())
+
+
+def convert(source: str | Path, target: str | Path, topics: str | Path | None = None, overwrite: bool = False) -> Log:
+    """Read a log and write it as a file of another type, which appears complete or not at all.
+
+    Args:
+        source: any log that can be read.
+        target: .npz, .h5, .hdf5, .csv or .parquet.
+        topics: experiment file whose `logs.topics` says what the topics of a bag hold.
+        overwrite: whether `target` may be replaced; what is read never is, as a log may hold more than is written.
+
+    Returns:
+        The log, in canonical frames and orders: another quaternion order or frame of the source is not kept.
+
+    Raises:
+        InputError: whatever does not fit; nothing has been written then.
+    """
+    path = Path(target)
+    new_log_kind(path)
+    check_free_file(path, "OUT", overwrite, (source, *([] if topics is None else [topics])))
+    mapped = None if topics is None else load_topics(topics)
+    with progress_bars() as bars:
+        reading = bars.add_task("reading", total=None)
+        log = read_log(source, mapped, lambda share: bars.update(reading, completed=round(100 * share), total=100))
+        bars.update(reading, completed=100, total=100)
+        bars.add_task("writing", total=None)
+        write_log(log, path)
+    return log

@@ -10,9 +10,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from torchid.commands.manifest import MANIFEST, FolderContents, FolderKind, inspect_folder, make_manifest, read_manifest
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, excerpt, join_names
 from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, note_written, staging_folder, try_lock
-from torchid.text import excerpt, join_names
 
 EVENTS = "events.out.tfevents*"
 EVALUATION = FolderKind("an evaluation")

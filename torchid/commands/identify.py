@@ -25,7 +25,7 @@ from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
-from torchid.identifiability.base_rank import StateReport, require_base, state_reports
+from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts

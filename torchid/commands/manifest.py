@@ -14,8 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from torchid.errors import excerpt
 from torchid.staging import atomic_file, is_leftover, remove_leftover
-from torchid.text import excerpt
 
 MANIFEST = "manifest.json"
 

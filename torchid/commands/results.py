@@ -20,7 +20,7 @@ from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary
-from torchid.identifiability.base_rank import StateReport
+from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
 from torchid.parameters import PER_BODY, Array
@@ -39,10 +39,10 @@ from torchid.report.figures import (
     save_figure,
 )
 from torchid.report.tables import table_text, verdict_counts_table
+from torchid.report.tensorboard import RunEvents
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-from torchid.report.tensorboard import RunEvents
 
 _PLOTTED_SAMPLES = 3000
 HELD_OUT = "blocks left out of the fit"

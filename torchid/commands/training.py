@@ -35,7 +35,7 @@ from torchid.commands.folder import (
 from torchid.commands.manifest import Manifest, inspect_folder, read_manifest
 from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
-from torchid.errors import ConfigError, InputError, SensorError, warn
+from torchid.errors import ConfigError, InputError, SensorError, excerpt, warn
 from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
 from torchid.fitting.experiment import Experiment
 from torchid.guards import MAX_STATE, check_regular
@@ -44,7 +44,6 @@ from torchid.problem import LinearProblem, Metrics, MiniBatches, RowBuilder, Sam
 from torchid.problem.linear import parameter_scale
 from torchid.report.tensorboard import RunEvents
 from torchid.robot import Robot
-from torchid.text import excerpt
 
 CHECKPOINT = "checkpoint.pt"
 

@@ -27,7 +27,7 @@ from torchid.config.sensors import (
 from torchid.errors import ConfigError, warn
 from torchid.logs import Topics
 from torchid.logs.containers import list_bag_files
-from torchid.logs.ros.topics import check_topics
+from torchid.logs.ros_topics import check_topics
 from torchid.settings import NotNegative, Positive, Seed
 
 JOINTS_ACCEPTED = "the name of a topic, or a mapping with topic and joints"

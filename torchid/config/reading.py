@@ -17,11 +17,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
-from torchid.errors import ConfigError, UnknownNameError, during
+from torchid.errors import ConfigError, UnknownNameError, during, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML, read_bytes
 from torchid.logs.containers import READABLE
 from torchid.settings import accepted_values
-from torchid.text import excerpt, is_plain
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TAG = "tag:yaml.org,2002:"

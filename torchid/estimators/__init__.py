@@ -9,10 +9,10 @@ from torchid.estimators.sgd import PenaltyWeights, Sgd, TrainingSettings
 from torchid.estimators.training import Epoch, SgdEstimate, Trainer
 
 __all__ = [
-    "ConstrainedEstimate",
     "Conditions",
     "Consistent",
     "ConsistentEstimate",
+    "ConstrainedEstimate",
     "Enclosure",
     "Epoch",
     "Estimate",

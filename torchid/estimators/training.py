@@ -19,8 +19,7 @@ from torchid.estimators.learnable import FreeParameters, LearnableParameters, Lo
 from torchid.estimators.least_squares import ConstrainedEstimate, report_rounding
 from torchid.estimators.optimizers import OPTIMIZERS, make_optimizer, make_schedule, step_schedule
 from torchid.estimators.residual import CANDIDATE_WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
-from torchid.estimators.sgd import Loss, LossTerms, Sgd
-from torchid.estimators.training_state import validate_state
+from torchid.estimators.sgd import Loss, LossTerms, Sgd, validate_state
 from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
 from torchid.problem.chunks import one_thread

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import ConfoundedWarning, LogError, warn
+from torchid.errors import ConfoundedWarning, LogError, join_names, warn
 from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import RobustLoss, fit_extras_robustly
@@ -24,7 +24,6 @@ from torchid.problem.extras import Extra
 from torchid.problem.predict import calibrate_readings
 from torchid.problem.samples import require_forces
 from torchid.robot import Robot
-from torchid.text import join_names
 
 T = TypeVar("T")
 

@@ -15,8 +15,7 @@ from torchid.errors import ConfigError, LogError, UnknownNameError
 from torchid.estimators import Conditions
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
-from torchid.fitting.estimator import batch_estimator, conditions_from
-from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
+from torchid.fitting.fit import Fit, LogFitter, batch_estimator, conditions_from, frozen_parameters
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples

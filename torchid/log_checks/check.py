@@ -13,14 +13,21 @@ import numpy as np
 import torch
 
 from torchid.errors import LogError, warn
-from torchid.log_checks.channels import channel_groups, channel_names, median_step
 from torchid.log_checks.contacts import (
     check_contact_flags,
     check_limb_sensors,
     check_standing_feet,
     subtract_contact_offsets,
 )
-from torchid.log_checks.findings import CONDEMNED, SEVERITIES, Finding, Skipped
+from torchid.log_checks.findings import (
+    CONDEMNED,
+    SEVERITIES,
+    Finding,
+    Skipped,
+    channel_groups,
+    channel_names,
+    median_step,
+)
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_repeats
 from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives

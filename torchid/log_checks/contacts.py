@@ -8,12 +8,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchid.errors import InputError
-from torchid.log_checks.channels import median_step
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, Span, find_spans
+from torchid.errors import InputError, format_count
+from torchid.log_checks.findings import (
+    CONDEMNED,
+    NORMAL,
+    NOTE,
+    SUSPICIOUS,
+    Finding,
+    Skipped,
+    Span,
+    find_spans,
+    median_step,
+)
 from torchid.log_checks.mistakes import Mistake, possible_mistakes
 from torchid.log_checks.model import COMPARED, bind_some_samples, default_cutoff_hz, link_poses, preprocess_pieces
-from torchid.log_checks.statistics import NORMAL
 from torchid.log_checks.weight import GRAVITY, WRONG_MASS
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
@@ -22,7 +30,6 @@ from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
-from torchid.text import format_count
 
 # ------------------------------------------------------------------------------------------------- flags against forces
 

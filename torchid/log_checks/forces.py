@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from torchid.errors import InputError
+from torchid.errors import InputError, join_names
 from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped
 from torchid.log_checks.mistakes import possible_mistakes
 from torchid.log_checks.model import (
@@ -25,7 +25,6 @@ from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 from torchid.problem import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact
-from torchid.text import join_names
 
 #: Misfit above which usual mistakes are tried. A URDF that is 20 % off leaves 0.05 to 0.1, one with links missing 0.3.
 WRONG = 0.4

@@ -8,11 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.log_checks.channels import ChannelGroup
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
-from torchid.log_checks.statistics import finite_median, neighbours_of
+from torchid.errors import format_count, join_names
+from torchid.log_checks.findings import (
+    CONDEMNED,
+    NOTE,
+    SUSPICIOUS,
+    ChannelGroup,
+    Finding,
+    Span,
+    finite_median,
+    neighbours_of,
+)
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
-from torchid.text import format_count, join_names
 
 #: Samples at the very same extreme value from which on it is a limit and no coincidence.
 AT_LIMIT = 5

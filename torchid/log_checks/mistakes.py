@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.errors import join_names
 from torchid.log_checks.motion import TWO_TURNS
 from torchid.log_checks.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
 from torchid.logs.quaternion import inverse_rotation, make_sign_continuous
-from torchid.text import join_names
 
 #: Parts of names that distinguish the sides, and the ends, of a robot.
 _SIDES = ("left right", "Left Right", "LEFT RIGHT", "l r", "L R", "FL FR", "RL RR", "HL HR", "LF RF", "LH RH")

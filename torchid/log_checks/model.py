@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchid.errors import TorchidWarning
-from torchid.log_checks.channels import median_step
+from torchid.log_checks.findings import median_step
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess

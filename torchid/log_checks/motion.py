@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchid.log_checks.channels import channel_names
-from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped
-from torchid.log_checks.statistics import NORMAL
+from torchid.errors import join_names
+from torchid.log_checks.findings import CONDEMNED, NORMAL, SUSPICIOUS, Finding, Skipped, channel_names
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
@@ -22,7 +21,6 @@ from torchid.logs.quaternion import (
 )
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
-from torchid.text import join_names
 
 # ---------------------------------------------------------------------------------------------- unit of joint positions
 

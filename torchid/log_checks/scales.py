@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchid import parameters
-from torchid.log_checks.channels import median_step
+from torchid.log_checks.findings import median_step
 from torchid.log_checks.model import DIFFERENTIATED_TO_TRY, NOTHING, bind_some_samples, preprocess_pieces
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray

@@ -9,13 +9,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.log_checks.channels import ChannelGroup, median_step
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span
-from torchid.log_checks.statistics import NORMAL, block_spread, finite_median, neighbours_of, widen_mask
+from torchid.errors import format_count, join_names
+from torchid.log_checks.findings import (
+    CONDEMNED,
+    NORMAL,
+    NOTE,
+    SUSPICIOUS,
+    ChannelGroup,
+    Finding,
+    Span,
+    block_spread,
+    finite_median,
+    median_step,
+    neighbours_of,
+    widen_mask,
+)
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
-from torchid.text import format_count, join_names
 
 POSES = ("joint_position", "base_quat_xyzw", "base_position_world")
 #: Fields whose lasting steps are reported; those of velocities and accelerations come from impacts and commands.

@@ -6,13 +6,22 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from torchid.log_checks.channels import LONG_STEP, NO_SIGNALS, channel_names
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Span, find_spans
+from torchid.errors import format_count, join_names
+from torchid.log_checks.findings import (
+    CONDEMNED,
+    LONG_STEP,
+    NO_SIGNALS,
+    NOTE,
+    SUSPICIOUS,
+    Finding,
+    Span,
+    channel_names,
+    find_spans,
+)
 from torchid.logs import Log
 from torchid.logs.log import NAN_ALLOWED, WRENCHES, BoolArray, FloatArray
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_STEP
-from torchid.text import format_count, join_names
 
 # --------------------------------------------------------------------------------------------------------------- values
 

@@ -6,10 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from torchid.log_checks.channels import median_step
-from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped
+from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
 from torchid.log_checks.model import link_poses
-from torchid.log_checks.statistics import widen_mask
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world

@@ -3,6 +3,6 @@
 from torchid.logs.log import Log
 from torchid.logs.preprocess import preprocess
 from torchid.logs.read import read_log, write_log
-from torchid.logs.ros.topics import Topics
+from torchid.logs.ros_topics import Topics
 
 __all__ = ["Log", "Topics", "preprocess", "read_log", "write_log"]

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, current_file
+from torchid.errors import FieldError, current_file, excerpt, is_plain
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
 from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS, UnknownFieldError, field_shape, is_quaternion
 from torchid.parameters import WRENCH_COMPONENTS
-from torchid.text import excerpt, is_plain
 
 #: The one column of text: the same in every row.
 TEXT_COLUMN = "imu_frame"

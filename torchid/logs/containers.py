@@ -15,12 +15,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, TorchidError, during
+from torchid.errors import FieldError, LogError, TorchidError, during, excerpt
 from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.spill import LazyArray, Spill
 from torchid.staging import atomic_file
-from torchid.text import excerpt
 
 # --------------------------------------------------------------------------------------------------- kinds of log files
 

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, UnknownNameError, about_file
+from torchid.errors import FieldError, LogError, UnknownNameError, about_file, excerpt, is_plain
 from torchid.guards import MAX_LETTERS
 from torchid.parameters import WRENCH_COMPONENTS
-from torchid.text import excerpt, is_plain
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -43,8 +43,8 @@ from torchid.logs.log import (
     to_float64,
 )
 from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
-from torchid.logs.ros.read import read_bag
-from torchid.logs.ros.topics import Topics
+from torchid.logs.ros_read import read_bag
+from torchid.logs.ros_topics import Topics
 from torchid.logs.tables import read_table, save_table
 
 

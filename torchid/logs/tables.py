@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, how_to_install
+from torchid.errors import FieldError, LogError, excerpt, how_to_install
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_size
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, column_names, parse_header
 from torchid.logs.containers import atomic_output, reader_errors_explained
 from torchid.logs.log import NAME_FIELDS
-from torchid.text import excerpt
 
 #: Bytes of a CSV file that are parsed at a time; no row may be longer.
 _BLOCK = 2**22

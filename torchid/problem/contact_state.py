@@ -14,8 +14,7 @@ from torchid.parameters import Array
 from torchid.problem.extras import Extra, measured_components
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import reduced_layout, reduction_matrix
-from torchid.regressor.jacobian import wrench_transform
-from torchid.regressor.regressor import JointRow, joint_rows
+from torchid.regressor.regressor import JointRow, joint_rows, wrench_transform
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from torchid.errors import join_names
 from torchid.parameters import Array
 from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import ContactState
@@ -17,7 +18,6 @@ from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
-from torchid.text import join_names
 
 WHITENED = "projected_residual"
 """The group of the rows of a fit: whitened, and projected so that nothing unmeasured is in them."""

@@ -19,7 +19,7 @@ from torchid.problem.contact_state import ContactState, contact_extra_column, do
 from torchid.problem.extras import ACTUATORS, Extra
 from torchid.problem.rows import ChunkDynamics, RowBuilder
 from torchid.problem.samples import Samples
-from torchid.regressor.jacobian import generalized_forces, wrench_transform, wrenches_at_base
+from torchid.regressor.regressor import generalized_forces, wrench_transform, wrenches_at_base
 from torchid.regressor.tree import KinematicTree
 
 _ROWS = 2**16  # of a log on the disk that are in memory at a time

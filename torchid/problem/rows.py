@@ -22,9 +22,16 @@ from torchid.problem.contact_state import (
 )
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.samples import Samples
-from torchid.regressor.jacobian import generalized_forces, wrench_transform, wrenches_at_base
 from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion
-from torchid.regressor.regressor import all_wrench_columns, friction_columns, joint_row, joint_screw_axes
+from torchid.regressor.regressor import (
+    all_wrench_columns,
+    friction_columns,
+    generalized_forces,
+    joint_row,
+    joint_screw_axes,
+    wrench_transform,
+    wrenches_at_base,
+)
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet

@@ -1,7 +1,6 @@
 """Batched kinematics and the regressor K(q, v, a)."""
 
-from torchid.regressor.jacobian import FrameJacobian
 from torchid.regressor.kinematics import Motion, motion_from_state
-from torchid.regressor.regressor import Regressor
+from torchid.regressor.regressor import FrameJacobian, Regressor
 
 __all__ = ["FrameJacobian", "Motion", "Regressor", "motion_from_state"]

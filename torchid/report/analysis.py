@@ -15,12 +15,12 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.identifiability.base_parameters import BaseParameters, format_base_parameters, unobservable_parameters
-from torchid.identifiability.expected_error import ExpectedErrors
+from torchid.identifiability.information import ExpectedErrors
 from torchid.problem import Metrics
 from torchid.problem.metrics import ROW_GROUPS, group_name
 from torchid.report.figures import STYLE
 from torchid.rounding import BASE_RANK_TOLERANCE
-from torchid.sensor_planning.candidates import Candidate
+from torchid.sensor_planning.demands import Candidate
 from torchid.sensor_planning.observability import BaseObservability, LostBase, PostureSummary
 from torchid.sensor_planning.planner import PartPlan, SensorPlan
 

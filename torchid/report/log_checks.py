@@ -16,12 +16,12 @@ from matplotlib.patches import Patch
 from rich.table import Table
 from rich.text import Text
 
+from torchid.errors import excerpt, join_names
 from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, Finding, Span
-from torchid.log_checks.channels import channel_names, channel_unit
+from torchid.log_checks.findings import channel_names, channel_unit
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.report.figures import STYLE
-from torchid.text import excerpt, join_names
 
 COLORS = {CONDEMNED: "tab:red", SUSPICIOUS: "tab:orange", NOTE: "tab:blue"}
 _ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0  # inches

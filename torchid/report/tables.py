@@ -17,6 +17,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from torchid.errors import escape, raw_stream
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.calibration import Comparison
@@ -25,7 +26,6 @@ from torchid.identifiability.contributions import Contribution, Contributions, P
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS
-from torchid.text import escape, raw_stream
 
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNOBSERVABLE: ".", FIXED: ""}
 

@@ -15,8 +15,7 @@ from yourdfpy.urdf import Inertial, Link
 from torchid import parameters
 from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError, during, warn
 from torchid.parameters import WRENCH_COMPONENTS, Array
-from torchid.robot.chain import JointGeometry, build_chain, joint_geometry, link_poses
-from torchid.robot.tree import BodyJoint, BodyTree, build_tree
+from torchid.robot.tree import BodyJoint, BodyTree, JointGeometry, build_chain, build_tree, joint_geometry, link_poses
 from torchid.robot.urdf import read_urdf
 
 if TYPE_CHECKING:

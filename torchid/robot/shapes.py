@@ -17,13 +17,11 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 from yourdfpy.urdf import Inertial
 
-from torchid.errors import UrdfError, warn
+from torchid.errors import UrdfError, excerpt, warn
 from torchid.guards import MAX_AXES, MAX_NUMBER, MAX_POINTS, MAX_SHAPES
 from torchid.parameters import Array
-from torchid.robot.meshes import MeshError, mesh_content
 from torchid.robot.robot import Robot
-from torchid.robot.urdf import parse_xml, read_urdf
-from torchid.text import excerpt
+from torchid.robot.urdf import MeshError, mesh_content, parse_xml, read_urdf
 
 ShapeKind = Literal["collision", "visual"]
 SHAPE_TAGS = ("box", "sphere", "cylinder", "capsule", "mesh")

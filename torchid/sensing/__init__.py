@@ -17,8 +17,8 @@ __all__ = [
     "Projection",
     "SensorNoise",
     "SensorSet",
-    "validate_contacts",
     "chosen_sensors",
     "named_sensors",
+    "validate_contacts",
     "with_ft_sensors",
 ]

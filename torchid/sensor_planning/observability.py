@@ -18,8 +18,14 @@ from torchid.robot import Robot
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values
-from torchid.sensor_planning.candidates import Candidate, candidates, contained_candidates
-from torchid.sensor_planning.demands import Demand, demands, orthonormal_basis
+from torchid.sensor_planning.demands import (
+    Candidate,
+    Demand,
+    candidates,
+    contained_candidates,
+    demands,
+    orthonormal_basis,
+)
 
 _ZERO = 1e-5  # of a unit vector
 _CHUNK = 1024

@@ -19,8 +19,7 @@ from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.projection import base_rank
-from torchid.sensor_planning.candidates import Candidate, candidates, sensor_set, total_cost
-from torchid.sensor_planning.demands import demands
+from torchid.sensor_planning.demands import Candidate, candidates, demands, sensor_set, total_cost
 from torchid.sensor_planning.observability import BaseObservability, assess_sensors, base_values
 from torchid.sensor_planning.ranking import (
     MotionStack,

@@ -24,7 +24,7 @@ from torchid.problem.chunks import one_thread, run_in_workers, subsample_states,
 from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
-from torchid.sensor_planning.candidates import Candidate, sensor_set
+from torchid.sensor_planning.demands import Candidate, sensor_set
 from torchid.sensor_planning.search import DemandGroup
 
 _ROUNDING_SHARE = 1e-9  # a share of the largest column in units of the scales, or of unit columns, that is rounding

@@ -15,14 +15,15 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from torchid.errors import SensorError
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
-from torchid.sensor_planning.candidates import Candidate, total_cost
 from torchid.sensor_planning.demands import (
     TOLERANCE,
+    Candidate,
     Demand,
     connected_groups,
     orthogonal_part,
     orthonormal_basis,
     span_basis,
+    total_cost,
 )
 
 _DEVICES, _COMBINATIONS, _BATCH = 5, 100_000, 4096

@@ -23,8 +23,8 @@ from mcap.records import Channel as McapChannel
 from mcap.records import Chunk, Message, Schema
 from rosbags import rosbag1
 
+from torchid.errors import excerpt
 from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget, require_plain_name
-from torchid.text import excerpt
 
 
 @dataclass(frozen=True)

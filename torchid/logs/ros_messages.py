@@ -16,7 +16,7 @@ from torchid.guards import MAX_ARRAYS, check_names, require_plain_name
 from torchid.logs.log import FloatArray
 
 if TYPE_CHECKING:
-    from torchid.logs.ros.files import Channel
+    from torchid.logs.ros_files import Channel
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _JOINT_FIELDS = {"position": "joint_position", "velocity": "joint_velocity", "effort": "joint_torque"}

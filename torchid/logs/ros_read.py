@@ -16,7 +16,7 @@ from torchid.errors import FieldError, LogError, UnknownNameError, current_file,
 from torchid.logs.containers import list_bag_files, reader_errors_explained
 from torchid.logs.log import FloatArray, is_quaternion, normalize_quaternions
 from torchid.logs.quaternion import make_sign_continuous
-from torchid.logs.ros.messages import (
+from torchid.logs.ros_messages import (
     ContactFlag,
     Decoder,
     Imu,
@@ -28,11 +28,11 @@ from torchid.logs.ros.messages import (
     Wrench,
     make_deserializer,
 )
-from torchid.logs.ros.topics import ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
+from torchid.logs.ros_topics import ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
 from torchid.logs.timeline import LONGEST_STEP, spline_derivatives
 
 if TYPE_CHECKING:
-    from torchid.logs.ros.files import BagFile, Channel
+    from torchid.logs.ros_files import BagFile, Channel
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +220,7 @@ def _open_bag_file(path: Path) -> Iterator[BagFile]:
     suffix = path.suffix.lower()
     try:
         # here: only those who read bags need the libraries of its readers
-        from torchid.logs.ros.files import McapFile, Ros1File, SqliteFile
+        from torchid.logs.ros_files import McapFile, Ros1File, SqliteFile
     except ImportError as error:
         absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
         found = f"a bag, but {' and '.join(absent) or error.name} {'are' if len(absent) > 1 else 'is'} not installed"
