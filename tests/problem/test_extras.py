@@ -207,8 +207,8 @@ def test_a_humanoid_with_ankle_sensors_and_an_imu_is_found_with_all_offsets_that
     true = true_parameters(oracle, robot).ravel()
     base = base_parameters(structural_problem(robot, FEET, sensors, [tuple(state) for state in states]))
     assert found.estimate.rank == base.rank
-    expected, units = base.of(true), np.abs(base.combination) @ base.scale
-    np.testing.assert_allclose((base.of(found.estimate.phi) - expected) / units, 0.0, rtol=0.0, atol=EXACT)
+    expected, units = base.reduce(true), np.abs(base.combination) @ base.scale
+    np.testing.assert_allclose((base.reduce(found.estimate.phi) - expected) / units, 0.0, rtol=0.0, atol=EXACT)
 
 
 def test_parameters_bound_to_be_physical_are_found_with_the_offsets_too() -> None:
