@@ -187,7 +187,7 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
         conditions: from `conditions_from`.
 
     Raises:
-        InputError: the certified method without CVXPY and Clarabel.
+        InputError: the certified method without Clarabel.
     """
     if settings.name == "least_squares":
         return settings.least_squares
