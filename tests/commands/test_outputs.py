@@ -6,20 +6,14 @@ import json
 import os
 import re
 import shutil
-import signal
-import sys
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
-from demo import DEMO
 from hostile_commands import Commands
 from refusals import refusal
-from repository import ROOT
+from run_folders import Add, a_run, everything, write
 
-import torchid
 from torchid.cli import main
 from torchid.commands.folder import (
     EVALUATION,
@@ -33,38 +27,7 @@ from torchid.commands.folder import (
 )
 from torchid.commands.manifest import MANIFEST, read_manifest
 from torchid.commands.training import Training
-from torchid.config import load_analysis, load_simulation
 from torchid.errors import ConfigError, TorchidWarning
-from torchid.staging import interrupts_deferred, staging_folder, termination_as_interrupt
-
-Add = Callable[[Path], None]
-
-
-def write(folder: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-
-
-def a_run(output: Path, text: str = "old") -> Path:
-    """A folder as a run leaves it, with an evaluation."""
-    with new_folder(output, overwrite=True) as folder:
-        write(folder, {"config.yaml": text, "metrics.json": text, "hparams/events": text})
-    with new_folder(output / "evaluation" / "log", True, EVALUATION) as folder:
-        write(folder, {"metrics.json": text})
-    return output
-
-
-def everything(folder: Path) -> dict[str, tuple[bytes, str]]:
-    """All files and folders, with what is in them or where they point to."""
-    return {
-        str(path.relative_to(folder)): (
-            path.read_bytes() if path.is_file() and not path.is_symlink() else b"",
-            os.readlink(path) if path.is_symlink() else "",
-        )
-        for path in folder.rglob("*")
-    }
-
 
 # --------------------------------------------------------------------------------------------- what others put there
 
@@ -225,74 +188,6 @@ def test_a_folder_that_may_not_be_changed_is_refused_before_any_work(tmp_path: P
     (output / "hparams").chmod(0o755)
 
 
-# ------------------------------------------------------------------------------------------------ killed processes
-
-_KILLED = """
-import os, signal, sys
-from pathlib import Path
-import torchid.commands.folder as folder
-stop, output, calls = int(sys.argv[1]), Path(sys.argv[2]), 0
-def counted(function):
-    def call(*args, **kwargs):
-        global calls
-        calls += 1
-        if calls == stop:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return function(*args, **kwargs)
-    return call
-for name in ("mkdir", "open", "rename", "unlink", "rmdir", "replace", "remove"):
-    setattr(os, name, counted(getattr(os, name)))
-with folder.new_folder(output, True) as new:
-    (new / "config.yaml").write_text("new")
-    (new / "hparams").mkdir()
-    (new / "hparams" / "events").write_text("new")
-"""
-
-
-def test_a_process_killed_at_any_step_loses_nothing_and_the_next_run_clears_what_it_left(tmp_path: Path) -> None:
-    """At every change that it makes to the disk, the one between the old run and the new included."""
-    stop, fates = 0, set()
-    while True:
-        stop += 1
-        place = tmp_path / str(stop)
-        output = a_run(place / "run")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads, which the child does not use
-            pid = os.fork()  # an interpreter would take a second to start
-        if not pid:
-            try:
-                sys.argv = ["", str(stop), str(output)]
-                exec(_KILLED, {})
-                os._exit(0)
-            finally:
-                os._exit(1)
-        ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        check_free(output, True)  # which clears what was left
-        text = (output / "config.yaml").read_text()
-        assert {path.read_text() for path in output.rglob("*") if path.is_file() and path.name != MANIFEST} == {text}
-        assert [path.name for path in place.iterdir()] == ["run"], stop
-        fates.add(text)
-        if not ended:
-            break
-        assert ended == -signal.SIGKILL
-    assert stop > 10
-    assert fates == {"old", "new"}
-
-
-def test_what_a_living_process_makes_and_what_only_looks_like_it_stay(tmp_path: Path) -> None:
-    output = tmp_path / "run"
-    names = {".run-notes.torchid/new/a", ".run-01234567.torchid/mine", ".run-01234567/new", ".run-0123456x.torchid/new"}
-    write(tmp_path, dict.fromkeys(names, "mine"))
-    (tmp_path / ".run-76543210.torchid").symlink_to(tmp_path / ".run-01234567")
-    before = everything(tmp_path)
-    with staging_folder(output) as living:
-        (living / "new").mkdir()
-        a_run(output)
-        assert (living / "new").exists()
-    shutil.rmtree(output)
-    assert everything(tmp_path) == before
-
-
 # ---------------------------------------------------------------------------------------------------------- commands
 
 
@@ -440,80 +335,3 @@ def test_files_are_replaced_only_on_request_and_links_and_inputs_never(
     (tmp_path / "same.npz").hardlink_to(log)
     for target in (log, tmp_path / "." / "log.npz"):
         assert "what is read" in refusal(["convert", str(log), str(target), "--overwrite"], tmp_path, capsys)
-
-
-# ----------------------------------------------------------------------------------------------------- where results go
-
-
-def test_results_of_what_ships_go_to_the_working_folder_and_nothing_into_the_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for file in (DEMO / "quadruped.yaml", *(ROOT / "configs").glob("*.yaml")):
-        if "motions" in yaml.safe_load(file.read_text()):
-            output = load_simulation(file).output
-        else:
-            output = load_analysis(file, ["logs=null", "analysis.compare={}"]).output
-        assert output.parent == tmp_path / "runs", file
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("ignored", [False, True])
-def test_calls_to_end_are_interrupts_even_in_the_background(number: signal.Signals, ignored: bool) -> None:
-    """A shell starts commands in the background with SIGINT ignored; SIGHUP that `nohup` ignores stays ignored."""
-    before = signal.getsignal(signal.SIGINT)
-    inherited = signal.signal(number, signal.SIG_DFL)  # whoever started the tests may have it ignored
-    if ignored:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with pytest.raises(KeyboardInterrupt), termination_as_interrupt():
-            signal.raise_signal(number)
-        done = []
-        with pytest.raises(KeyboardInterrupt), termination_as_interrupt(), interrupts_deferred():  # noqa: PT012
-            signal.raise_signal(number)
-            done.append("all of it")
-        assert done
-        if ignored:
-            with interrupts_deferred():
-                signal.raise_signal(signal.SIGINT)
-    finally:
-        signal.signal(signal.SIGINT, before)
-        signal.signal(number, inherited)
-    earlier = signal.signal(number, signal.SIG_IGN)
-    try:
-        with termination_as_interrupt():
-            signal.raise_signal(number)
-    finally:
-        signal.signal(number, earlier)
-
-
-# ------------------------------------------------------------------------------------------------------------ the name
-
-
-def test_nobody_is_told_to_install_the_torchid_of_somebody_else() -> None:
-    """That name on PyPI is another package."""
-    files = [
-        path for folder in ("torchid", "scripts", "docs", "configs", "tests") for path in (ROOT / folder).rglob("*")
-    ]
-    files += [ROOT / name for name in ("README.md", "Makefile", "pyproject.toml", "constraints.txt")]
-    wrong = re.compile(r"pip3? install (?:-\S+ )*['\"]?torchid\b(?!/)|\btorchid\[[a-z]")
-    for path in files:
-        if path.suffix in (".py", ".md", ".yaml", ".toml", ".txt", "") and path.is_file() and path != Path(__file__):
-            assert not wrong.search(path.read_text()), path
-    assert wrong.search("pip install 'torchid[oracle]'")
-    assert wrong.search("pip install torchid")
-
-
-def test_the_lock_has_a_version_within_bounds_of_every_package_that_is_needed() -> None:
-    from packaging.requirements import Requirement
-    from packaging.utils import canonicalize_name
-
-    text = (ROOT / "pyproject.toml").read_text().partition("dependencies = [")[2].partition("[project.scripts]")[0]
-    needed = [Requirement(x) for x in re.findall(r'"([a-z][^"]*[=<>\]][^"]*)"', text)]
-    lock = [Requirement(x) for x in (ROOT / "constraints.txt").read_text().splitlines() if x and x[0] != "#"]
-    versions = {canonicalize_name(x.name): next(iter(x.specifier)).version for x in lock}
-    assert len(needed) > 15
-    for one in needed:
-        if one.name != "torchid-robotics":
-            assert one.specifier.contains(versions[canonicalize_name(one.name)]), one
-    assert torchid.__version__

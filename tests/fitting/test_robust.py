@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from demo import shortened_demo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from intervals import FEET, REPETITIONS, STATES, covered, noisy_torques
-from refusals import refusal
 from scipy.optimize import least_squares
 from synthetic import SOLO12, UR5, Array, Oracle, load, make_log
 from true_robots import true_parameters
 from urdfs import inertial, joint, link, write
 
 from torchid import parameters
-from torchid.cli import main
 from torchid.estimators import Conditions, Consistent, Estimate, LeastSquares, violations
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import TUNING, Reweighting, RobustLoss, RobustSummary, fit_robustly
@@ -378,50 +373,3 @@ def test_a_loss_that_is_flat_where_all_rows_are_says_nothing_of_errors() -> None
     one_pass(log_named("x"), (0,), torch.tensor([[1.0, 5.0], [1.0, -7.0]], dtype=torch.float64))
     assert np.isnan(one_pass.deviation(1.0))
     assert np.isnan(Reweighting(RobustLoss("huber", 1.0), {}, 1.0).deviation(0.0))
-
-
-# --------------------------------------------------------------------------------------------------- the command line
-
-
-@pytest.fixture
-def tampered(tmp_path: Path) -> Path:
-    """The demo's experiment file; one torque sensor of its training log has spikes."""
-    folder = shortened_demo(tmp_path / "demo", 500)
-    with np.load(folder / "sway_train.npz") as log:
-        fields = dict(log.items())
-    fields["joint_torque"][::25, 3] += 50.0
-    np.savez(folder / "sway_train.npz", **fields)
-    return folder / "quadruped.yaml"
-
-
-@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
-def test_a_run_says_how_its_robust_fit_went_and_whether_it_settled(
-    tampered: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    output = tampered.parent / "run"
-    assert main(["identify", str(tampered), f"output={output}", "estimator.robust={loss: tukey, passes: 1}"]) == 0
-    printed = capsys.readouterr()
-    assert "of the weight kept, 1 passes" in printed.out
-    assert "NumericalWarning: " in printed.err
-    assert "estimator.robust: not settled after 1 passes; accepted: more passes" in printed.err
-    robust = json.loads((output / "metrics.json").read_text())["robust"]
-    assert (robust["loss"], robust["tuning"], robust["passes"], robust["converged"]) == ("tukey", 4.685, 1, False)
-    assert 0.9 < robust["mean_weight"] < 1.0
-
-
-@pytest.mark.parametrize(
-    ("override", "expected"),
-    [
-        ("estimator.name=sgd", "estimator.robust"),
-        ("estimator.robust=cauchy", "huber"),
-        ("estimator.robust={loss: huber, tuning: 0}", "estimator.robust.tuning"),
-        ("estimator.robust={loss: huber, passes: 0}", "estimator.robust.passes"),
-        ("estimator.robust={tuning: 2}", "loss"),
-        ("estimator.robust={loss: tukey, pases: 2}", "passes"),
-    ],
-)
-def test_robust_settings_that_make_no_sense_are_refused(
-    tampered: Path, capsys: pytest.CaptureFixture[str], override: str, expected: str
-) -> None:
-    arguments = ["identify", str(tampered), "estimator.robust=tukey", override]
-    assert expected in refusal(arguments, tampered.parent, capsys)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import grown_bags
 import grown_logs
 import grown_robots
 import numpy as np
@@ -67,9 +68,9 @@ KINDS: dict[str, tuple[Callable[[], Grow], Callable[[Path], object]]] = {
     "hdf5": (lambda: grown_logs.hdf5, read),
     "csv": (lambda: grown_logs.table_csv, read),
     "parquet": (lambda: grown_logs.parquet, read),
-    "mcap": (lambda: grown_logs.mcap, read),
-    "bag": (lambda: grown_logs.bag, read),
-    "database": (lambda: grown_logs.database, read),
+    "mcap": (lambda: grown_bags.mcap, read),
+    "bag": (lambda: grown_bags.bag, read),
+    "database": (lambda: grown_bags.database, read),
     "urdf": (lambda: grown_robots.urdf, lambda path: body_extents(load_robot(path))),
     "mesh": (lambda: grown_robots.mesh, lambda path: body_extents(load_robot(path))),
     "settings": (lambda: grown_robots.settings, read_settings),

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from demo import shortened_demo
 from hostile import examined
-from hostile_logs import N, archives, damaged, fields, hdf5, values, write
+from hostile_hdf5 import hdf5
+from hostile_logs import N, archives, damaged, fields, values, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refusal

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from repository import SHARED
 from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, LogError, UnknownNameError
@@ -397,13 +396,3 @@ def test_selecting_samples_takes_the_same_ones_of_every_field(tmp_path: Path) ->
     chosen = log.select(np.array([4, 0]))
     np.testing.assert_array_equal(chosen.joint_position, log.joint_position[[4, 0]])
     assert len(log.select(log.time > 0.025)) == 3
-
-
-def test_the_real_logs_read_and_weigh_what_they_should() -> None:
-    if not SHARED.is_dir():
-        pytest.skip(f"no real logs at {SHARED}")
-    static = read_log(SHARED / "human_squats" / "static1.npz")
-    assert static.contact_wrench_world is not None
-    force = static.contact_wrench_world[:, :, :3].sum(axis=1).mean(axis=0)
-    assert np.linalg.norm(force) / 9.81 == pytest.approx(60.03, rel=2e-3)  # a person does not stand quite still
-    assert read_log(SHARED / "kuka_lwr4" / "run1.npz").joint_torque is not None

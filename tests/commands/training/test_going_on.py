@@ -1,0 +1,272 @@
+"""A descent as a run: curves, checkpoints, and going on after whatever stopped it as if nothing had."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from repository import DEMO
+from tensorboard.plugins.custom_scalar import layout_pb2
+from trainings import (
+    BY_EPOCH,
+    EPOCHS,
+    EVALUATED,
+    FIGURES,
+    assert_as_uninterrupted,
+    command,
+    events_in,
+    interrupt,
+    steps,
+    stopped_in,
+    training_of,
+)
+
+import torchid
+from torchid import parameters
+from torchid.cli import main
+from torchid.commands.training import CHECKPOINT, load_checkpoint
+from torchid.config import load_config
+from torchid.estimators import Trainer
+from torchid.estimators.least_squares import VERDICTS
+from torchid.problem.linear import parameter_scale
+from torchid.problem.metrics import ERROR_GROUPS, ROW_GROUPS, WHITENED
+
+
+def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Path) -> None:
+    names = {"events" if path.name.startswith("events") else path.name for path in run.iterdir()}
+    figures = {"forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png"}
+    results = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "manifest.json"}
+    assert names == {"events", "hparams", *results, *figures}
+    assert list(run.parent.iterdir()) == [run]
+    assert load_config(run / "config.yaml").estimator.training.epochs == EPOCHS
+
+
+def test_metrics_and_parameters_are_those_of_the_best_epoch(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")
+    groups += ("projected_residual",)
+    for name in ("train", "test"):
+        assert set(metrics[name]) == {*groups, *(f"{group}_relative" for group in groups)}
+        for group in ("joint_torque_rms", "base_force_rms", "base_moment_rms", "nullspace_rms"):
+            assert metrics[name][group] < metrics[f"{name}_nominal"][group]
+    held_out = {event.step: event.value for event in events_in(run).Scalars("loss_held_out/data")}
+    best = min(held_out, key=lambda step: held_out[step])
+    assert metrics["solution"]["epochs"] == EPOCHS
+    assert metrics["solution"]["best_epoch"] == best
+    least = {event.step: event.value for event in events_in(run).Scalars("closed_form/objective_above_least")}
+    above = metrics["solution"]["objective"] / metrics["solution"]["unconstrained"] - 1.0
+    assert above == pytest.approx(least[best], rel=1e-6)
+    robot = torchid.load_robot(DEMO / "quadruped.urdf")
+    bodies = json.loads((run / "parameters.json").read_text())["bodies"]
+    phi = np.array([list(body["identified"].values()) for body in bodies])
+    least_eigenvalues = parameters.least_eigenvalues(phi.ravel(), parameter_scale(robot.nominal).ravel())
+    assert metrics["smallest_eigenvalue"] == pytest.approx(dict(zip(robot.body_names, least_eigenvalues, strict=True)))
+    assert least_eigenvalues.min() > 1e-4
+    assert phi[1:, 10:].min() > 0.0
+
+
+def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path) -> None:
+    events, robot = events_in(run), torchid.load_robot(DEMO / "quadruped.urdf")
+    by_epoch = [
+        *("loss/total", "loss/data", "loss/prior", "loss_held_out/data", "share_of_force/rigid_body"),
+        *("closed_form/objective_above_least", "closed_form/distance"),
+        *("descent/learning_rate", "descent/samples_per_second"),
+    ]
+    evaluated = [f"{kind}_error_{name}/{group}" for kind in ("relative", "rms") for name in ("train", "test")
+                 for group in ROW_GROUPS]  # fmt: skip
+    # the log is too short to leave folds of it out
+    judged = [f"{kind}_error_{name}/{WHITENED}" for kind in ("relative", "rms") for name in ("train", "test")]
+    evaluated += [f"eigenvalue/{name}" for name in robot.body_names]
+    once = ["fit/residual_std", "fit/rank", "fit/condition_number", "identifiability/bits"]
+    once += ["identifiability/combinations", *(f"verdicts/{verdict}" for verdict in VERDICTS)]
+    assert set(events.Tags()["scalars"]) == {*by_epoch, *evaluated, *judged, *once, "identifiability/singular_value"}
+    for tags, expected in ((by_epoch, BY_EPOCH), (evaluated, EVALUATED), (judged, [0, EPOCHS]), (once, [EPOCHS])):
+        for tag in tags:
+            assert steps(events, tag) == expected
+    for tag in ("loss/data", "loss_held_out/data", "relative_error_test/nullspace", "closed_form/distance"):
+        values = [event.value for event in events.Scalars(tag)]
+        assert values[-1] < 0.8 * values[0]
+    total = [event.value for event in events.Scalars("loss/total")]
+    parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in ("data", "prior")), strict=True)
+    assert total == pytest.approx([sum(pair) for pair in parts], rel=1e-6)
+    assert set(events.Tags()["images"]) == {"forces", "errors", "parameters", "identifiability", "contributions"}
+    (text,) = events.Tensors("config/text_summary")
+    assert b"checkpoint_seconds: 0" in text.tensor_proto.string_val[0]
+
+
+def test_hyperparameters_stand_beside_the_final_errors(run: Path) -> None:
+    events = events_in(run / "hparams")
+    tags = set(events.Tags()["scalars"])
+    assert {f"final/{name}_{group}" for name in ("train", "test") for group in ROW_GROUPS} <= tags
+    metrics = json.loads((run / "metrics.json").read_text())
+    (found,) = events.Scalars("final/test_nullspace")
+    assert found.value == pytest.approx(metrics["test"]["nullspace_rms_relative"], rel=1e-6)
+    (start,) = (summary for name, summary in events.summary_metadata.items() if name == "_hparams_/session_start_info")
+    for name in (b"optimizer", b"Adam", b"CosineAnnealingLR", b"batch_size", b"consistency", b"log_cholesky"):
+        assert name in start.plugin_data.content
+
+
+def test_custom_charts_show_training_and_unseen_logs_together(run: Path) -> None:
+    events = events_in(run)
+    layout = layout_pb2.Layout()
+    layout.ParseFromString(events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0])
+    charts = {chart.title: list(chart.multiline.tag) for category in layout.category for chart in category.chart}
+    for group in ERROR_GROUPS:
+        assert charts[group] == [f"relative_error_{name}/{group}" for name in ("train", "test", "left_out")]
+    assert charts["train and held out"] == ["loss/data", "loss_held_out/data"]
+    tags = events.Tags()["scalars"]
+    for title, patterns in charts.items():
+        shown = [tag for tag in tags if any(re.match(pattern, tag) for pattern in patterns)]
+        assert len(shown) >= 2, f"{title} shows nothing"
+    bodies = torchid.load_robot(DEMO / "quadruped.urdf").body_names
+    assert len(charts["smallest eigenvalue"]) == len(bodies)
+
+
+# -------------------------------------------------------------------------------------------------------- being stopped
+
+SERVER = """
+import os, sys, time
+from matplotlib.figure import Figure
+import torchid.commands.results as results
+from torchid.cli import main
+from torchid.estimators import Trainer
+for name in {figures}:
+    setattr(results, name, lambda *_: Figure())
+plain = Trainer.run_epoch
+Trainer.run_epoch = lambda trainer: time.sleep(0.03) or plain(trainer)  # or a fast machine is done before it is killed
+print("ready", flush=True)
+for line in sys.stdin:
+    child = os.fork()
+    if not child:
+        os._exit(main(line.rstrip("\\n").split("\\t")))
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[subprocess.Popen[str]]:
+    """A process that has everything loaded and runs a command in a child for every line it reads."""
+    code = SERVER.format(figures=FIGURES)
+    with subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield process
+        process.stdin.close()
+
+
+def killed(server: subprocess.Popen[str], arguments: list[str], output: Path, after: float) -> int:
+    """The exit status of a command that is killed so many seconds after a checkpoint that is not there yet."""
+    checkpoint = training_of(output) / CHECKPOINT
+    before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else None
+    server.stdin.write("\t".join(arguments) + "\n")
+    server.stdin.flush()
+    child = int(server.stdout.readline())
+    deadline = time.monotonic() + 60.0
+    while not checkpoint.exists() or checkpoint.stat().st_mtime_ns == before:
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    time.sleep(after)
+    os.kill(child, signal.SIGKILL)
+    time.sleep(1.0 - time.time() % 1.0)  # event files of several processes sort by the second they were made in
+    while not (line := server.stdout.readline()).startswith(("-", "0", "1", "2")):  # tables of a run that was done
+        pass
+    return int(line)
+
+
+@pytest.mark.usefixtures("plain")
+def test_a_run_killed_at_any_moments_ends_as_if_it_had_not_been(
+    experiment: Path, run: Path, server: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    output = tmp_path / "runs" / "run"
+    output.parent.mkdir()
+    draw, arguments = random.Random(0), command(experiment, output)
+    for _ in range(2):
+        assert killed(server, arguments, output, draw.uniform(0.0, 0.1)) == -signal.SIGKILL
+        assert not output.exists()
+        assert {path.name.split(".out")[0] for path in training_of(output).iterdir()} <= {
+            *("config.yaml", CHECKPOINT, f".{CHECKPOINT}", "events", "manifest.json"),
+        }
+        assert load_checkpoint(training_of(output))["trainer"]["epoch"] < EPOCHS
+        arguments = command(experiment, output, "--resume")
+    assert main(arguments) == 0
+    assert_as_uninterrupted(output, run)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.usefixtures("plain")
+def test_a_signal_ends_a_training_with_a_line_on_how_to_go_on(
+    experiment: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], number: int
+) -> None:
+    output = tmp_path / "runs" / "run"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        stopped_in(7, monkeypatch, interrupt(number))
+        assert main(command(experiment, output)) == 1
+    printed = capsys.readouterr()
+    assert printed.err == "torchid: interrupted in epoch 6; --resume goes on after epoch 6\n"
+    assert printed.out == ""
+    assert not output.exists()
+    assert main(command(experiment, output, "--resume")) == 0
+    assert_as_uninterrupted(output, run)
+
+
+@pytest.mark.usefixtures("plain")
+def test_what_came_after_the_last_checkpoint_is_done_again(
+    experiment: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also if a resumed training is interrupted before its first checkpoint."""
+    output, seldom = tmp_path / "runs" / "run", "estimator.training.checkpoint_seconds=1000"
+    for resume, epoch, saved in (((), 5, 0), (("--resume",), 8, 0)):
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            stopped_in(epoch, monkeypatch, interrupt())
+            assert main(command(experiment, output, seldom, *resume)) == 1
+        expected = f"torchid: interrupted in epoch {epoch - 1}; --resume goes on after epoch {saved}\n"
+        assert capsys.readouterr().err == expected
+    assert main(command(experiment, output, seldom, "--resume")) == 0
+    assert_as_uninterrupted(output, run)
+
+
+@pytest.mark.usefixtures("plain")
+def test_an_interrupt_before_the_first_checkpoint_leaves_nothing_in_the_way(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "runs" / "run"
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr("torchid.commands.training.save_checkpoint", lambda *_: signal.raise_signal(signal.SIGINT))
+        assert main(command(experiment, output)) == 1
+    assert capsys.readouterr().err == "torchid: interrupted in epoch 0; --resume goes on after epoch 0\n"
+    monkeypatch.setattr(Trainer, "finished", True)  # what matters is that it starts
+    assert main(command(experiment, output, "--resume")) == 0
+    assert "no checkpoint to go on from; training starts at the beginning" in capsys.readouterr().err
+    assert [path.name for path in output.parent.iterdir()] == ["run"]
+
+
+def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
+    experiment: Path, run: Path, output: Path, plain: None
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("torchid.commands.results.write_json", stopped)
+        assert main(command(experiment, output, "--resume")) == 1
+    assert [path.name for path in output.parent.iterdir()] == ["run.training"]
+    assert load_checkpoint(training_of(output))["trainer"]["epoch"] == EPOCHS
+    assert main(command(experiment, output, "--resume")) == 0
+    assert_as_uninterrupted(output, run)

@@ -1,0 +1,279 @@
+"""What a training refuses to go on with or to replace."""
+
+from __future__ import annotations
+
+import random
+import resource
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from refusals import files_in, refusal
+from repository import DEMO
+from trainings import (
+    EPOCHS,
+    assert_as_uninterrupted,
+    command,
+    events_in,
+    interrupt,
+    steps,
+    stopped_in,
+    training_of,
+)
+
+import torchid
+from torchid.cli import main
+from torchid.commands.training import CHECKPOINT, load_checkpoint, save_checkpoint
+from torchid.config import load_config
+from torchid.errors import InputError
+
+
+def resume_refused(experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
+    return refusal(command(experiment, output, "--resume", *more), output.parent, capsys)
+
+
+@pytest.mark.parametrize(
+    ("override", "place", "found"),
+    [
+        ("estimator.training.optimizer.lr=0.1", "estimator.training.optimizer.lr", "0.1, but the checkpoint has 0.05"),
+        ("estimator.training.epochs=30", "estimator.training.epochs", f"30, but the checkpoint has {EPOCHS}"),
+        ("sensors=full", "sensors.set", "full, but the checkpoint has joints"),
+        ("estimator.training.schedule=null", "estimator.training.schedule", "None, but the checkpoint has"),
+        ("logs.test=[]", "logs.test", "[], but the checkpoint has"),
+    ],
+)
+def test_other_settings_are_not_gone_on_with(
+    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], override: str, place: str, found: str
+) -> None:
+    line = resume_refused(experiment, output, capsys, override)
+    assert f"experiment.yaml: {place}: {found}" in line
+    assert line.endswith("accepted: the same settings")
+
+
+def test_other_logs_are_not_gone_on_with(
+    experiment: Path, output: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(experiment, other)
+    with np.load(other / "train.npz") as file:
+        fields = dict(file)
+    fields["joint_torque"] = fields["joint_torque"] * (1.0 + 1e-6)
+    np.savez(other / "train.npz", **fields)
+    shutil.move(experiment / "train.npz", tmp_path / "kept.npz")
+    try:
+        shutil.copy(other / "train.npz", experiment / "train.npz")
+        line = resume_refused(experiment, output, capsys)
+    finally:
+        shutil.move(tmp_path / "kept.npz", experiment / "train.npz")
+    assert "experiment.yaml: logs: not those of the checkpoint; accepted: the same files, unchanged" in line
+
+
+def test_a_finished_run_is_not_gone_on_with(experiment: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = resume_refused(experiment, run, capsys)
+    assert f"{run}: --resume: a finished run; accepted: an unfinished one, or overwrite=true" in line
+
+
+@pytest.mark.parametrize("name", ["least_squares", "consistent"])
+def test_what_is_done_in_one_go_is_not_gone_on_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    arguments = ["identify", str(DEMO / "quadruped.yaml"), f"estimator.name={name}", f"output={tmp_path / 'run'}"]
+    line = refusal([*arguments, "--resume"], tmp_path, capsys)
+    assert f"quadruped.yaml: --resume: {name}, which is done in one go; accepted: estimator.name: sgd" in line
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda content: b"",
+    "last byte missing": lambda content: content[:-1],
+    "one bit of a number": lambda content: _flipped(content, len(content) // 3),
+    "one bit near the start": lambda content: _flipped(content, 700),
+}
+
+
+def _flipped(content: bytes, place: int) -> bytes:
+    return content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_is_not_gone_on_with(
+    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], damage: str
+) -> None:
+    path = training_of(output) / CHECKPOINT
+    path.write_bytes(DAMAGES[damage](path.read_bytes()))
+    line = resume_refused(experiment, output, capsys)
+    assert f"{path}: file: not readable (" in line
+    assert line.endswith("accepted: a checkpoint that torchid wrote")
+
+
+@pytest.mark.parametrize("state", [{"trainer": {}}, [1, 2]], ids=str)
+def test_a_file_of_tensors_that_is_no_checkpoint_is_not_gone_on_with(
+    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], state: Any
+) -> None:
+    torch.save(state, training_of(output) / CHECKPOINT)
+    assert f"{training_of(output) / CHECKPOINT}: file: " in resume_refused(experiment, output, capsys)
+
+
+@pytest.mark.parametrize("epoch", [10**9, -5])
+def test_an_epoch_edited_by_hand_is_not_gone_on_from(
+    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str], epoch: int
+) -> None:
+    folder = training_of(output)
+    state = load_checkpoint(folder)
+    state["trainer"]["epoch"] = epoch
+    save_checkpoint(folder, state)
+    line = resume_refused(experiment, output, capsys)
+    assert f"{folder / CHECKPOINT}: file: " in line
+    assert f"epoch: found {epoch}; accepted: a whole number from 0 to {EPOCHS}" in line
+    torch.save(state, folder / CHECKPOINT)
+    assert "not the values that were written" in resume_refused(experiment, output, capsys)
+
+
+def test_a_full_disk_is_told_as_such_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path, {"epoch": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))  # what a file may hold; longer ones fail as on a disk
+    try:
+        with pytest.raises(OSError, match="File too large") as raised:
+            save_checkpoint(tmp_path, {"epoch": 2, "x": torch.zeros(1000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert raised.value.filename == str(tmp_path / CHECKPOINT)
+    assert load_checkpoint(tmp_path) == {"epoch": 1}
+    assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
+
+
+def test_whatever_bit_of_a_checkpoint_flips_it_is_refused_or_says_the_same(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(0)
+    numbers = torch.randn(300, generator=generator, dtype=torch.float64)
+    save_checkpoint(tmp_path, {"config": "a: 1", "trainer": {"x": numbers, "epoch": 3}})
+    path, draw = tmp_path / CHECKPOINT, random.Random(0)
+    content, read = path.read_bytes(), 0
+    for _ in range(300):
+        place = draw.randrange(len(content))
+        path.write_bytes(content[:place] + bytes([content[place] ^ (1 << draw.randrange(8))]) + content[place + 1 :])
+        with suppress(InputError):
+            state = load_checkpoint(tmp_path)
+            read += 1
+            assert torch.equal(state["trainer"]["x"], numbers)
+            assert (state["config"], state["trainer"]["epoch"]) == ("a: 1", 3)
+    assert read < 250, "some bits are only padding, but not most"
+
+
+# ----------------------------------------------------------------------------------------------------- what is replaced
+
+
+@pytest.mark.usefixtures("plain")
+def test_a_run_stays_as_it_is_until_the_one_that_replaces_it_is_complete(
+    experiment: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "runs" / "run"
+    shutil.copytree(run, output)
+    before = files_in(output)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        stopped_in(4, monkeypatch, interrupt())
+        assert main(command(experiment, output, "overwrite=true")) == 1
+    assert files_in(output) == before
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr("json.dumps", _full_disk)
+        assert main(command(experiment, output, "overwrite=true", "--resume")) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert files_in(output) == before
+    assert sorted(path.name for path in output.parent.iterdir()) == ["run", "run.training"]
+    refusal(command(experiment, output, "--resume"), output.parent, capsys)
+    assert main(command(experiment, output, "overwrite=true", "--resume")) == 0
+    assert_as_uninterrupted(output, run)
+
+
+def _full_disk(*_: object, **__: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_an_unfinished_training_is_not_overwritten_unless_asked_for(
+    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal(command(experiment, output), output.parent, capsys)
+    assert f"{training_of(output)}: output: an unfinished training; accepted: --resume, overwrite=true" in line
+
+
+@pytest.mark.usefixtures("plain")
+def test_an_unfinished_training_is_begun_anew_if_asked_for(
+    experiment: Path, output: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = ("overwrite=true", "estimator.training.epochs=1", "estimator.training.seed=3")
+    assert main(command(experiment, output, *more)) == 0
+    assert steps(events_in(output), "loss/data") == [1], "nothing of the old curves"
+    assert [path.name for path in output.parent.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("more", [(), ("overwrite=true",), ("--resume",)], ids=["plain", "overwrite", "resume"])
+def test_a_folder_of_that_name_that_is_no_training_stays(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...]
+) -> None:
+    output = tmp_path / "runs" / "run"
+    training_of(output).mkdir(parents=True)
+    (training_of(output) / "notes.txt").write_text("mine")
+    assert "holds notes.txt, and no manifest.json that says that torchid wrote a training" in refusal(
+        command(experiment, output, *more), tmp_path, capsys
+    )
+
+
+@pytest.mark.usefixtures("plain")
+def test_a_descent_that_diverges_ends_in_one_line_and_is_not_in_the_way_of_the_next(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its curves stay until then."""
+    output = tmp_path / "runs" / "run"
+    assert main(command(experiment, output, "estimator.training.optimizer.lr=1e9")) == 2
+    printed = capsys.readouterr()
+    (line,) = printed.err.splitlines()
+    assert line.startswith("torchid: estimator: training: a loss of ")
+    assert line.endswith("; accepted: a smaller lr")
+    assert printed.out == ""
+    assert [path.name for path in output.parent.iterdir()] == ["run.training"]
+    assert {path.name.split(".")[0] for path in training_of(output).iterdir()} == {"config", "events", "manifest"}
+    assert main(command(experiment, output, "estimator.training.epochs=1")) == 0
+    assert [path.name for path in output.parent.iterdir()] == ["run"]
+
+
+def test_nothing_to_learn_is_noticed_before_anything_is_written(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bodies = ", ".join(torchid.load_robot(DEMO / "quadruped.urdf").body_names)
+    line = refusal(command(experiment, tmp_path / "run", f"estimator.frozen=[{bodies}]"), tmp_path, capsys)
+    assert "experiment.yaml: sensors: no parameter is in reach of them" in line
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("estimator.training.optimizer.name=Adm", "estimator.training.optimizer: unknown name 'Adm'; accepted: Adam, "),
+        ("estimator.training.optimizer.rate=1", "estimator.training.optimizer Adam: "),
+        ("estimator.training.schedule.T_min=3", "estimator.training.schedule CosineAnnealingLR: "),
+        ("estimator.frozen=[trunc]", "estimator.frozen: unknown name 'trunc'; accepted: trunk"),
+    ],
+)
+def test_a_slip_in_the_settings_of_a_descent_is_named_before_anything_is_written(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], override: str, expected: str
+) -> None:
+    line = refusal(command(experiment, tmp_path / "run", override), tmp_path, capsys)
+    assert f"experiment.yaml: {expected}" in line
+
+
+@pytest.mark.usefixtures("plain")
+def test_overrides_may_come_before_and_after_options_and_strangers_are_refused(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As they stand in `torchid identify FILE --resume overwrite=true`, where argparse takes them for strangers."""
+    place, once = f"output={tmp_path / 'run'}", "estimator.training.epochs=1"
+    assert main(["identify", str(experiment / "experiment.yaml"), once, "--resume", place, "--debug"]) == 0
+    assert load_config(tmp_path / "run" / "config.yaml").estimator.training.epochs == 1
+    for stranger in (["identify", "a.yaml", "--resume", "--hurry"], ["evaluate", "run", "--log", "a.npz", "b=1"]):
+        with pytest.raises(SystemExit) as raised:
+            main(stranger)
+        assert raised.value.code == 2
+        assert f"unrecognized arguments: {stranger[-1]}" in capsys.readouterr().err
