@@ -240,7 +240,7 @@ def test_the_command_names_sensors_that_read_another_offset_in_the_air_or_nothin
         "preprocessing": {"cutoff_hz": 10.0, "sample_rate_hz": 200.0},
         "sensors": {"set": "contacts", "offsets": {"contact_force": "log", "contact_moment": "log"}, "noise": noise},
         "estimator": {"name": "least_squares", "ridge": 1e-6},
-        "output": "run",
+        "output": str(tmp_path / "run"),
     }
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(experiment))
     assert main(["identify", str(tmp_path / "experiment.yaml")]) == 0
