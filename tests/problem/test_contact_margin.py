@@ -39,7 +39,12 @@ def slipping(folder: Path, slip: float) -> tuple[Path, Array]:
     log.joint_torque[near] += 20.0
     write_log(log, folder / "steps.h5")
     contacts = [{"frame": foot, "type": "point"} for foot in FEET]
-    settings = {"robot": {"urdf": str(SOLO12)}, "contacts": contacts, "sensors": "joints", "output": str(folder / "run")}
+    settings = {
+        "robot": {"urdf": str(SOLO12)},
+        "contacts": contacts,
+        "sensors": "joints",
+        "output": str(folder / "run"),
+    }
     (folder / "experiment.yaml").write_text(yaml.safe_dump(settings | {"logs": {"train": ["steps.h5"]}}))
     return folder / "experiment.yaml", true_parameters(oracle, robot).ravel()
 

@@ -104,8 +104,8 @@ class _Program:
         """A."""
         blocks = []
         for A, columns in self.rows:
-            place = np.repeat(np.arange(len(A)), len(columns)), np.tile(columns, len(A))
-            blocks.append(sparse.coo_matrix((A.ravel(), place), (len(A), len(self.q))))
+            index = np.repeat(np.arange(len(A)), len(columns)), np.tile(columns, len(A))
+            blocks.append(sparse.coo_matrix((A.ravel(), index), (len(A), len(self.q))))
         A = sparse.csc_matrix(sparse.vstack(blocks))
         A.eliminate_zeros()  # a factorization would keep them, and take two to six times as long
         return A

@@ -144,17 +144,17 @@ def _summary(
 ) -> NoiseSummary:
     deviation = _rounded(rows.reference_std * np.sqrt(free.variance))
     groups = []
-    for place, name in enumerate(rows.groups):
-        determined = bool(free.estimated[place])
-        origin = "stated" if name in tied else _origin(free, place)
+    for index, name in enumerate(rows.groups):
+        determined = bool(free.estimated[index])
+        origin = "stated" if name in tied else _origin(free, index)
         unit = "N" if "force" in name else "N m"
         groups.append(
             GroupNoise(
                 group=name,
                 unit=unit,
                 origin=origin,
-                used=float(used[place]),
-                residual=float(deviation[place]) if determined else None,
+                used=float(used[index]),
+                residual=float(deviation[index]) if determined else None,
             )
         )
     noise = noise_of_groups(std_by_group(guess) | {one.group: one.used for one in groups})
@@ -168,10 +168,10 @@ def _summary(
     return NoiseSummary(noise, groups, _suggested(guess, tied, known), passes)
 
 
-def _origin(components: GroupVariances, place: int) -> str:
-    if not components.estimated[place]:
+def _origin(components: GroupVariances, index: int) -> str:
+    if not components.estimated[index]:
         return "assumed"
-    return "at most" if components.upper_bound[place] else "confounded" if components.confounded[place] else "estimated"
+    return "at most" if components.upper_bound[index] else "confounded" if components.confounded[index] else "estimated"
 
 
 def _suggested(

@@ -211,10 +211,10 @@ class Reweighting:
         """Scale of the residuals of this pass, from the median of their size; within a bin of it they count as even."""
         counts = np.cumsum(self._histogram)
         half = 0.5 * counts[-1]
-        place = int(np.searchsorted(counts, half))
-        inside = (half - (counts[place - 1] if place else 0.0)) / max(self._histogram[place], 1.0)
+        index = int(np.searchsorted(counts, half))
+        inside = (half - (counts[index - 1] if index else 0.0)) / max(self._histogram[index], 1.0)
         low, high = _DECADES
-        return float(self.scale * 10.0 ** (low + (high - low) * (place + inside) / _BINS) / _NORMAL)
+        return float(self.scale * 10.0 ** (low + (high - low) * (index + inside) / _BINS) / _NORMAL)
 
     @property
     def mean_weight(self) -> float:

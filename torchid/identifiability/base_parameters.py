@@ -159,8 +159,8 @@ def format_base_parameters(base: BaseParameters, body_names: Sequence[str]) -> l
     names = [f"{name}[{body}]" for body in body_names for name in PARAMETERS]
     lines = []
     for kept, row in zip(base.kept, base.combination, strict=True):
-        others = [place for place in np.flatnonzero(row) if place != kept]
-        lines.append("".join([names[kept], *(_term(row[place], names[place]) for place in others)]))
+        others = [index for index in np.flatnonzero(row) if index != kept]
+        lines.append("".join([names[kept], *(_term(row[index], names[index]) for index in others)]))
     return lines
 
 

@@ -237,9 +237,9 @@ def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Seq
         ("wrench in a limb", limbs, information.limbs),
         ("contact wrench", frames, information.wrenches),
     ):
-        for place, H in lost.items():
+        for index, H in lost.items():
             gone = everything - _gain(information.total - H)
-            out.append(SensorContribution(names[place], gone.bits, gone.determined, kind))
+            out.append(SensorContribution(names[index], gone.bits, gone.determined, kind))
     return sorted(out, key=lambda sensor: -sensor.bits)
 
 

@@ -70,7 +70,7 @@ class SensorInformation:
         """The same with every matrix changed by a linear map."""
         return SensorInformation(
             change(self.total),
-            *({place: change(H) for place, H in of.items()} for of in (self.torques, self.limbs, self.wrenches)),
+            *({index: change(H) for index, H in of.items()} for of in (self.torques, self.limbs, self.wrenches)),
         )
 
     def marginal(self, unknown: Sequence[int]) -> SensorInformation:
@@ -113,18 +113,18 @@ def sensor_information(
         total[0] += rows_information(K, weight)
         lost = (reading_directions(torques, W) @ K).transpose(0, 1)  # (joints, B, columns)
         total[1 : 1 + len(joints)].baddbmm_(lost.mT, lost, alpha=weight)
-        for place, limb in enumerate(limbs, start=1 + len(joints)):
+        for index, limb in enumerate(limbs, start=1 + len(joints)):
             C = units[(base + n + 6 * limb + np.flatnonzero(in_limbs[limb])).tolist()]
-            total[place] += rows_information(_span(C.expand(len(samples), *C.shape), W) @ K, weight)
+            total[index] += rows_information(_span(C.expand(len(samples), *C.shape), W) @ K, weight)
         for contact, H in _air_information(builder, samples, count):
             total[0] += weight * H
             total[first + contacts.index(contact)] += weight * H
         if any(state[contact] for contact in contacts):
             J = builder.contact_jacobian(samples.to(builder.device))
-            for place, contact in enumerate(contacts, start=first):
+            for index, contact in enumerate(contacts, start=first):
                 if state[contact]:
                     C = J[:, contact, np.flatnonzero(components[contact]).tolist()]
-                    total[place] += rows_information(_span(C, W) @ K, weight)
+                    total[index] += rows_information(_span(C, W) @ K, weight)
         if done is not None:
             done(len(samples))
     information = total.cpu().numpy()
@@ -140,7 +140,7 @@ def add_information(parts: Sequence[SensorInformation]) -> SensorInformation:
     """Of logs together that have no unknown in common but the columns."""
 
     def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
-        return {place: np.asarray(sum(one[place] for one in matrices)) for place in matrices[0]}
+        return {index: np.asarray(sum(one[index] for one in matrices)) for index in matrices[0]}
 
     return SensorInformation(
         np.asarray(sum(one.total for one in parts)),
@@ -208,11 +208,11 @@ def triangular_factor(X: Array) -> Array:
 def _air_information(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
     """Contacts, and the information (count, count) that their readings in the air hold on offsets."""
     for channel in unloaded_offset_equations(builder, samples):
-        if not channel.gated and (place := builder.extras[channel.offset].contact):
+        if not channel.gated and (index := builder.extras[channel.offset].contact):
             columns, row = channel.row(builder)
             wide = row.new_zeros(count)
             wide[list(columns)] = row[0, :-1]
-            yield place[0], torch.outer(wide, wide)
+            yield index[0], torch.outer(wide, wide)
 
 
 def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, ContactState, float]]:

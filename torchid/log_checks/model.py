@@ -195,8 +195,8 @@ def _projected_fit(
     rows = [*range(base), *(base + joints)]
     vectors = np.zeros((1 + len(joints), *needed.shape))
     vectors[0] = needed
-    for place, joint in enumerate(joints):
-        vectors[1 + place, :, base + joint] = torque[:, joint]
+    for index, joint in enumerate(joints):
+        vectors[1 + index, :, base + joint] = torque[:, joint]
     ends = np.cumsum([len(part) for part in samples])[:-1]
     parts = np.split(vectors, ends, axis=1)
     inside = np.concatenate([null_space_part(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
@@ -218,9 +218,9 @@ def _projected_fit(
 def _with_wrenches(fit: TorqueFit, needed: FloatArray, torque: FloatArray) -> TorqueFit:
     """The fit with gains that all rows together leave open from each joint's own row, the contacts' part taken off."""
     gain, clear = fit.gain.copy(), fit.clear.copy()
-    for place in np.flatnonzero(~clear):
-        want, have = needed[:, fit.joints[place]], torque[:, fit.joints[place]]
-        gain[place] = want @ have / (have @ have)
-        left = np.linalg.norm(want - gain[place] * have)
-        clear[place] = abs(gain[place]) * np.linalg.norm(have) > CLEAR_ROW * left
+    for index in np.flatnonzero(~clear):
+        want, have = needed[:, fit.joints[index]], torque[:, fit.joints[index]]
+        gain[index] = want @ have / (have @ have)
+        left = np.linalg.norm(want - gain[index] * have)
+        clear[index] = abs(gain[index]) * np.linalg.norm(have) > CLEAR_ROW * left
     return dataclasses.replace(fit, gain=gain, clear=clear)

@@ -273,8 +273,8 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
     for part in samples:
         rows, W, equations = _whitened_rows(builder, part)
         torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
-        for place, joint in enumerate(joints):
-            torque[:, builder.tree.base_rows + joint, place] = builder.recorded_torque(part)[:, joint].numpy()
+        for index, joint in enumerate(joints):
+            torque[:, builder.tree.base_rows + joint, index] = builder.recorded_torque(part)[:, joint].numpy()
         moved = np.concatenate([torque, _about(builder, part, sensors.wrench)], axis=2)
         through = np.einsum("nvr,nvk->nrk", W, moved)
         without = rows[..., -1] - through[..., : len(joints)].sum(axis=2)

@@ -188,9 +188,9 @@ class _MeasuredDataset:
             raise ValueError(f"a chunk of {stored.size} bytes for {self._size}")
         mask, data = self._item.id.read_direct_chunk(offset)
         found, held = len(data), memoryview(data)
-        for place in reversed(range(len(self._filters))):
-            kind = self._filters[place]
-            if mask >> place & 1:
+        for index in reversed(range(len(self._filters))):
+            kind = self._filters[index]
+            if mask >> index & 1:
                 continue
             if kind == _FLETCHER32:
                 found, held = found - _SUM, held[:-_SUM]

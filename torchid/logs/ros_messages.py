@@ -272,8 +272,8 @@ class TopicMessages:
             TorchidWarning: messages come twice.
         """
         if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.other_joints:
-            place, (name, *_) = "logs.topics.joint_states.joints", self._decoder.names
-            raise UnknownNameError(current_file(), place, name, self._decoder.other_joints)
+            index, (name, *_) = "logs.topics.joint_states.joints", self._decoder.names
+            raise UnknownNameError(current_file(), index, name, self._decoder.other_joints)
         if not self._stamps:
             raise FieldError(self.topic, "no messages", "at least one")
         stamps: Stamps = np.array(self._stamps, dtype=np.int64)

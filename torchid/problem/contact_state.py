@@ -160,8 +160,8 @@ class ContactStateLayouts:
         coupled = tuple(joint for joint in measured if joint in moving)
         bodies = tuple(self._contact_body(body, members, coupled) for body, members in touching.items())
         moved = sorted(
-            (body, place, ratio)
-            for place, joint in enumerate(coupled)
+            (body, index, ratio)
+            for index, joint in enumerate(coupled)
             for body, ratio in self.columns.joint_rows[joint].moved
         )
         nodes_below, starts = self._nodes_below([body for body, _, _ in moved]), self.columns.layout.starts
@@ -203,7 +203,7 @@ class ContactStateLayouts:
         _, values, Vh = np.linalg.svd(np.concatenate(unmeasured), full_matrices=False)
         span = Vh[is_significant(values, KINEMATIC_TOLERANCE)]
         above = set(self.columns.joints_above(body))
-        joints = tuple(place for place, joint in enumerate(coupled) if joint in above)
+        joints = tuple(index for index, joint in enumerate(coupled) if joint in above)
         return ContactBody(body, self._tensor(span), self._tensor(np.concatenate(measured)), tuple(components), joints)
 
     def _tensor(self, values: Array) -> Tensor:

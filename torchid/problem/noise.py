@@ -246,9 +246,9 @@ class VarianceComponentEstimator:
         """Tie the variances of some groups together: one factor for all of them."""
         self.rows = rows
         count = len(rows.groups)
-        kept = [place for place, name in enumerate(rows.groups) if name in tied]
-        free = [place for place in range(count) if place not in kept]
-        blocks = [kept, *([place] for place in free)] if kept else [[place] for place in free]
+        kept = [index for index, name in enumerate(rows.groups) if name in tied]
+        free = [index for index in range(count) if index not in kept]
+        blocks = [kept, *([index] for index in free)] if kept else [[index] for index in free]
         self._blocks = np.zeros((count, len(blocks)))  # (G, unknown variances)
         for number, block in enumerate(blocks):
             self._blocks[block, number] = 1.0

@@ -300,7 +300,7 @@ class RowBuilder(nn.Module):
         X = workspace.zeros("projected", W, len(layout.support) + 1, *W.shape[1:])
         torch.sum(W * f[:, None], dim=0, out=X[-1])
         moved = {body: index for index, (body, _, _) in enumerate(layout.moved)}
-        own = W[self._index(tree.base_rows + place for _, place, _ in layout.moved)]
+        own = W[self._index(tree.base_rows + position for _, position, _ in layout.moved)]
         own *= own.new_tensor([ratio for _, _, ratio in layout.moved])[:, None, None]
         velocity = dynamics.joints.velocity[self._index(moved)][:, None]
         friction = X[len(inertial) : len(inertial) + 2 * len(moved)].unflatten(0, (len(moved), 2))
@@ -342,8 +342,8 @@ class RowBuilder(nn.Module):
         both = dynamics.wrenches.new_zeros(sum(sizes), len(layout.row_std), samples)
         starts = [0, sizes[0]]
         for contact in layout.contact_bodies:
-            joints = [layout.coupled_joints[place] for place in contact.joints]
-            columns = [*range(base_rows), *(base_rows + place for place in contact.joints)]
+            joints = [layout.coupled_joints[index] for index in contact.joints]
+            columns = [*range(base_rows), *(base_rows + index for index in contact.joints)]
             for kind, wrenches in enumerate((contact.unmeasured, contact.measured)):
                 if len(wrenches):
                     at_base = wrenches_at_base(dynamics.states, contact.body, wrenches)

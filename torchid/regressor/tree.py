@@ -128,7 +128,7 @@ class KinematicTree(nn.Module):
         self.subtree_end = [body + int(is_ancestor[:, body].sum()) for body in range(count)]
         is_ancestor[:, 0] = 0.0
         by_depth = np.argsort(depth, kind="stable")
-        place = np.argsort(by_depth)
+        position = np.argsort(by_depth)
         self.level_sizes = np.bincount(depth).tolist()
 
         moving = np.arange(count) > 0
@@ -144,8 +144,8 @@ class KinematicTree(nn.Module):
         level_start = np.repeat(np.cumsum([0, 0, *self.level_sizes[:-1]])[:-1], self.level_sizes)
         self._register("parent", parent)
         self._register("by_depth", by_depth)
-        self._register("depth_first", place)
-        self._register("place_above", place[parent[by_depth]] - level_start)
+        self._register("depth_first", position)
+        self._register("place_above", position[parent[by_depth]] - level_start)
 
     def _register(self, name: str, value: np.ndarray) -> None:
         dtype = torch.int64 if value.dtype.kind == "i" else torch.float64

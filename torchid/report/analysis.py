@@ -148,8 +148,8 @@ def sets_table(parts: Sequence[PartPlan]) -> Table:
     """The cheapest sets of every part of the robot, most informative first."""
     table = _table("Smallest sets, most informative first", "contacts", "minimal sets", "bits", "sensors")
     for part in parts:
-        for place, (bits, chosen) in enumerate(part.ranked[:_MOST]):
-            first = place == 0
+        for index, (bits, chosen) in enumerate(part.ranked[:_MOST]):
+            first = index == 0
             count = "" if not first else "not counted" if part.sets is None else str(len(part.sets))
             table.add_row(Text(", ".join(part.frames) if first else ""), count, f"{bits:.1f}", Text(join_names(chosen)))
         if len(part.ranked) > _MOST:
@@ -231,8 +231,8 @@ def removal_table(plan: SensorPlan) -> Table:
 
 def _table(title: str, *headings: str) -> Table:
     table = Table(title=title, title_justify="left")
-    for place, heading in enumerate(headings):
-        table.add_column(heading, overflow="fold", justify="left" if place == 0 or heading == "sensors" else "right")
+    for index, heading in enumerate(headings):
+        table.add_column(heading, overflow="fold", justify="left" if index == 0 or heading == "sensors" else "right")
     return table
 
 
@@ -292,7 +292,7 @@ def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
     """One panel per group of rows, with the sensor sets side by side on a logarithmic scale."""
     figure = Figure(figsize=(2.6 * len(ROW_GROUPS) + 0.6, 3.8), layout="constrained")
     axes = figure.subplots(1, len(ROW_GROUPS))
-    place = np.arange(len(sets))
+    index = np.arange(len(sets))
     for axis, (group, label) in zip(axes, ROW_GROUPS.items(), strict=True):
         measured = [None if found.measured is None else found.measured.rms[group] for found in sets.values()]
         for shift, name, (marker, color), heights in (
@@ -301,12 +301,12 @@ def accuracy_figure(sets: Mapping[str, SetAccuracy]) -> Figure:
             (0.15, "measured on the test logs", _MEASURED, measured),
         ):
             known = [np.nan if height is None else height for height in heights]
-            axis.plot(place + shift, known, marker, color=color, markersize=7, label=name)
+            axis.plot(index + shift, known, marker, color=color, markersize=7, label=name)
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
         axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         axis.margins(x=0.3 / max(len(sets) - 1, 1), y=0.15)
-        axis.set_xticks(place, list(sets), rotation=40, ha="right")
+        axis.set_xticks(index, list(sets), rotation=40, ha="right")
         axis.set_title(group_name(group), loc="left", fontsize=9)
         axis.set_ylabel(f"rms error {label[label.index('[') :]}")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=3)

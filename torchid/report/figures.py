@@ -108,15 +108,15 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
     axes = figure.subplots(1, len(sets), sharey=True, squeeze=False)[0]
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
-        place = np.arange(len(groups))
+        index = np.arange(len(groups))
         for shift, metrics, color, label in (
             (-0.2, nominal, _NOMINAL, "URDF"),
             (0.2, identified, _IDENTIFIED, "identified"),
         ):
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
-            bars = axis.bar(place + shift, heights, 0.38, color=color, label=label)
+            bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
             axis.bar_label(bars, fmt="%.3g", fontsize=8)
-        axis.set_xticks(place, [group_name(group).replace(" ", "\n") for group in groups])
+        axis.set_xticks(index, [group_name(group).replace(" ", "\n") for group in groups])
         axis.set_title(name, loc="left")
     axes[0].set_ylabel("rms of error / rms of measured [%]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
@@ -128,19 +128,19 @@ def parameter_figure(body_names: Sequence[str], nominal: Array, identified: Arra
     """Mass, first moment and inertia of every body with mass; bars on the masses the data determine: standard error."""
     shown = np.flatnonzero(nominal[:, parameters.INERTIAL].any(axis=1))
     nominal, identified, standard_error = nominal[shown], identified[shown], standard_error[shown]
-    place = np.arange(len(shown))
+    index = np.arange(len(shown))
     figure = Figure(figsize=(9.0, 0.24 * len(shown) + 1.4), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     mass = parameters.MASS
     error = np.nan_to_num(standard_error[:, mass])
     for axis, quantity, unit in zip(axes, _QUANTITIES, ("kg", "kg m", "kg m²"), strict=True):
         before, after = (_QUANTITIES[quantity](phi) for phi in (nominal, identified))
-        axis.barh(place - 0.2, before, 0.38, color=_NOMINAL, label="URDF")
-        axis.barh(place + 0.2, after, 0.38, color=_IDENTIFIED, label="identified")
+        axis.barh(index - 0.2, before, 0.38, color=_NOMINAL, label="URDF")
+        axis.barh(index + 0.2, after, 0.38, color=_IDENTIFIED, label="identified")
         if unit == "kg":
-            axis.errorbar(after, place + 0.2, xerr=error, fmt="none", ecolor="black", elinewidth=0.8)
+            axis.errorbar(after, index + 0.2, xerr=error, fmt="none", ecolor="black", elinewidth=0.8)
         axis.set_xlabel(f"{quantity} [{unit}]")
-    axes[0].set_yticks(place, [body_names[int(body)] for body in shown], fontsize=7)
+    axes[0].set_yticks(index, [body_names[int(body)] for body in shown], fontsize=7)
     axes[0].set_ylim(len(shown) - 0.4, -0.6)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     return figure
@@ -211,11 +211,11 @@ def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str]
     for number, log in enumerate(logs):
         points = [x for x in extras if x.log == log]
         below = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
-        values, place = [x.value for x in points], [rows.index(x.extra.label) + below for x in points]
+        values, index = [x.value for x in points], [rows.index(x.extra.label) + below for x in points]
         error = [min(1.96 * x.standard_error, reach) if math.isfinite(x.standard_error) else reach for x in points]
-        axis.errorbar(values, place, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
+        axis.errorbar(values, index, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
         fill = [colors[log] if x.separable else "white" for x in points]
-        axis.scatter(values, place, c=fill, edgecolors=colors[log], s=22, zorder=3)
+        axis.scatter(values, index, c=fill, edgecolors=colors[log], s=22, zorder=3)
     axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
     axis.set_yticks(range(len(rows)), rows, fontsize=8)
     axis.set_ylim(len(rows) - 0.5, -0.5)
@@ -337,12 +337,12 @@ def _contact_rows(robot: Robot, contacts: Sequence[Contact], places: Sequence[Pl
 
 
 def _draw_joint(
-    axes: Axes, joint: BodyJoint, parent: Place, place: Place, readings: Collection[str], constrained: Collection[str]
+    axes: Axes, joint: BodyJoint, parent: Place, index: Place, readings: Collection[str], constrained: Collection[str]
 ) -> None:
     name = joint.name if joint.mimic is None else joint.mimic.master
     weld = [k for k in WRENCH_COMPONENTS if f"{name}.{k}" in readings] if joint.kind == "fixed" else []
     loaded, measured = name in constrained, bool(weld) or name in readings
-    (x, y), turn = place, parent[1] + 0.5
+    (x, y), turn = index, parent[1] + 0.5
     style: dict[str, Any] = {"color": _LOADED if loaded else _PLAIN, "linewidth": 2.2 if loaded else 1.4, "zorder": 0}
     axes.plot([parent[0], parent[0], x, x], [parent[1], turn, turn, y], **style)
     color, part = _LIMB if weld else _TORQUE, 0 < len(weld) < len(WRENCH_COMPONENTS)
@@ -351,21 +351,21 @@ def _draw_joint(
     axes.plot(x, y, "h" if joint.kind == "fixed" else "o", markersize=8 if joint.kind == "fixed" else 7, **style)
     label = joint.name if joint.mimic is None else f"{joint.name} (follows)"
     label += f": {', '.join(weld)}" if part else ""
-    _label(axes, label, place, measured, fontsize=6.5, color="black" if measured or loaded else "0.45")
+    _label(axes, label, index, measured, fontsize=6.5, color="black" if measured or loaded else "0.45")
 
 
-def _draw_contact(axes: Axes, contact: Contact, body: Place, place: Place, measured: Sequence[str]) -> None:
-    axes.plot([place[0], place[0]], [body[1], place[1]], color=_LOADED, linewidth=2.2, zorder=0)
+def _draw_contact(axes: Axes, contact: Contact, body: Place, index: Place, measured: Sequence[str]) -> None:
+    axes.plot([index[0], index[0]], [body[1], index[1]], color=_LOADED, linewidth=2.2, zorder=0)
     part = bool(measured) and not set(measured) >= set(contact.component_names)
     color, face = (_WRENCH, _WRENCH) if measured else ("0.5", "white")
-    axes.plot(*place, "D", color=color, markerfacecolor=face, fillstyle="left" if part else "full", markersize=8)
+    axes.plot(*index, "D", color=color, markerfacecolor=face, fillstyle="left" if part else "full", markersize=8)
     components = f": {', '.join(measured)}" if part else ""
-    _label(axes, f"{contact.frame} ({contact.kind}){components}", place, bool(measured), fontsize=7)
+    _label(axes, f"{contact.frame} ({contact.kind}){components}", index, bool(measured), fontsize=7)
 
 
-def _label(axes: Axes, text: str, place: Place, bold: bool = False, **style: Any) -> None:
+def _label(axes: Axes, text: str, index: Place, bold: bool = False, **style: Any) -> None:
     weight = "bold" if bold else "normal"
-    axes.annotate(text, place, (8, 0), textcoords="offset points", va="center", fontweight=weight, **style)
+    axes.annotate(text, index, (8, 0), textcoords="offset points", va="center", fontweight=weight, **style)
 
 
 def _legend(welds: bool) -> list[Line2D]:

@@ -76,15 +76,15 @@ def _panel(axes: Axes, checked: Checked) -> None:
     places = {channel: -row for row, channel in enumerate(rows)}
     every = slice(None, None, max(1, len(time) // _POINTS))
     lines = [
-        np.column_stack([time[every], _scaled(values)[every] + place])
-        for (values, place) in zip(rows.values(), places.values(), strict=True)
+        np.column_stack([time[every], _scaled(values)[every] + index])
+        for (values, index) in zip(rows.values(), places.values(), strict=True)
     ]
     axes.add_collection(LineCollection(lines, colors="0.35", linewidths=0.6))
     for finding in _marked(checked):
         for span in finding.spans:
             inside = [
-                place
-                for (field, name), place in places.items()
+                index
+                for (field, name), index in places.items()
                 if finding.field in (field, "time") and span.channel in ("", name)
             ]
             _mark(axes, float(time[span.first]), float(time[span.last]), inside, time[-1], finding.severity)
@@ -101,9 +101,9 @@ def _panel(axes: Axes, checked: Checked) -> None:
 def _mark(axes: Axes, start: float, end: float, places: Sequence[int], lasts: float, severity: str) -> None:
     width = max(end - start, _NARROW * lasts)
     middle = 0.5 * (start + end)
-    for place in places:
+    for index in places:
         axes.broken_barh(
-            [(middle - 0.5 * width, width)], (place - 0.5, 1.0), color=COLORS[severity], alpha=0.6, linewidth=0
+            [(middle - 0.5 * width, width)], (index - 0.5, 1.0), color=COLORS[severity], alpha=0.6, linewidth=0
         )
 
 

@@ -128,8 +128,8 @@ class RunEvents:
         for tag, value in scalars.items():
             self._writer.add_scalar(tag, value, step)
         self._writer.add_text("verdicts", _preformatted(table), step)
-        for place, value in enumerate(estimate.singular_values):
-            self._writer.add_scalar("identifiability/singular_value", value, place)
+        for index, value in enumerate(estimate.singular_values):
+            self._writer.add_scalar("identifiability/singular_value", value, index)
 
     def write_summary(
         self,

@@ -82,14 +82,14 @@ def candidates(
     offered = [
         Candidate(name, "joint_torque", 1.0, dofs=(j,)) for j, name in enumerate(robot.joint_names) if name in chosen
     ]
-    for place, contact in enumerate(contacts):
+    for index, contact in enumerate(contacts):
         if per == "device":
             components = tuple(contact.components)
-            offered.append(Candidate(contact.frame, "contact", 1.0, contact=place, components=components))
+            offered.append(Candidate(contact.frame, "contact", 1.0, contact=index, components=components))
         elif per == "axis":
             names = zip(contact.component_names, contact.components, strict=True)
             offered += [
-                Candidate(f"{contact.frame}.{name}", "contact", 1.0, contact=place, components=(k,))
+                Candidate(f"{contact.frame}.{name}", "contact", 1.0, contact=index, components=(k,))
                 for name, k in names
             ]
     return _priced([*offered, *_in_limbs(robot, ft_sensors, per == "axis")], costs or {})
@@ -235,23 +235,23 @@ def demands(
     J = builder.contact_jacobian(resting_samples(joint_position[None], (False,) * len(contacts)))[0].numpy()
     above = [linking.intersection(builder.columns.joints_above(body)) for body, _ in builder.frames]
     groups = dict.fromkeys(group for state in states for group in _groups(above, state))
-    joints = {group: sorted(set().union(*(above[place] for place in group)) & set(range(robot.n))) for group in groups}
+    joints = {group: sorted(set().union(*(above[index] for index in group)) & set(range(robot.n))) for group in groups}
     return [_demand(group, tuple(joints[group]), contacts, J, candidates) for group in groups]
 
 
 def _groups(above: Sequence[AbstractSet[int]], state: ContactState) -> list[tuple[int, ...]]:
     """Active contacts, grouped by shared joints among those `above` each."""
-    active = [place for place, touching in enumerate(state) if touching]
-    return [tuple(active[k] for k in group) for group in connected_groups([above[place] for place in active])]
+    active = [index for index, touching in enumerate(state) if touching]
+    return [tuple(active[k] for k in group) for group in connected_groups([above[index] for index in active])]
 
 
 def connected_groups(sets: Sequence[AbstractSet[Hashable]]) -> list[tuple[int, ...]]:
     """Places of sets that are linked by common members, ascending; an empty set is alone."""
     groups: list[tuple[list[int], set[Hashable]]] = []
-    for place, members in enumerate(sets):
+    for index, members in enumerate(sets):
         touched = [group for group in groups if group[1] & members]
         groups = [group for group in groups if not group[1] & members]
-        places = sorted([place, *(k for group in touched for k in group[0])])
+        places = sorted([index, *(k for group in touched for k in group[0])])
         groups.append((places, set(members).union(*(group[1] for group in touched))))
     return sorted(tuple(places) for places, _ in groups)
 
@@ -264,7 +264,7 @@ def _demand(
     candidates: Sequence[Candidate],
 ) -> Demand:
     """What a group demands, from the Jacobians of all contacts, (C, 6, n_rows)."""
-    rows = [(place, k) for place in group for k in contacts[place].components]
+    rows = [(index, k) for index in group for k in contacts[index].components]
     J_group = np.stack([J[row] for row in rows])
     J_group /= np.linalg.norm(J_group[:, :6])
     vectors = {}
@@ -277,5 +277,5 @@ def _demand(
         elif candidate.contact in group:
             read = [rows.index((candidate.contact, k)) for k in candidate.components]
             vectors[candidate] = np.eye(len(rows))[:, read]
-    frames = tuple(contacts[place].frame for place in group)
-    return Demand(group, frames, joints, tuple(place for place, _ in rows), span_basis(J_group[:, :6]), vectors)
+    frames = tuple(contacts[index].frame for index in group)
+    return Demand(group, frames, joints, tuple(index for index, _ in rows), span_basis(J_group[:, :6]), vectors)

@@ -190,15 +190,15 @@ def rank_sets(
 
     def run(places: Iterator[int]) -> list[tuple[float, int]]:
         ranked = []
-        for place in places:
-            ranked.append((-ranking.bits(sets[place]), place))
+        for index in places:
+            ranked.append((-ranking.bits(sets[index]), index))
             if done is not None:
                 done()
         return ranked
 
     workers = min(worker_count(torch.device("cpu")), max(len(sets), 1))
     ranked = sorted(chain.from_iterable(run_in_workers(range(len(sets)), run, workers)))
-    return [RankedSet(-bits, sets[place]) for bits, place in ranked]
+    return [RankedSet(-bits, sets[index]) for bits, index in ranked]
 
 
 def improve_by_exchange(

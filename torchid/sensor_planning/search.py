@@ -155,8 +155,8 @@ def demand_groups(demands: Sequence[Demand], candidates: Sequence[Candidate]) ->
     acting = [demand.vectors.keys() & set(candidates) for demand in demands]
     return [
         DemandGroup(
-            tuple(demands[place] for place in places),
-            tuple(c for c in candidates if any(c in acting[place] for place in places)),
+            tuple(demands[index] for index in places),
+            tuple(c for c in candidates if any(c in acting[index] for index in places)),
         )
         for places in connected_groups(acting)
     ]
@@ -321,10 +321,10 @@ def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.n
 def _cheapest_basis(vectors: Array, flat: np.ndarray) -> list[int]:
     """Places of independent vectors among the members (N,) bool of a flat, the first ones first."""
     basis, chosen = np.zeros((len(vectors), 0)), []
-    for place in np.flatnonzero(flat).tolist():
-        left = orthogonal_part(vectors[:, [place]], basis)
+    for index in np.flatnonzero(flat).tolist():
+        left = orthogonal_part(vectors[:, [index]], basis)
         length = np.linalg.norm(left)
         if length > TOLERANCE:
             basis = np.hstack([basis, left / length])
-            chosen.append(place)
+            chosen.append(index)
     return chosen
