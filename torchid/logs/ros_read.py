@@ -152,12 +152,12 @@ class _Bag:
         for role, topic in self.topics.by_role.items():
             if topic.topic is None:
                 continue
-            name, index = topic.topic, f"logs.topics.{role}"
+            name, field = topic.topic, f"logs.topics.{role}"
             if name not in self.channels:
-                raise UnknownNameError(current_file(), index, name, self.channels)
+                raise UnknownNameError(current_file(), field, name, self.channels)
             decoder, given = _decoder(topic), self.channels[name].type
             if given not in decoder.types:
-                raise FieldError(index, f"{name} carries {given}", " or ".join(decoder.types))
+                raise FieldError(field, f"{name} carries {given}", " or ".join(decoder.types))
             self.decoders[role], self.rows[role] = decoder, TopicMessages(name, decoder)
 
 
