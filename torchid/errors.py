@@ -15,66 +15,6 @@ from typing import Any
 _UNPLAIN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
-def is_plain(text: str) -> bool:
-    """Whether a text has neither control characters, visible or not, nor line breaks."""
-    return text.isprintable() or not any(unicodedata.category(letter) in _UNPLAIN for letter in text)
-
-
-def excerpt(text: str, longest: int = 100) -> str:
-    """The text for use in a message: control characters escaped, the middle of a long text left out."""
-    if len(text) > longest:
-        text = f"{text[: longest // 2]} ... {text[-longest // 4 :]} ({len(text)} characters)"
-    return escape(text)
-
-
-def escape(text: str, kept: str = "") -> str:
-    """The text with control characters as escapes, except for the characters in `kept`."""
-    if is_plain(text):
-        return text
-    return "".join(letter if letter in kept or is_plain(letter) else ascii(letter)[1:-1] for letter in text)
-
-
-def one_line(text: str) -> str:
-    """The text on one line, of plain characters."""
-    return escape(" ".join(text.split()))
-
-
-class EscapedStream:
-    """A stream to a terminal that escapes control characters, which could move the cursor or hide text."""
-
-    def __init__(self, stream: Any) -> None:
-        """Write to a stream, which `raw_stream` returns to code that escapes by itself."""
-        self.plain_stream = stream
-
-    def write(self, text: str) -> int:
-        """Write a text; its length."""
-        self.plain_stream.write(escape(text, "\n\t"))
-        return len(text)
-
-    def writelines(self, lines: Iterable[str]) -> None:
-        """Write texts."""
-        for line in lines:
-            self.write(line)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.plain_stream, name)
-
-
-def raw_stream(stream: Any) -> Any:
-    """The stream below an `EscapedStream`."""
-    return getattr(stream, "plain_stream", stream)
-
-
-def join_names(names: Sequence[str], most: int = 4) -> str:
-    """Names joined by commas, the first few of many."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def format_count(count: int, what: str) -> str:
-    """A number with its noun, as in "1 gap" and "3 gaps"."""
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
 class TorchidError(Exception):
     """Base of every error that torchid raises on purpose."""
 
@@ -236,3 +176,66 @@ def _nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:
         return ", ".join(close)
     shown = ", ".join(valid[:8])
     return (f"{shown}, ... ({len(valid)} names)" if len(valid) > 8 else shown) or "none"
+
+
+# ------------------------------------------------------------------------------------------------- text in messages
+
+
+def is_plain(text: str) -> bool:
+    """Whether a text has neither control characters, visible or not, nor line breaks."""
+    return text.isprintable() or not any(unicodedata.category(letter) in _UNPLAIN for letter in text)
+
+
+def excerpt(text: str, longest: int = 100) -> str:
+    """The text for use in a message: control characters escaped, the middle of a long text left out."""
+    if len(text) > longest:
+        text = f"{text[: longest // 2]} ... {text[-longest // 4 :]} ({len(text)} characters)"
+    return escape(text)
+
+
+def escape(text: str, kept: str = "") -> str:
+    """The text with control characters as escapes, except for the characters in `kept`."""
+    if is_plain(text):
+        return text
+    return "".join(letter if letter in kept or is_plain(letter) else ascii(letter)[1:-1] for letter in text)
+
+
+def one_line(text: str) -> str:
+    """The text on one line, of plain characters."""
+    return escape(" ".join(text.split()))
+
+
+class EscapedStream:
+    """A stream to a terminal that escapes control characters, which could move the cursor or hide text."""
+
+    def __init__(self, stream: Any) -> None:
+        """Write to a stream, which `raw_stream` returns to code that escapes by itself."""
+        self.plain_stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text; its length."""
+        self.plain_stream.write(escape(text, "\n\t"))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write texts."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.plain_stream, name)
+
+
+def raw_stream(stream: Any) -> Any:
+    """The stream below an `EscapedStream`."""
+    return getattr(stream, "plain_stream", stream)
+
+
+def join_names(names: Sequence[str], most: int = 4) -> str:
+    """Names joined by commas, the first few of many."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def format_count(count: int, what: str) -> str:
+    """A number with its noun, as in "1 gap" and "3 gaps"."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
