@@ -95,7 +95,7 @@ class RowBuilder(nn.Module):
     the same but for a rotation of each sample's rows, in fewer columns (see `Columns`). It shares their kernels, the
     functions of `torchid.regressor` and the null spaces of `torchid.sensing.projection`, but takes samples one contact
     state at a time, where all shapes are constant, and multiplies W^T into the bodies' wrenches without forming K.
-    `tests/test_rows_two_ways.py` compares both ways; read the other first.
+    `tests/problem/test_rows_two_ways.py` compares both ways; read the other first.
     """
 
     def __init__(
