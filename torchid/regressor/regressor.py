@@ -36,7 +36,7 @@ class Regressor(nn.Module):
 
     With `FrameJacobian` and `torchid.Projection`, the plain way to the equations of a fit. Fits take
     `torchid.RowBuilder`, which shares the functions of this package but never forms K, for speed
-    (`tests/test_rows_two_ways.py` compares both).
+    (`tests/problem/test_rows_two_ways.py` compares both).
     """
 
     def __init__(

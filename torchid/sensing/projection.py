@@ -41,7 +41,8 @@ class Projection(nn.Module):
     something. Where an active contact loses rank (a straight knee), the null space jumps and has no derivative.
 
     Takes any K, dense and with any sensors, and is differentiable. Fits take `torchid.RowBuilder`, which uses the same
-    null spaces but multiplies V_x^T into the bodies' wrenches, for speed (`tests/test_rows_two_ways.py` compares both).
+    null spaces but multiplies V_x^T into the bodies' wrenches, for speed
+    (`tests/problem/test_rows_two_ways.py` compares both).
     """
 
     def __init__(
