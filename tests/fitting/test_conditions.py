@@ -24,7 +24,7 @@ from torchid.config.estimator import EstimatorConfig
 from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError
 from torchid.estimators import Conditions, violations
 from torchid.estimators.conditions import mirror_matrix
-from torchid.fitting.fit import batch_estimator, conditions_from
+from torchid.fitting.experiment import batch_estimator, conditions_from
 from torchid.parameters import PARAMETERS
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.linear import parameter_scale

@@ -18,7 +18,7 @@ from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, warn
-from torchid.estimators import Conditions, Estimate, LeastSquares, violations
+from torchid.estimators import Conditions, Estimate, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
 from torchid.fitting.experiment import Experiment, set_up, with_noise
@@ -230,10 +230,10 @@ def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
     samples = Counter[ContactState]()
     for part in parts:
         samples[part.state] += part.samples
-    estimator, out = LeastSquares(fitter.estimator.ridge, rank_tolerance=fitter.estimator.rank_tolerance), {}
+    out = {}
     for state, _ in samples.most_common():
         problem = fitter.assemble([part for part in parts if part.state == state]).problem
-        out[state_name(fitter.builder.contacts, state)] = estimator.solve(problem)
+        out[state_name(fitter.builder.contacts, state)] = fitter.least_squares.solve(problem)
     return out
 
 

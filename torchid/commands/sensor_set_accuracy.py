@@ -10,8 +10,7 @@ from rich.progress import Progress
 from torchid.commands.plausibility import require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration
-from torchid.fitting.experiment import Scene
-from torchid.fitting.fit import batch_estimator
+from torchid.fitting.experiment import Scene, batch_estimator
 from torchid.identifiability.information import error_directions, expected_errors
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples, assemble, compress_parts

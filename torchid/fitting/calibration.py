@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from torchid.errors import ConfoundedWarning, LogError, join_names, warn
-from torchid.estimators import LeastSquares
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import RobustLoss, fit_extras_robustly
 from torchid.identifiability.confounding import ExtraEstimate, disagreements, estimate_extras
@@ -195,7 +194,7 @@ def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:
             message = f"{log}: {named} read exactly 0 in the air, as if masked or clamped"
             warn(f"{message}, which says nothing of their offsets")
     assembly = fitter.assemble(on_ground)
-    estimate = LeastSquares(estimator.ridge, rank_tolerance=estimator.rank_tolerance).solve(assembly.problem)
+    estimate = fitter.least_squares.solve(assembly.problem)
     extras = estimate_extras(assembly, estimate, fitter.robot.body_names, estimator.rank_tolerance)
     noise = float(np.sqrt(fit.assembly.problem.oversampling) * fit.estimate.residual_std)
     contradictions = disagreements(fit.parts, builder, extras, noise)
