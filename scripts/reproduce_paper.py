@@ -19,6 +19,7 @@ from paper.study import Reproduction
 from torchid.boundary import run_guarded
 from torchid.commands.folder import STUDY, check_free, new_folder
 from torchid.config import load_simulation
+from torchid.errors import about_file
 from torchid.report.tables import print_tables
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -41,10 +42,11 @@ def reproduce(options: argparse.Namespace) -> None:
     """Run the study as asked."""
     check_free(options.output, options.overwrite, STUDY)
     experiments = {name: CONFIGS / f"biped_{name}.yaml" for name in SENSOR_SETS}
-    study = Study(load_simulation(SIMULATION), experiments, SIMULATION)
-    with new_folder(options.output, options.overwrite, STUDY) as folder:
-        results, series = Reproduction(study.quick() if options.quick else study).run(folder)
-        write_study(folder, results, series)
+    with about_file(SIMULATION):
+        study = Study(load_simulation(SIMULATION), experiments)
+        with new_folder(options.output, options.overwrite, STUDY) as folder:
+            results, series = Reproduction(study.quick() if options.quick else study).run(folder)
+            write_study(folder, results, series)
     print_tables(*study_tables(results).values())
     print(f"written to {options.output}")
 

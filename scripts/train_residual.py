@@ -23,7 +23,7 @@ import torchid
 from torchid.boundary import run_guarded
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, about_file
 from torchid.estimators import ResidualEffect, Sgd, Trainer
 from torchid.fitting.experiment import set_up
 from torchid.problem import MiniBatches
@@ -68,7 +68,8 @@ def compare(options: argparse.Namespace) -> None:
     config = load_config(options.file, options.overrides)
     if not config.logs.test:
         raise ConfigError(options.file, "logs.test", "none", "logs to judge the networks by")
-    experiment = set_up(config, options.file)
+    with about_file(options.file):
+        experiment = set_up(config)
     robot = experiment.robot
     builder = torchid.RowBuilder(robot, experiment.contacts, experiment.sensors)
     reader = LogReader(experiment)

@@ -122,7 +122,7 @@ def _identify(options: argparse.Namespace) -> None:
             violation_table,
         )
 
-    run = identify(load_config(options.file, options.overrides), options.file, options.resume)
+    run = identify(load_config(options.file, options.overrides), options.resume)
     estimate, robot = run.estimate, run.experiment.robot
     if run.worse:
         _print_headline(run.worse)
@@ -230,7 +230,7 @@ def _analyze(options: argparse.Namespace) -> None:
         from torchid.report.analysis import accuracy_table
         from torchid.report.tables import print_tables
 
-    analysis = analyze(load_analysis(options.file, options.overrides), options.file)
+    analysis = analyze(load_analysis(options.file, options.overrides))
     for scenario in analysis.scenarios:
         _print_scenario(scenario)
     if analysis.accuracies:
@@ -307,6 +307,6 @@ def _simulate(options: argparse.Namespace) -> None:
         from torchid.report.tables import print_tables, stability_table
 
     config = load_simulation(options.file, options.overrides)
-    stabilities = simulate(config, options.file)
+    stabilities = simulate(config)
     print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
     print(f"written to    {config.output}")

@@ -9,8 +9,9 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TypeVar
 
+E = TypeVar("E", bound="InputError")
 #: Unicode categories of control characters, line breaks, surrogates and invisible formatting characters.
 _UNPLAIN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
@@ -22,17 +23,21 @@ class TorchidError(Exception):
 class InputError(TorchidError, ValueError):
     """Something a user supplied cannot be used.
 
-    The message is one line: where it was found (a file or an argument), which field, what was found and what
-    is accepted.
+    The message is one line: where it was found (a file or an argument; nothing if `source` is empty), which field, what
+    was found and what is accepted.
     """
 
     def __init__(self, source: object, field: str, found: str, accepted: str) -> None:
         self.source, self.field, self.found, self.accepted = str(source), field, found, accepted
-        message = f"{source}: {field}: {found}; accepted: {accepted}"
-        super().__init__(one_line(message))
+        super().__init__(one_line(_prefixed(source, f"{field}: {found}; accepted: {accepted}")))
+
+    @classmethod
+    def at_field(cls: type[E], field: str, *rest: Any) -> E:
+        """The error at a field of `current_file`; `rest`: what follows the field in the arguments of the class."""
+        return cls(current_file(), field, *rest)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Errors of worker processes reach their parent."""
+        """Errors of worker processes, which may be about another file than their parent, reach it as they are."""
         return type(self), (self.source, self.field, self.found, self.accepted)
 
 
@@ -42,17 +47,6 @@ class UrdfError(InputError):
 
 class LogError(InputError):
     """A log that is malformed, inconsistent, or lacks what the run needs."""
-
-
-class FieldError(LogError):
-    """A field of the log at hand, or a column or topic, is not what it should be; `about_file` says of which file."""
-
-    def __init__(self, field: str, found: str, accepted: str) -> None:
-        super().__init__(current_file(), field, found, accepted)
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """Another process works on another file."""
-        return LogError, (self.source, self.field, self.found, self.accepted)
 
 
 class ConfigError(InputError):
@@ -123,6 +117,11 @@ def warn(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
     warnings.warn(message, category, stacklevel=level)
 
 
+def warn_about_file(message: str, category: type[TorchidWarning] = TorchidWarning) -> None:
+    """As `warn`, the message with `current_file` before it, if there is one."""
+    warn(_prefixed(current_file(), message), category)
+
+
 def how_to_install(extra: str) -> str:
     """How to install the packages of an extra; the name torchid on PyPI is not ours."""
     return f"pip install '.[{extra}]' in the clone of torchid"
@@ -166,6 +165,10 @@ def during(doing: str, source: object) -> Iterator[None]:
 def activity_of(error: BaseException) -> str:
     """What was being done when an error came up, as `during` noted; empty if it did not."""
     return str(getattr(error, "_torchid_doing", ""))
+
+
+def _prefixed(source: object, text: str) -> str:
+    return f"{source}: {text}" if str(source) else text
 
 
 def _nearest_names(name: str, valid: Iterable[str], limit: int = 3) -> str:

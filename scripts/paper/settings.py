@@ -53,14 +53,12 @@ class Study:
     Attributes:
         simulation: the motions; the study switches the imperfections, at the levels given there.
         experiments: experiment files by name of the sensor set; robot and logs in them are the study's.
-        source: of the simulation, named in errors.
         noise_draws: draws of white noise, and of biases and gains.
         nominal_draws: draws of the nominal parameters.
     """
 
     simulation: SimulationConfig
     experiments: Mapping[str, Path]
-    source: object = "simulation"
     noise_draws: int = 3
     nominal_draws: int = 5
 
@@ -70,7 +68,7 @@ class Study:
         kinds = [name.startswith(SQUATS) for name in names], [name.startswith(UNSEEN) for name in names]
         if not any(kinds[0]) or sum(kinds[1]) != 1:
             accepted = f"some whose names begin with {SQUATS}, and one with {UNSEEN}"
-            raise ConfigError(self.source, "motions", ", ".join(names), accepted)
+            raise ConfigError.at_field("motions", ", ".join(names), accepted)
 
     def quick(self) -> Study:
         """The same in a minute: fewer and shorter motions, fewer draws."""

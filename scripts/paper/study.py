@@ -17,7 +17,7 @@ from paper.settings import SHOWN, SQUATS, TRAINING, UNSEEN, Condition, Study, co
 from torchid import parameters
 from torchid.commands.simulate import nominal_parameters, simulate
 from torchid.config import load_config
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, about_file
 from torchid.fitting.experiment import Experiment, set_up
 from torchid.logs import Log, read_log
 from torchid.logs.preprocess import preprocess
@@ -88,7 +88,8 @@ class Reproduction:
     def _experiment(self, path: Path) -> Experiment:
         """An experiment file, for the study's robot and logs."""
         urdf, logs = json.dumps(str(self.study.simulation.robot.urdf)), "logs={train: [squats], test: []}"
-        return set_up(load_config(path, [f"robot.urdf={urdf}", logs]), path)
+        with about_file(path):
+            return set_up(load_config(path, [f"robot.urdf={urdf}", logs]))
 
     def _draws(self, condition: Condition) -> int:
         return self.study.noise_draws if condition.random else 1
@@ -97,7 +98,7 @@ class Reproduction:
         """What the robot did, with or without friction in its joints."""
         config = self.study.simulation
         plant = replace(config.friction, enabled=friction)
-        simulate(replace(config, output=folder, friction=plant), self.study.source)
+        simulate(replace(config, output=folder, friction=plant))
         logs = {name: read_log(folder / "exact" / f"{name}.npz") for name in names}
         shutil.rmtree(folder)
         return logs

@@ -337,7 +337,7 @@ def test_a_bolted_arm_without_contacts_is_asked_what_the_stack_of_its_log_needs(
         output=str(experiment / "bolted"),
     )
     with pytest.warns(TorchidWarning):  # fitted on what it is tested on
-        analysis = analyze(load_analysis(file), file)
+        analysis = analyze(load_analysis(file))
     (scenario,) = analysis.scenarios
     assert scenario.plan.problem.criterion == "stack"
     assert scenario.plan.stack_rank == scenario.plan.stack_full == scenario.base.rank - 2 * len(TORQUES)

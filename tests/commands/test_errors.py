@@ -12,7 +12,6 @@ from motions import moving_log
 from torchid.errors import (
     BaseLostError,
     ConfigError,
-    FieldError,
     InputError,
     LogError,
     SensorError,
@@ -24,6 +23,7 @@ from torchid.errors import (
     current_file,
     during,
     warn,
+    warn_about_file,
 )
 from torchid.logs.preprocess import preprocess
 from torchid.logs.read import UnknownFieldError
@@ -61,13 +61,22 @@ def test_a_warning_is_of_the_line_outside_of_torchid_that_led_to_it_however_deep
     assert Path(direct[0].filename) == Path(__file__)
 
 
+def test_a_warning_begins_with_the_file_that_it_is_about_if_there_is_one() -> None:
+    with about_file("walk.npz"), pytest.warns(TorchidWarning, match=r"^walk.npz: a gap$") as caught:
+        warn_about_file("a gap")
+    assert Path(caught[0].filename) == Path(__file__)
+    with pytest.warns(TorchidWarning, match="^a gap$"):
+        warn_about_file("a gap")
+
+
 def test_an_error_that_names_a_field_alone_is_about_the_innermost_file_and_stays_so() -> None:
     with about_file("walk.npz"):
         with during("reading", "jump.npz"):
-            inner = FieldError("time", "no samples", "some")
-        outer = FieldError("time", "no samples", "some")
+            inner = LogError.at_field("time", "no samples", "some")
+        outer = LogError.at_field("time", "no samples", "some")
     assert current_file() == ""
     assert str(inner) == "jump.npz: time: no samples; accepted: some"
     assert str(outer) == "walk.npz: time: no samples; accepted: some"
+    assert str(ConfigError.at_field("ridge", "-1", "0 or more")) == "ridge: -1; accepted: 0 or more"
     back = pickle.loads(pickle.dumps(inner))  # in a process that works on no file or on another one
     assert (type(back), str(back)) == (LogError, str(inner))

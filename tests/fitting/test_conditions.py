@@ -21,7 +21,7 @@ from urdfs import INERTIAL, ball, inertial, joint, link, table, write
 from torchid.commands.identify import identify
 from torchid.config import dump_config, load_config
 from torchid.config.estimator import EstimatorConfig
-from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError
+from torchid.errors import ConfigError, InputError, TorchidWarning, UnknownNameError, about_file
 from torchid.estimators import Conditions, violations
 from torchid.estimators.conditions import mirror_matrix
 from torchid.fitting.experiment import batch_estimator, conditions_from
@@ -45,7 +45,9 @@ def settings_of(folder: Path, **keys: Any) -> EstimatorConfig:
 
 
 def conditions(folder: Path, robot: Robot, **keys: Any) -> Conditions:
-    return conditions_from(settings_of(folder, **keys), robot, "experiment.yaml")
+    settings = settings_of(folder, **keys)
+    with about_file("experiment.yaml"):
+        return conditions_from(settings, robot)
 
 
 def refusal(folder: Path, robot: Robot, kind: type[InputError] = ConfigError, **keys: Any) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic import ANYMAL, Oracle, load, make_log
 
-from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError
+from torchid.errors import BaseLostError, BaseLostWarning, SensorError, UnknownNameError, about_file
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.problem import RowBuilder, bind_log
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, validate_contacts
@@ -42,8 +42,8 @@ def test_contacts_of_the_robot_pass_unchanged() -> None:
 def test_a_contact_that_cannot_be_is_refused_by_its_place(
     contacts: list[Contact], error: type[Exception], message: str
 ) -> None:
-    with pytest.raises(error, match=message) as raised:
-        validate_contacts(load(ANYMAL), contacts, "experiment.yaml")
+    with pytest.raises(error, match=message) as raised, about_file("experiment.yaml"):
+        validate_contacts(load(ANYMAL), contacts)
     assert "experiment.yaml" in str(raised.value)
 
 

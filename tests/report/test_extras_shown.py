@@ -11,7 +11,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import to_rgba
 from rich.console import Console
 
-from torchid.errors import ConfoundedWarning
+from torchid.errors import ConfoundedWarning, about_file
 from torchid.fitting.calibration import warn_of_confounded
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.problem.extras import Extra
@@ -78,8 +78,8 @@ def test_a_warning_of_what_cannot_be_told_apart_lists_sensors_and_parameters_by_
     joints = [replace(found("scale", f"hip{j}", ""), inflation=1e9, confounded_with=mixed) for j in range(8)]
     foot = Extra("offset", "sole", "fz", "N", 1.0, False, contact=(0, 2))
     off = ExtraEstimate(foot, "", 1.5, 1.4, 0.1, 1e9, mixed)
-    with pytest.warns(ConfoundedWarning) as caught:
-        warn_of_confounded([*joints, off], "a.yaml")
+    with pytest.warns(ConfoundedWarning) as caught, about_file("a.yaml"):
+        warn_of_confounded([*joints, off])
     message = str(caught.list[0].message)
     assert message.startswith("a.yaml: scale of hip0, hip1, hip2, hip3, hip4, hip5 and 2 more; offset of sole fz: ")
     assert "confounded with m, Izz of trunk; mcy of thigh; do not trust" in message

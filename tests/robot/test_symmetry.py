@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, G1, ROBOTS, ROMEO, SOLO8, SOLO12, TALOS, Array, load
 from urdfs import joint, link, table, words, write
 
-from torchid.errors import ConfigError
+from torchid.errors import ConfigError, about_file
 from torchid.estimators.conditions import mirror_matrix
 from torchid.problem.linear import parameter_scale
 from torchid.robot import Robot, mirror_pairs
@@ -122,8 +122,8 @@ def test_points_of_the_right_arm_are_those_of_the_left_seen_in_a_mirror(normal: 
 
 def refusal(robot: Robot, *tokens: str, **options: object) -> str:
     """The one line, of a file called experiment.yaml."""
-    with pytest.raises(ConfigError) as caught:
-        mirror_pairs(robot, *tokens, source="experiment.yaml", **options)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError) as caught, about_file("experiment.yaml"):
+        mirror_pairs(robot, *tokens, **options)  # type: ignore[arg-type]
     message = str(caught.value)
     assert "\n" not in message
     assert message.startswith("experiment.yaml: symmetry: ")

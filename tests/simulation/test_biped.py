@@ -95,7 +95,7 @@ def test_joints_may_turn_as_far_as_their_mirror_images(biped: Robot) -> None:
 
 @pytest.mark.parametrize("frame", SOLES)
 def test_a_sole_is_a_level_rectangle_of_spheres_below_the_ankle(biped: Robot, frame: str) -> None:
-    (foot,) = find_feet([FootConfig(frame)], BIPED, "test")
+    (foot,) = find_feet([FootConfig(frame)], BIPED)
     points, radii = foot.points, foot.radii
     assert set(radii) == {SPHERE}
     expected = {(x, y, SPHERE) for x in (-HALF_LENGTH, HALF_LENGTH) for y in (-HALF_WIDTH, HALF_WIDTH)}
@@ -108,7 +108,7 @@ def test_a_sole_is_a_level_rectangle_of_spheres_below_the_ankle(biped: Robot, fr
 
 @pytest.mark.parametrize("feet", [(), SOLES], ids=["no feet", "feet"])
 def test_mujoco_weighs_what_torchid_weighs(biped: Robot, feet: tuple[str, ...]) -> None:
-    plant = Plant(BIPED, find_feet([FootConfig(frame) for frame in feet], BIPED, "test"), 1000.0)
+    plant = Plant(BIPED, find_feet([FootConfig(frame) for frame in feet], BIPED), 1000.0)
     assert plant.mass == pytest.approx(biped.nominal[:, 0].sum(), rel=1e-14)
     assert plant.n == biped.n
 

@@ -17,7 +17,7 @@ from simulated import BIPED, SHIPPED, SOLES, STOOD
 from torchid.cli import main
 from torchid.commands.folder import SIMULATION, new_folder
 from torchid.config import load_simulation
-from torchid.errors import InputError
+from torchid.errors import InputError, about_file
 from torchid.simulation import Recording, set_up_simulation
 
 FEET = [{"frame": sole} for sole in SOLES]
@@ -89,7 +89,8 @@ def refused(folder: Path, capsys: pytest.CaptureFixture[str], *overrides: str) -
 def simulated(file: Path) -> Recording:
     """The first motion of a file, in this process."""
     config = load_simulation(file)
-    return set_up_simulation(config, file).run(config.motions[0])[0]
+    with about_file(file):
+        return set_up_simulation(config).run(config.motions[0])[0]
 
 
 def edit(folder: Path, changes: dict[str, Any]) -> None:

@@ -64,7 +64,7 @@ def test_the_nominal_robot_is_the_true_one_with_other_inertias_and_could_exist(b
     assert np.abs(ratio - 1.0).max() > 0.1
     assert (parameters.consistency_margin(nominal.nominal) > 0.0).all()
     for sole in ("l_sole", "r_sole"):
-        found, shipped = (find_feet([FootConfig(sole)], p, "test") for p in (biped_folder / "nominal.urdf", BIPED))
+        found, shipped = (find_feet([FootConfig(sole)], p) for p in (biped_folder / "nominal.urdf", BIPED))
         assert found == shipped
 
 

@@ -98,37 +98,34 @@ class AnalysisRequest:
             InputError: a name that nothing answers to, or that is taken.
         """
         settings, config = scene.config.analysis, scene.config
-        wanted = settings.candidates
-        with _errors_at(scene.source):
+        choice = settings.candidates
+        with _errors_at("analysis"):
             offered = candidates(
-                scene.robot, scene.contacts, wanted.joint_torques, wanted.contacts, settings.costs, wanted.ft_sensors
+                scene.robot, scene.contacts, choice.joint_torques, choice.contacts, settings.costs, choice.ft_sensors
             )
         proposed = None if config.sensors.empty else scene.sensors_of(config.sensors)
         return cls(
             scene=scene,
             candidates=offered,
-            keep=_candidates_named(settings.keep, "keep", offered, scene.source),
-            exclude=_candidates_named(settings.exclude, "exclude", offered, scene.source),
+            keep=_candidates_named(settings.keep, "keep", offered),
+            exclude=_candidates_named(settings.exclude, "exclude", offered),
             proposed=proposed,
             compared=_sets_named(scene, proposed),
         )
 
 
-def analyze(config: AnalyzeConfig, source: object = "experiment") -> Analysis:
+def analyze(config: AnalyzeConfig) -> Analysis:
     """Plan and check sensors as an experiment file says under `analysis`, and write a folder with the results.
-
-    Args:
-        config: the experiment file.
-        source: its path, named in errors.
 
     Raises:
         InputError: whatever does not fit; nothing has been written then.
     """
     output = analysis_folder(config.output)
     if not config.output.name:
-        raise ConfigError(source, "output", f"'{config.output}', no name for a folder", "a path to a new folder")
-    check_free(output, config.overwrite, ANALYSIS, (source, *inputs_of(config)))
-    scene = set_up_scene(config, source)
+        found = f"'{config.output}', no name for a folder"
+        raise ConfigError.at_field("output", found, "a path to a new folder")
+    check_free(output, config.overwrite, ANALYSIS, inputs_of(config))
+    scene = set_up_scene(config)
     request = AnalysisRequest.of(scene)
     with progress_bars() as bars:
         train, test = _read(request, bars)
@@ -169,8 +166,8 @@ def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[Contact
         UnknownNameError: a frame that is no contact.
     """
     frames = [contact.frame for contact in scene.contacts]
-    wanted = scene.config.analysis.scenarios
-    if wanted is None:
+    chosen = scene.config.analysis.scenarios
+    if chosen is None:
         recorded: Counter[ContactState] = Counter()
         for samples in train:
             for state, index in chunks_by_state(samples):
@@ -178,10 +175,10 @@ def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[Contact
         most_first = tuple(state for state, _ in recorded.most_common())
         return {"logs": most_first} if recorded else {"all_contacts": ((True,) * len(frames),)}
     out = {}
-    for name, states in wanted.items():
+    for name, states in chosen.items():
         for frame in (frame for state in states for frame in state):
             if frame not in frames:
-                raise UnknownNameError(scene.source, f"analysis.scenarios.{name}", frame, frames)
+                raise UnknownNameError.at_field(f"analysis.scenarios.{name}", frame, frames)
         out[name] = tuple(dict.fromkeys(tuple(frame in state for frame in frames) for state in states))
     return out
 
@@ -212,7 +209,7 @@ def _analyze_scenario(
     def progress(what: str, step: int, steps: int) -> None:
         bars.update(bar, description=f"{name}: {what}", completed=step, total=steps)
 
-    with _errors_at(scene.source):
+    with _errors_at("analysis"):
         plan = plan_sensors(problem, progress)
     progress("base parameters", 0, 1)
     planned, proposed = sensor_set(robot, contacts, plan.chosen), None
@@ -267,7 +264,7 @@ def write_analysis(analysis: Analysis) -> None:
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
         figures[f"sensors-{scenario.name}"] = _picture(scene, scenario)
     if analysis.accuracies:
-        document["accuracy"] = {name: found.as_dict() for name, found in analysis.accuracies.items()}
+        document["accuracy"] = {name: accuracy.as_dict() for name, accuracy in analysis.accuracies.items()}
         figures["accuracy"] = accuracy_figure(analysis.accuracies)
     with during("writing", analysis.output), new_folder(analysis.output, scene.config.overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(scene.config))
@@ -294,38 +291,30 @@ def _picture(scene: Scene, scenario: ScenarioAnalysis) -> Figure:
 
 
 @contextmanager
-def _errors_at(source: object, field: str = "analysis", instead_of: str = "") -> Iterator[None]:
-    """Let errors name the experiment file and the place in it.
-
-    Args:
-        source: the file.
-        field: put before the place that an error names, or instead of its beginning.
-        instead_of: that beginning.
-    """
+def _errors_at(field: str, instead_of: str = "") -> Iterator[None]:
+    """Let errors name the experiment file, and a field of it before theirs or instead of its beginning."""
     try:
         yield
     except UnknownNameError as error:
-        raise UnknownNameError(source, _place(field, instead_of, error), error.name, error.valid) from error
+        raise UnknownNameError.at_field(_field_in_file(field, instead_of, error), error.name, error.valid) from error
     except SensorError as error:
-        raise SensorError(source, _place(field, instead_of, error), error.found, error.accepted) from error
+        raise SensorError.at_field(_field_in_file(field, instead_of, error), error.found, error.accepted) from error
 
 
-def _place(field: str, instead_of: str, error: UnknownNameError | SensorError) -> str:
+def _field_in_file(field: str, instead_of: str, error: UnknownNameError | SensorError) -> str:
     return error.field.replace(instead_of, field, 1) if instead_of else f"{field}.{error.field}"
 
 
-def _candidates_named(
-    names: Sequence[str], field: str, offered: Sequence[Candidate], source: object
-) -> frozenset[Candidate]:
+def _candidates_named(names: Sequence[str], field: str, offered: Sequence[Candidate]) -> frozenset[Candidate]:
     by_name: dict[str, list[Candidate]] = {}
     for candidate in offered:
         by_name.setdefault(candidate.name, []).append(candidate)
     for name in names:
         if name not in by_name:
-            raise UnknownNameError(source, f"analysis.{field}", name, by_name)
+            raise UnknownNameError.at_field(f"analysis.{field}", name, by_name)
         if len(by_name[name]) > 1:
             found = f"'{name}', the name of several sensors: joint, contact or fixed joint"
-            raise ConfigError(source, f"analysis.{field}", found, "a name that only one sensor has")
+            raise ConfigError.at_field(f"analysis.{field}", found, "a name that only one sensor has")
     return frozenset(by_name[name][0] for name in names)
 
 
@@ -335,7 +324,7 @@ def _sets_named(scene: Scene, proposed: SensorSet | None) -> dict[str, SensorSet
     for name, choice in scene.config.analysis.compare.items():
         field = f"analysis.compare.{name}"
         if name in sets:
-            raise ConfigError(scene.source, field, "the name of what stands under sensors", "another name")
-        with _errors_at(scene.source, field, instead_of="sensors"):
+            raise ConfigError.at_field(field, "the name of what stands under sensors", "another name")
+        with _errors_at(field, instead_of="sensors"):
             sets[name] = scene.sensors_of(choice)
     return sets

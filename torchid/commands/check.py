@@ -12,7 +12,7 @@ from torchid.commands.folder import check_free_file
 from torchid.commands.reading import memory_needed
 from torchid.config import load_analysis
 from torchid.config.experiment import PreprocessingConfig, load_topics
-from torchid.errors import ConfigError, LogError
+from torchid.errors import ConfigError, LogError, about_file
 from torchid.fitting.experiment import set_up_scene
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
@@ -65,14 +65,15 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     config = load_analysis(path, overrides)
     if config.logs is None:
         raise ConfigError(path, "logs", "missing", "logs to check")
-    scene = set_up_scene(config, path)
+    with about_file(path):
+        scene = set_up_scene(config)
     files = [*config.logs.train, *config.logs.validation, *config.logs.test]
-    found = []
+    checked = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
             log = read_log_to_check(file, config.logs.topics, config.preprocessing)
-            found.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
-    return found
+            checked.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
+    return checked
 
 
 def check_log(
@@ -98,8 +99,9 @@ def check_log(
     if urdf is None:
         return check(log)
     robot = load_robot(urdf, base_link, fixed_base, log.ft_names)
-    for name in log.contact_names:
-        robot.link(name, "contact_names", log.source)
+    with about_file(log.source):
+        for name in log.contact_names:
+            robot.link(name, "contact_names")
     return check(log, robot, [_contact(log, index) for index in range(len(log.contact_names))])
 
 

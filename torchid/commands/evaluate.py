@@ -10,7 +10,7 @@ from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, ref
 from torchid.commands.reading import LogReader
 from torchid.commands.results import draw_forces
 from torchid.config import load_config
-from torchid.errors import ConfigError, during, warn
+from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, set_up
@@ -54,7 +54,8 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
     check_free(output, True, EVALUATION, logs)
     config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])
     with progress_bars() as bars:
-        experiment = set_up(config, folder / "config.yaml")
+        with about_file(folder / "config.yaml"):
+            experiment = set_up(config)
         builder = experiment.builder(experiment.sensors)
         compared = _calibrations(experiment, builder, folder / "parameters.json")
         reading = bars.add_task("reading logs", total=len(logs))

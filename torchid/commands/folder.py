@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from torchid.commands.manifest import MANIFEST, FolderContents, FolderKind, inspect_folder, make_manifest, read_manifest
-from torchid.errors import ConfigError, excerpt, join_names
+from torchid.errors import ConfigError, current_file, excerpt, join_names
 from torchid.staging import CAN_LOCK, NEW, OLD, interrupts_deferred, leftovers, note_written, staging_folder, try_lock
 
 EVENTS = "events.out.tfevents*"
@@ -94,16 +94,16 @@ def refuse_link(folder: Path) -> None:
 
 
 def refuse_inputs(output: Path, inputs: Iterable[object]) -> None:
-    """Make sure that a folder which will be replaced or removed holds nothing that the command reads.
+    """Make sure that a folder which will be replaced or removed holds neither inputs nor `current_file`.
 
     Raises:
         ConfigError: it does.
     """
     top = os.path.realpath(output)
-    for path in inputs:
-        place = os.path.realpath(str(path))
-        if os.path.lexists(str(path)) and place.startswith(top + os.sep):
-            found = f"holds {excerpt(os.path.relpath(place, top))}, which is an input"
+    for path in (current_file(), *inputs):
+        target = os.path.realpath(str(path))
+        if os.path.lexists(str(path)) and target.startswith(top + os.sep):
+            found = f"holds {excerpt(os.path.relpath(target, top))}, which is an input"
             raise ConfigError(output, "output", found, "another output, or inputs that lie elsewhere")
 
 
@@ -120,24 +120,24 @@ def require_replaceable(folder: Path, kind: FolderKind, output: Path | None = No
     """
     output = output or folder
     try:
-        found, names = inspect_folder(folder, kind), [excerpt(name) for name in sorted(os.listdir(folder))]
+        contents, names = inspect_folder(folder, kind), [excerpt(name) for name in sorted(os.listdir(folder))]
     except OSError as error:
         raise ConfigError(output, "output", f"cannot be read ({error})", "a new folder") from error
-    if found is None and (other := read_manifest(folder)):
+    if contents is None and (other := read_manifest(folder)):
         accepted = f"a new folder, or {kind.name} to overwrite"
         raise ConfigError(output, "output", f"holds {excerpt(other.kind)}", accepted)
-    if found is None:
+    if contents is None:
         what = f"holds {join_names(names, _MOST_NAMES)}, and no {MANIFEST} that says that torchid wrote {kind.name}"
         accepted = f"a new folder, or {kind.name} to overwrite; one that an older version wrote is for you to remove"
         raise ConfigError(output, "output", what, accepted)
-    complaints = [f"{join_names(found.foreign, _MOST_NAMES)}, which torchid did not write"] if found.foreign else []
-    complaints += [f"{join_names(found.changed, _MOST_NAMES)}, changed since torchid wrote it"] if found.changed else []
-    closed = [str(path) for path in found.folders if not os.access(path, os.W_OK | os.X_OK)]
+    unsafe = {"which torchid did not write": contents.foreign, "changed since torchid wrote it": contents.changed}
+    complaints = [f"{join_names(paths, _MOST_NAMES)}, {what}" for what, paths in unsafe.items() if paths]
+    closed = [str(path) for path in contents.folders if not os.access(path, os.W_OK | os.X_OK)]
     complaints += [f"{join_names(closed)}, where nothing can be removed"] if closed and not complaints else []
     if complaints:
         accepted = f"a new folder, or {kind.name} to overwrite; move elsewhere what is yours"
         raise ConfigError(output, "output", f"holds {' and '.join(complaints)}", accepted)
-    return found
+    return contents
 
 
 def recover_leftovers(output: Path, kind: FolderKind) -> None:
@@ -152,11 +152,11 @@ def recover_leftovers(output: Path, kind: FolderKind) -> None:
         if not os.path.lexists(output):
             (folder / OLD).rename(output)
             continue
-        if found := inspect_folder(folder / OLD, kind):
-            found.remove()
-        for place, _, _ in os.walk(folder / OLD, topdown=False):  # the process was killed after their manifests went
+        if contents := inspect_folder(folder / OLD, kind):
+            contents.remove()
+        for path, _, _ in os.walk(folder / OLD, topdown=False):  # the process was killed after their manifests went
             with suppress(OSError):
-                os.rmdir(place)
+                os.rmdir(path)
 
 
 def write_json(path: Path, document: object) -> None:
@@ -231,13 +231,13 @@ def _put(folder: Path, output: Path, overwrite: bool, kind: FolderKind) -> None:
         except OSError as error:
             raise ConfigError(output, "output", f"cannot be replaced ({error.strerror})", "a new folder") from error
         try:
-            found = require_replaceable(folder / OLD, kind, output)  # moved aside, it cannot change any more
+            contents = require_replaceable(folder / OLD, kind, output)  # moved aside, it cannot change any more
             done = _renamed(folder / NEW, output)
         except BaseException:
             with suppress(OSError):
                 (folder / OLD).rename(output)
             raise
-        found.remove()
+        contents.remove()
         if done:
             return
     raise ConfigError(output, "output", "other runs take the place again and again", "another output")

@@ -17,7 +17,7 @@ from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning, warn
+from torchid.errors import NumericalWarning, warn_about_file
 from torchid.estimators import Conditions, Estimate, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
@@ -46,12 +46,11 @@ class _Clock:
         self.seconds[name] = time.perf_counter() - start
 
 
-def identify(config: ExperimentConfig, source: object = "experiment", resume: bool = False) -> Identification:
+def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
     """Fit the parameters and write the run folder.
 
     Args:
         config: the experiment.
-        source: named in errors.
         resume: go on with a training that was interrupted.
 
     Raises:
@@ -61,9 +60,9 @@ def identify(config: ExperimentConfig, source: object = "experiment", resume: bo
     """
     trains = config.estimator.name == "sgd"
     with claim_folder(training_folder(config.output)) if trains else nullcontext():
-        require_trainable(config, resume, source)
-        check_free(config.output, config.overwrite, RUN, (source, *inputs_of(config)))
-        return _identify(config, source, resume)
+        require_trainable(config, resume)
+        check_free(config.output, config.overwrite, RUN, inputs_of(config))
+        return _identify(config, resume)
 
 
 @dataclass
@@ -82,12 +81,12 @@ class _Prepared:
     ridge: RidgeChoice | None
 
 
-def _prepare(config: ExperimentConfig, source: object, clock: _Clock, bars: Progress) -> _Prepared:
+def _prepare(config: ExperimentConfig, clock: _Clock, bars: Progress) -> _Prepared:
     with clock("read"):
-        experiment = set_up(config, source)
+        experiment = set_up(config)
         conditions = experiment.conditions()
         if config.estimator.name == "sgd":
-            descent_settings(config, source)  # before any work
+            descent_settings(config)  # before any work
         reader = LogReader(experiment)
         logs = _read(reader, experiment, bars)
     with clock("noise"):
@@ -115,10 +114,10 @@ def _prepare(config: ExperimentConfig, source: object, clock: _Clock, bars: Prog
     )
 
 
-def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identification:
+def _identify(config: ExperimentConfig, resume: bool) -> Identification:
     clock = _Clock()
     with progress_bars() as bars:
-        ready = _prepare(config, source, clock, bars)
+        ready = _prepare(config, clock, bars)
         experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
         evaluation, builder = experiment.evaluation(), fitter.builder
         training, solve = None, None
@@ -133,7 +132,7 @@ def _identify(config: ExperimentConfig, source: object, resume: bool) -> Identif
             ready.parts = []
             estimate, problem = fit.estimate, fit.assembly.problem
             mass = require_plausible(fit, experiment)
-            warn_of_confounded(fit.extras, source)
+            warn_of_confounded(fit.extras)
             warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
             whole = merge_folds(fit.parts, builder)
@@ -220,8 +219,8 @@ def _robust(
     robust = fit_robustly(train, fitter, loss, first=fit, progress=lambda n: bars.advance(bar, n))
     bars.update(bar, total=1, completed=1)
     if not robust.summary.converged:
-        settled = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"
-        warn(f"{experiment.source}: {settled}", NumericalWarning)
+        message = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"
+        warn_about_file(message, NumericalWarning)
     return robust.fit, robust.summary
 
 

@@ -160,49 +160,49 @@ def inspect_folder(folder: Path, kind: FolderKind, name: str | None = None) -> F
     manifest = read_manifest(folder)
     if manifest is None or manifest.kind != kind.name or name not in (None, manifest.folder):
         return None
-    found = FolderContents()
-    _look(folder, "", manifest, kind, found)
-    found.own.append(folder / MANIFEST)
-    found.folders.append(folder)
-    return found
+    contents = FolderContents()
+    _look(folder, "", manifest, kind, contents)
+    contents.own.append(folder / MANIFEST)
+    contents.folders.append(folder)
+    return contents
 
 
-def _look(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: FolderContents) -> None:
-    """Add what is in the folder at a place below the top."""
-    for name, path in _entries(top / place):
-        inner = f"{place}/{name}" if place else name
+def _look(top: Path, relative: str, manifest: Manifest, kind: FolderKind, contents: FolderContents) -> None:
+    """Add what is in the folder at a path relative to the top."""
+    for name, path in _entries(top / relative):
+        inner = f"{relative}/{name}" if relative else name
         mode = os.lstat(path).st_mode
         if stat.S_ISDIR(mode):
-            _look_into(top, inner, manifest, kind, found)
+            _look_into(top, inner, manifest, kind, contents)
         elif inner in manifest.files and stat.S_ISREG(mode):
             same = _is(path, *manifest.files[inner])
-            found.own.append(path) if same else found.changed.append(excerpt(inner))
-        elif stat.S_ISREG(mode) and not place and any(fnmatchcase(name, x) for x in manifest.growing):
-            found.own.append(path)
+            contents.own.append(path) if same else contents.changed.append(excerpt(inner))
+        elif stat.S_ISREG(mode) and not relative and any(fnmatchcase(name, x) for x in manifest.growing):
+            contents.own.append(path)
         elif inner != MANIFEST:
-            found.foreign.append(excerpt(inner))
+            contents.foreign.append(excerpt(inner))
 
 
-def _look_into(top: Path, place: str, manifest: Manifest, kind: FolderKind, found: FolderContents) -> None:
+def _look_into(top: Path, relative: str, manifest: Manifest, kind: FolderKind, contents: FolderContents) -> None:
     """Add a folder."""
-    path, above = top / place, place.rpartition("/")[0]
+    path, above = top / relative, relative.rpartition("/")[0]
     if is_leftover(path):
-        found.leftovers.append(path)
+        contents.leftovers.append(path)
     elif kind.inner_kind is not None and above == kind.inner_folder:
         inside = inspect_folder(path, kind.inner_kind, path.name)
         if inside is None:
-            found.foreign.append(excerpt(f"{place}/"))
+            contents.foreign.append(excerpt(f"{relative}/"))
             return
-        found.own += inside.own
-        found.folders += inside.folders
-        found.leftovers += inside.leftovers
-        found.foreign += [f"{place}/{name}" for name in inside.foreign]
-        found.changed += [f"{place}/{name}" for name in inside.changed]
-    elif place in manifest.folders or place == kind.inner_folder:
-        _look(top, place, manifest, kind, found)
-        found.folders.append(path)
+        contents.own += inside.own
+        contents.folders += inside.folders
+        contents.leftovers += inside.leftovers
+        contents.foreign += [f"{relative}/{name}" for name in inside.foreign]
+        contents.changed += [f"{relative}/{name}" for name in inside.changed]
+    elif relative in manifest.folders or relative == kind.inner_folder:
+        _look(top, relative, manifest, kind, contents)
+        contents.folders.append(path)
     else:
-        found.foreign.append(excerpt(f"{place}/"))
+        contents.foreign.append(excerpt(f"{relative}/"))
 
 
 def _entries(folder: Path) -> Iterator[tuple[str, Path]]:
@@ -217,8 +217,8 @@ def _is(path: Path, size: int, checksum: str) -> bool:
 
 def _checksum(path: Path) -> str:
     """SHA-256 of a file."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(_BLOCK):
-            found.update(block)
-    return found.hexdigest()
+            digest.update(block)
+    return digest.hexdigest()

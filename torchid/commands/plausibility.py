@@ -8,7 +8,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.commands.check import read_log_to_check
-from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn
+from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn_about_file
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.identifiability.confounding import TotalMass, total_mass
@@ -53,9 +53,7 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     """
     estimate = fit.estimate
     if not estimate.rank:
-        raise SensorError(
-            scene.source, "sensors", "no parameter is in reach of them", "other sensors, contacts or logs"
-        )
+        raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
     mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance)
     reason = implausibility(fit.assembly.problem, estimate.phi, mass, scene.robot)
     unexplained = _unexplained(fit)
@@ -64,16 +62,16 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     log, finding = next(_findings(scene), (None, None))
     if finding is not None and (reason is not None or finding.condemns_all):
         checks = f"{log}: {finding.field}: {finding.found}"
-        raise ImplausibleFitError(
-            scene.source, "logs", f"{reason or unexplained}; torchid check finds in {checks}", finding.advice
+        raise ImplausibleFitError.at_field(
+            "logs", f"{reason or unexplained}; torchid check finds in {checks}", finding.advice
         )
     if reason is not None:
-        raise ImplausibleFitError(
-            scene.source, "logs", reason, f"data and URDF that fit each other; usual reasons: {_USUAL}"
+        raise ImplausibleFitError.at_field(
+            "logs", reason, f"data and URDF that fit each other; usual reasons: {_USUAL}"
         )
     named = "" if finding is None else f"; torchid check finds in {log}: {finding.field}: {finding.found}"
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
-    warn(f"{scene.source}: {unexplained}{named}; {advice}", NumericalWarning)
+    warn_about_file(f"{unexplained}{named}; {advice}", NumericalWarning)
     return mass
 
 
@@ -93,8 +91,8 @@ def require_not_worse(worse: list[WorseThanNominal], scene: Scene) -> None:
     if finding is not None:
         message, advice = f"{message}; torchid check finds in {log}: {finding.field}: {finding.found}", finding.advice
         if finding.condemns_all:
-            raise ImplausibleFitError(scene.source, "logs", message, advice)
-    warn(f"{scene.source}: {message}; {advice}", NumericalWarning)
+            raise ImplausibleFitError.at_field("logs", message, advice)
+    warn_about_file(f"{message}; {advice}", NumericalWarning)
 
 
 def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: Robot) -> str | None:
@@ -156,8 +154,8 @@ def _beyond_bounds(phi: Array, robot: Robot) -> Iterator[str]:
     bound[parameters.INERTIA], bound[parameters.FRICTION] = total * reach**2, total * _GRAVITY * max(reach, 1.0)
     beyond = ~(np.abs(phi) <= LARGEST_FACTOR * np.maximum(bound, np.abs(robot.nominal)))
     for body, parameter in np.argwhere(beyond):
-        found = f"{robot.body_names[body]} has {PARAMETERS[parameter]} = {phi[body, parameter]:.3g}"
-        yield f"the fit's {found}, beyond {LARGEST_FACTOR:g} times the whole URDF's {bound[parameter]:.3g}"
+        fitted = f"{robot.body_names[body]} has {PARAMETERS[parameter]} = {phi[body, parameter]:.3g}"
+        yield f"the fit's {fitted}, beyond {LARGEST_FACTOR:g} times the whole URDF's {bound[parameter]:.3g}"
 
 
 def _reach(robot: Robot) -> float:
@@ -189,16 +187,16 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     files = scene.config.logs
     if files is None:
         return
-    found = []
+    findings = []
     for path in files.train:
         try:
             log = read_log_to_check(path, files.topics, scene.config.preprocessing)
             checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
         except InputError:  # larger than memory: it is not checked
             continue
-        grave = (one for one in checked.findings if one.severity in SEVERITIES[:2])
-        found += [(path.name, one) for one in grave if one.mask(len(checked.log)).mean() > _PART]
-    yield from sorted(found, key=lambda pair: _order(pair[1]))
+        severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
+        findings += [(path.name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
+    yield from sorted(findings, key=lambda pair: _order(pair[1]))
 
 
 def _order(finding: Finding) -> tuple[bool, int, bool]:

@@ -198,14 +198,14 @@ class LargeLog:
 
     def _coverage(self, blocks: LogBlocks, first: Log, timeline: Timeline) -> dict[str, Coverage]:
         """Which channels were measured throughout, which takes a pass over the log."""
-        found = {name: Coverage.empty(getattr(first, name).shape[1:]) for name in gapless_fields(first, timeline)}
-        for piece in self._pieces(blocks, len(blocks)) if found else ():
-            log = blocks.read(piece, only=(*found, "contact_active"))
-            for name, coverage in found.items():
+        coverages = {name: Coverage.empty(getattr(first, name).shape[1:]) for name in gapless_fields(first, timeline)}
+        for piece in self._pieces(blocks, len(blocks)) if coverages else ():
+            log = blocks.read(piece, only=(*coverages, "contact_active"))
+            for name, coverage in coverages.items():
                 coverage.add(getattr(log, name), log.contact_active if name in WRENCHES else None)
-        for name, coverage in found.items():
+        for name, coverage in coverages.items():
             warn_of_gaps(first, name, coverage)
-        return found
+        return coverages
 
     def _contacts(self, blocks: LogBlocks, first: Log) -> Log | None:
         """The log with nothing but the contacts' flags, which takes a pass over it; None if there are none."""
@@ -238,8 +238,8 @@ def _in_the_air(contacts: Log) -> BoolArray | None:
     """Which contacts are in the air for sure in which samples of the log, None if none ever is."""
     if contacts.contact_active is None:
         return None
-    found = find_unloaded(contacts.time, contacts.contact_active)
-    return found if found.any() else None
+    unloaded = find_unloaded(contacts.time, contacts.contact_active)
+    return unloaded if unloaded.any() else None
 
 
 def _preprocessed(

@@ -18,6 +18,7 @@ from torchid import parameters
 from torchid.commands.folder import SIMULATION, check_free, new_folder, write_json
 from torchid.config import MotionConfig, NominalConfig, SimulationConfig
 from torchid.config.reading import dump
+from torchid.errors import about_file, current_file
 from torchid.logs import write_log
 from torchid.parameters import Array
 from torchid.report import identified_urdf
@@ -28,12 +29,11 @@ from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
 _POLL_S = 0.2
 
 
-def simulate(config: SimulationConfig, source: object = "simulation") -> dict[str, Stability]:
+def simulate(config: SimulationConfig) -> dict[str, Stability]:
     """Simulate all motions and write a folder: `logs/`, `exact/`, `nominal.urdf`, `stability.json`, `simulation.yaml`.
 
     Args:
         config: robot, feet, motions and imperfections.
-        source: named in errors.
 
     Returns:
         How the robot stood, by motion.
@@ -41,16 +41,16 @@ def simulate(config: SimulationConfig, source: object = "simulation") -> dict[st
     Raises:
         InputError: whatever does not fit, or a robot that does not keep standing; nothing has been written then.
     """
-    check_free(config.output, config.overwrite, SIMULATION, (source, config.robot.urdf))
+    check_free(config.output, config.overwrite, SIMULATION, [config.robot.urdf])
     robot = load_robot(config.robot.urdf)
-    simulation = set_up_simulation(config, source)
+    simulation = set_up_simulation(config)
     for motion in config.motions:
         simulation.reference(motion)
     with new_folder(config.output, config.overwrite, SIMULATION) as folder, progress_bars() as bars:
         (folder / "logs").mkdir()
         (folder / "exact").mkdir()
         bar = bars.add_task("simulating [s]", total=sum(LEAD_S + motion.duration_s for motion in config.motions))
-        stabilities = _in_processes(config, source, folder, lambda seconds: bars.update(bar, completed=seconds))
+        stabilities = _in_processes(config, folder, lambda seconds: bars.update(bar, completed=seconds))
         (folder / "simulation.yaml").write_text(dump(config))
         write_json(folder / "stability.json", {name: asdict(stability) for name, stability in stabilities.items()})
         (folder / "nominal.urdf").write_bytes(identified_urdf(robot, nominal_parameters(robot, config.nominal)))
@@ -62,9 +62,7 @@ def nominal_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -> 
     return parameters.perturb_parameters(robot.nominal, settings.error, np.random.default_rng([settings.seed, draw]))
 
 
-def _in_processes(
-    config: SimulationConfig, source: object, folder: Path, progress: Callable[[float], None]
-) -> dict[str, Stability]:
+def _in_processes(config: SimulationConfig, folder: Path, progress: Callable[[float], None]) -> dict[str, Stability]:
     """Simulate every motion, the longest first; `progress` gets the seconds simulated so far."""
     context = multiprocessing.get_context("spawn")
     done = context.Value("d", 0.0)
@@ -72,7 +70,9 @@ def _in_processes(
     pool = ProcessPoolExecutor(workers, context, _start_worker, (done,))
     try:
         ordered = sorted(config.motions, key=lambda motion: -motion.duration_s)
-        tasks = {motion.name: pool.submit(_simulate_motion, config, motion, source, folder) for motion in ordered}
+        tasks = {
+            motion.name: pool.submit(_simulate_motion, config, motion, folder, current_file()) for motion in ordered
+        }
         waiting = set(tasks.values())
         while waiting:
             finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
@@ -106,14 +106,15 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _simulate_motion(config: SimulationConfig, motion: MotionConfig, source: object, folder: Path) -> Stability:
-    """Simulate one motion in a worker and write its two logs."""
+def _simulate_motion(config: SimulationConfig, motion: MotionConfig, folder: Path, file: str) -> Stability:
+    """Simulate one motion of a file in a worker, which does not know of `about_file`, and write its two logs."""
 
     def progress(seconds: float) -> None:
         with _done.get_lock():
             _done.value += seconds
 
-    recording, stability = set_up_simulation(config, source).run(motion, progress)
+    with about_file(file):
+        recording, stability = set_up_simulation(config).run(motion, progress)
     write_log(recording.log, folder / "exact" / f"{motion.name}.npz")
     log = sensor_log(recording.log, config.sensors, config.seed)
     write_log(log, folder / "logs" / f"{motion.name}.npz")

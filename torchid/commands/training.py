@@ -59,17 +59,17 @@ def training_folder(output: Path) -> Path:
     return output.with_name(f"{output.name}.training")
 
 
-def require_trainable(config: ExperimentConfig, resume: bool, source: object) -> None:
+def require_trainable(config: ExperimentConfig, resume: bool) -> None:
     """Make sure, before any work, that a training may start or go on.
 
     Raises:
         ConfigError: nothing to go on with, or an unfinished training in the way.
     """
-    folder, output, inputs = training_folder(config.output), config.output, (source, *inputs_of(config))
+    folder, output, inputs = training_folder(config.output), config.output, inputs_of(config)
     if config.estimator.name != "sgd":
         if resume:
             found = f"{config.estimator.name}, which is done in one go"
-            raise ConfigError(source, "--resume", found, "estimator.name: sgd, or no --resume")
+            raise ConfigError.at_field("--resume", found, "estimator.name: sgd, or no --resume")
         return
     refuse_link(folder)
     recover_leftovers(folder, TRAINING)
@@ -96,9 +96,9 @@ class Training:
             InputError: optimizer, schedule or a number that cannot be.
         """
         config = experiment.config
-        self.config, self.robot, self.source = config, experiment.robot, experiment.source
+        self.config, self.robot = config, experiment.robot
         self.folder = training_folder(config.output)
-        self.settings = descent_settings(config, self.source)
+        self.settings = descent_settings(config)
         self._text, self._saved = dump_config(config), 0
 
     def run(
@@ -131,7 +131,7 @@ class Training:
         )
         trainer = Trainer(self.settings, problem, train, held_out if held_out.samples else None)
         if not trainer.closed_form.rank:
-            raise SensorError(self.source, "sensors", "no parameter is in reach of them", "other sensors or contacts")
+            raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors or contacts")
         self._prepare(trainer, resume)
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
         since = trainer.epoch + 1 if trainer.epoch else 0
@@ -144,8 +144,8 @@ class Training:
 
     def copy_curves(self, folder: Path) -> None:
         """Copy the training's event files into the finished run's folder."""
-        found = inspect_folder(self.folder, TRAINING)
-        for path in found.own if found else ():
+        contents = inspect_folder(self.folder, TRAINING)
+        for path in contents.own if contents else ():
             if fnmatchcase(path.name, EVENTS):
                 shutil.copy2(path, folder)
 
@@ -155,8 +155,8 @@ class Training:
         Warns:
             TorchidWarning: there is more in its folder than torchid wrote.
         """
-        if found := inspect_folder(self.folder, TRAINING):
-            found.remove()
+        if contents := inspect_folder(self.folder, TRAINING):
+            contents.remove()
         if self.folder.exists():
             message = f"{self.folder}: stays: it holds what torchid did not write"
             warn(message)
@@ -203,12 +203,12 @@ class Training:
         if set(state) != {"config", "logs", "trainer"}:
             raise InputError(path, "file", "not a checkpoint of a run", "one that torchid identify wrote")
         before, now = (yaml.safe_load(text) for text in (state["config"], self._text))
-        for place, old, new in _differences(before, now):
-            if place not in _FREE_TO_CHANGE:
-                raise ConfigError(self.source, place, f"{new}, but the checkpoint has {old}", "the same settings")
+        for key, old, new in _differences(before, now):
+            if key not in _FREE_TO_CHANGE:
+                raise ConfigError.at_field(key, f"{new}, but the checkpoint has {old}", "the same settings")
         rows, cost = _fingerprint(trainer)
         if state["logs"][0] != rows or abs(state["logs"][1] - cost) > _SAME * cost:
-            raise ConfigError(self.source, "logs", "not those of the checkpoint", "the same files, unchanged")
+            raise ConfigError.at_field("logs", "not those of the checkpoint", "the same files, unchanged")
 
     @contextmanager
     def _interruptible(self, trainer: Trainer) -> Iterator[None]:
@@ -222,7 +222,7 @@ class Training:
             raise
 
 
-def descent_settings(config: ExperimentConfig, source: object = "experiment") -> Sgd:
+def descent_settings(config: ExperimentConfig) -> Sgd:
     """What an experiment file says of a descent.
 
     Raises:
@@ -232,7 +232,7 @@ def descent_settings(config: ExperimentConfig, source: object = "experiment") ->
     try:
         settings.try_out()
     except InputError as error:
-        raise ConfigError(source, f"estimator.training.{error.field}", error.found, error.accepted) from error
+        raise ConfigError.at_field(f"estimator.training.{error.field}", error.found, error.accepted) from error
     return settings
 
 
@@ -255,13 +255,13 @@ def _fingerprint(trainer: Trainer) -> tuple[int, float]:
     return trainer.problem.rows, trainer.problem.cost(trainer.problem.nominal)
 
 
-def _differences(before: Any, now: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Places where two settings differ."""
+def _differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Keys, as in `estimator.ridge`, whose values differ between two settings, with both values."""
     if isinstance(before, dict) and isinstance(now, dict):
-        for key in dict.fromkeys([*before, *now]):
-            yield from _differences(before.get(key), now.get(key), f"{place}.{key}" if place else str(key))
+        for name in dict.fromkeys([*before, *now]):
+            yield from _differences(before.get(name), now.get(name), f"{key}.{name}" if key else str(name))
     elif before != now:
-        yield place, before, now
+        yield key, before, now
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BeforeValidator, Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
@@ -175,11 +174,11 @@ class EstimatorConfig(_ConditionsConfig, _FitConfig):
 
     def _settings(self, estimator: type[Settings], **given: Any) -> Settings:
         """An estimator with its fields taken from here, from `training`, or as given."""
-        found = vars(self) | vars(self.training) | {"ridge": self.numeric_ridge} | given
-        return estimator(**{key: found[key] for key in _fields(estimator) if key in found})
+        values = vars(self) | vars(self.training) | {"ridge": self.numeric_ridge} | given
+        return estimator(**{key: values[key] for key in _fields(estimator) if key in values})
 
 
-def validate_keys(estimator: EstimatorConfig, path: Path) -> None:
+def validate_keys(estimator: EstimatorConfig) -> None:
     """Refuse a setting that the estimator has not: it would be ignored in silence.
 
     Raises:
@@ -190,10 +189,10 @@ def validate_keys(estimator: EstimatorConfig, path: Path) -> None:
         having = _estimators_with(key)
         if estimator.name not in having and value != getattr(defaults, key):
             found = f"set, which {estimator.name} has not"
-            raise ConfigError(path, f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
+            raise ConfigError.at_field(f"estimator.{key}", found, f"name: {' or '.join(having)}, or no such key")
     if estimator.consistency != "penalties" and estimator.penalties != defaults.penalties:
         found = f"set, which consistency: {estimator.consistency} has not"
-        raise ConfigError(path, "estimator.penalties", found, "consistency: penalties, or no such key")
+        raise ConfigError.at_field("estimator.penalties", found, "consistency: penalties, or no such key")
 
 
 def _estimators_with(key: str) -> list[str]:

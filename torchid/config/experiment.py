@@ -24,7 +24,7 @@ from torchid.config.sensors import (
     spelled_out,
     validate_choice,
 )
-from torchid.errors import ConfigError, warn
+from torchid.errors import ConfigError, about_file, warn_about_file
 from torchid.logs import Topics
 from torchid.logs.containers import list_bag_files
 from torchid.logs.ros_topics import check_topics
@@ -211,26 +211,29 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
     """
     path = Path(path)
     config = load(_EXPERIMENT, path, overrides)
-    validate_choice(path, "sensors", config.sensors)
-    validate_keys(config.estimator, path)
-    _check_extras(path, config)
-    return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
+    with about_file(path):
+        validate_choice("sensors", config.sensors)
+        validate_keys(config.estimator)
+        _check_extras(config)
+        return dataclasses.replace(config, logs=_checked_logs(config, config.logs))
 
 
 def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeConfig:
     """Read an experiment file for `torchid analyze`: as `load_config`, but logs and sensors may be left out."""
     path = Path(path)
     config = load(_ANALYSIS, path, overrides)
-    validate_choice(path, "sensors", config.sensors, may_be_empty=True)
-    validate_keys(config.estimator, path)
-    _check_extras(path, config)
-    for name, choice in config.analysis.compare.items():
-        validate_choice(path, f"analysis.compare.{name}", choice)
-    if config.logs is None:
+    with about_file(path):
+        validate_choice("sensors", config.sensors, may_be_empty=True)
+        validate_keys(config.estimator)
+        _check_extras(config)
+        for name, choice in config.analysis.compare.items():
+            validate_choice(f"analysis.compare.{name}", choice)
+        if config.logs is not None:
+            return dataclasses.replace(config, logs=_checked_logs(config, config.logs))
         if config.analysis.compare:
-            raise ConfigError(path, "analysis.compare", "set, without logs to predict accuracy from", "logs.train too")
-        return config
-    return dataclasses.replace(config, logs=_checked_logs(path, config, config.logs))
+            found = "set, without logs to predict accuracy from"
+            raise ConfigError.at_field("analysis.compare", found, "logs.train too")
+    return config
 
 
 def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
@@ -278,41 +281,41 @@ def load_topics(path: str | Path) -> Topics:
         UnknownNameError: a key that does not exist; the message names the nearest that do.
     """
     topics = load(_TOPICS, Path(path)).logs.topics
-    check_topics(path, topics)
+    with about_file(path):
+        check_topics(topics)
     return topics
 
 
-def _check_extras(path: Path, config: _Common) -> None:
+def _check_extras(config: _Common) -> None:
     """Refuse the same extra parameter under two keys, and extra parameters for a descent, which has none."""
     actuators, sensors = config.actuators, config.sensors
     if actuators.torque_offset and "joint_torque" in sensors.offsets:
         found = "set together with sensors.offsets.joint_torque, which is the same"
-        raise ConfigError(path, "actuators.torque_offset", found, "one of the two")
+        raise ConfigError.at_field("actuators.torque_offset", found, "one of the two")
     unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items()}
     unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
-    for field, wanted in unknowns.items():
-        if wanted and config.estimator.name == "sgd":
-            raise ConfigError(path, field, "set, which sgd has not", "estimator.name: least_squares or consistent")
+    for field, is_set in unknowns.items():
+        if is_set and config.estimator.name == "sgd":
+            raise ConfigError.at_field(field, "set, which sgd has not", "estimator.name: least_squares or consistent")
 
 
-def _checked_logs(path: Path, config: _Common, logs: LogsConfig) -> LogsConfig:
+def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:
     """The logs with patterns resolved; refuses logs that an estimator has no use for, or with two uses."""
-    _check_held_out(path, config.estimator, logs)
-    found = {key: _matching(path, f"logs.{key}", getattr(logs, key)) for key in ("train", "test", "validation")}
+    _check_held_out(config.estimator, logs)
+    files = {key: _matching(f"logs.{key}", getattr(logs, key)) for key in ("train", "test", "validation")}
     for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
-        both = sorted({*found[key]} & {*found["test"]})
+        both = sorted({*files[key]} & {*files["test"]})
         if both:
-            message = f"{path}: logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion"
-            warn(message)
-    both = sorted({*found["train"]} & {*found["validation"]})
+            warn_about_file(f"logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion")
+    both = sorted({*files["train"]} & {*files["validation"]})
     if both:
-        raise ConfigError(path, "logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
+        raise ConfigError.at_field("logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
     if logs.topics is not None:
-        check_topics(path, logs.topics)
-    return LogsConfig(**found, topics=logs.topics)
+        check_topics(logs.topics)
+    return LogsConfig(**files, topics=logs.topics)
 
 
-def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
+def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
     """The paths, with every file that matches in place of a name with * or ? in it."""
     out: list[Path] = []
     for path in paths:
@@ -320,19 +323,23 @@ def _matching(source: Path, field: str, paths: Sequence[Path]) -> list[Path]:
             out.append(path)
             continue
         matching = path.parent.glob(path.name.replace("[", "[[]"))
-        found = sorted(file for file in matching if file.is_file() or list_bag_files(file))
-        if not found:
-            raise ConfigError(source, field, f"no file matches {path}", "a log, or a pattern of several")
-        out += found
+        files = sorted(file for file in matching if file.is_file() or list_bag_files(file))
+        if not files:
+            raise ConfigError.at_field(field, f"no file matches {path}", "a log, or a pattern of several")
+        out += files
     again = [path for path in out if out.count(path) > 1]
     if again:
-        raise ConfigError(source, field, f"{again[0]} is given twice", "every log once")
+        raise ConfigError.at_field(field, f"{again[0]} is given twice", "every log once")
     return out
 
 
-def _check_held_out(path: Path, estimator: EstimatorConfig, logs: LogsConfig) -> None:
+def _check_held_out(estimator: EstimatorConfig, logs: LogsConfig) -> None:
     """Refuse held-out logs without a descent, and patience without held-out logs."""
     if logs.validation and estimator.name != "sgd":
-        raise ConfigError(path, "logs.validation", f"set, which {estimator.name} has no use for", "estimator.name: sgd")
+        raise ConfigError.at_field(
+            "logs.validation", f"set, which {estimator.name} has no use for", "estimator.name: sgd"
+        )
     if estimator.training.patience is not None and not logs.validation:
-        raise ConfigError(path, "estimator.training.patience", "set, without logs to hold out", "logs.validation too")
+        raise ConfigError.at_field(
+            "estimator.training.patience", "set, without logs to hold out", "logs.validation too"
+        )

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
-from torchid.errors import ConfigError, UnknownNameError, during, excerpt, is_plain
+from torchid.errors import ConfigError, UnknownNameError, about_file, during, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML, read_bytes
 from torchid.logs.containers import READABLE
 from torchid.settings import accepted_values
@@ -103,7 +103,7 @@ def _check_scalar(value: str) -> None:
         raise ValueError(f"'{excerpt(value)}', but ${{...}} stands for nothing here")
 
 
-#: What YAML and OmegaConf raise at a value that is not what its tag or its place says.
+#: What YAML and OmegaConf raise at a value that is not what its tag or its key says.
 _NO_YAML = (
     OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, AssertionError, AttributeError, LookupError,
     ArithmeticError, RecursionError,
@@ -133,7 +133,7 @@ class FileKind(Generic[T]):
         outputs: keys that hold the path of a result.
         prepare: takes settings and those that will override them, and returns the settings to merge; it is called for
             the file and nothing, then, for each override, for all before and it, and for it and nothing.
-        accepted: the accepted values in messages, by place (`*` for a name from the file), where the type alone says
+        accepted: the accepted values in messages, by key (`*` for a name from the file), where the type alone says
             too little.
     """
 
@@ -146,11 +146,11 @@ class FileKind(Generic[T]):
     prepare: Callable[[Settings, Settings], Settings] = _as_is
     accepted: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
-    def accepted_at(self, place: Sequence[str], otherwise: str) -> str:
-        """What is accepted at a place."""
+    def accepted_at(self, key: Sequence[str], otherwise: str) -> str:
+        """What is accepted at a key."""
         for pattern, accepted in self.accepted.items():
             parts = pattern.split(".")
-            if len(parts) == len(place) and all(map(fnmatch, place, parts)):
+            if len(parts) == len(key) and all(map(fnmatch, key, parts)):
                 return accepted
         return otherwise
 
@@ -173,10 +173,11 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
 
 
 def _load(kind: FileKind[T], path: Path, overrides: Sequence[str]) -> T:
-    in_file = _absolute(path, _read(kind, path), kind.paths, path.resolve().parent)
-    settings = kind.prepare(_absolute(path, in_file, kind.outputs, Path.cwd()), {})
+    in_file = _absolute(_read(kind, path), kind.paths, path.resolve().parent)
+    settings = kind.prepare(_absolute(in_file, kind.outputs, Path.cwd()), {})
     for text in overrides:
-        given = _absolute("command line", _parsed(text), (*kind.paths, *kind.outputs), Path.cwd())
+        with about_file("command line"):
+            given = _absolute(_parsed(text), (*kind.paths, *kind.outputs), Path.cwd())
         try:
             layers = _cleared(kind.prepare(settings, given), given), kind.prepare(given, {})
             settings = _container(OmegaConf.merge(*layers))
@@ -186,7 +187,7 @@ def _load(kind: FileKind[T], path: Path, overrides: Sequence[str]) -> T:
     try:
         return TypeAdapter(kind.settings).validate_python(settings)
     except ValidationError as error:
-        raise _in_one_line(kind, path, error) from error
+        raise _in_one_line(kind, error) from error
 
 
 def dump(settings: object) -> str:
@@ -225,7 +226,7 @@ def _why(error: Exception) -> str:
 def _parsed(text: str) -> Settings:
     key, equals, value = text.partition("=")
     if not equals:
-        raise ConfigError("command line", excerpt(text), "not an override", "key.subkey=value")
+        raise ConfigError.at_field(excerpt(text), "not an override", "key.subkey=value")
     try:
         check_yaml(key)
         check_yaml(value)
@@ -233,7 +234,7 @@ def _parsed(text: str) -> Settings:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")
         return _container(OmegaConf.from_dotlist([text]))
     except _NO_YAML as error:
-        raise ConfigError("command line", excerpt(text), _why(error), "key.subkey=value, in YAML") from error
+        raise ConfigError.at_field(excerpt(text), _why(error), "key.subkey=value, in YAML") from error
 
 
 def _cleared(settings: Settings, given: Settings) -> Settings:
@@ -251,24 +252,24 @@ def _container(config: Any) -> Any:
     return OmegaConf.to_container(config, resolve=True)
 
 
-def _absolute(source: object, settings: Settings, keys: Sequence[str], folder: Path) -> Settings:
-    for place in keys:
+def _absolute(settings: Settings, keys: Sequence[str], folder: Path) -> Settings:
+    for key in keys:
         try:
-            settings = _absolute_at(settings, place.split("."), folder)
+            settings = _absolute_at(settings, key.split("."), folder)
         except (RuntimeError, ValueError) as error:
-            raise ConfigError(source, place.removesuffix(".*"), str(error), "a path") from error
+            raise ConfigError.at_field(key.removesuffix(".*"), str(error), "a path") from error
     return settings
 
 
-def _absolute_at(value: Any, place: Sequence[str], folder: Path) -> Any:
-    """The value with the path at a place made absolute; values of another type are left to the validation."""
-    if not place:
+def _absolute_at(value: Any, key: Sequence[str], folder: Path) -> Any:
+    """The value with the path at a key made absolute; values of another type are left to the validation."""
+    if not key:
         return _absolute_path(value, folder) if isinstance(value, str) else value
-    key, *rest = place
-    if key == "*":
+    name, *rest = key
+    if name == "*":
         return [_absolute_at(item, rest, folder) for item in value] if isinstance(value, list) else value
-    if isinstance(value, Mapping) and key in value:
-        return {**value, key: _absolute_at(value[key], rest, folder)}
+    if isinstance(value, Mapping) and name in value:
+        return {**value, name: _absolute_at(value[name], rest, folder)}
     return value
 
 
@@ -282,34 +283,34 @@ def _absolute_path(value: str, folder: Path) -> str:
     return path
 
 
-def _in_one_line(kind: FileKind[T], path: Path, error: ValidationError) -> ConfigError | UnknownNameError:
+def _in_one_line(kind: FileKind[T], error: ValidationError) -> ConfigError | UnknownNameError:
     """The first validation error as one line; an unknown key first, the likeliest cause of the others."""
     complaints = sorted(error.errors(), key=lambda e: e["type"] != "unexpected_keyword_argument")
     first = complaints[0]
-    place = [str(part) for part in first["loc"] if part != "[key]"]
-    field = ".".join(place)
+    key = [str(part) for part in first["loc"] if part != "[key]"]
+    field = ".".join(key)
     if first["type"] == "unexpected_keyword_argument":
-        keys = _keys_at(kind.settings, place[:-1])
-        elsewhere = list(_keys_named(place[-1], kind.settings))
-        valid = [*get_close_matches(place[-1], keys, cutoff=0.5), *elsewhere] if elsewhere else keys
-        return UnknownNameError(path, ".".join(place[:-1]) or "key", place[-1], valid)
+        keys = _keys_at(kind.settings, key[:-1])
+        elsewhere = list(_keys_named(key[-1], kind.settings))
+        valid = [*get_close_matches(key[-1], keys, cutoff=0.5), *elsewhere] if elsewhere else keys
+        return UnknownNameError.at_field(".".join(key[:-1]) or "key", key[-1], valid)
     missing = [list(map(str, e["loc"])) for e in complaints if e["type"] == "missing"]
     if missing:
-        wanted = {".".join(x): kind.accepted_at(x, _described(_hint_at(kind.settings, x))) for x in missing}
-        named = wanted.values() if len(wanted) == 1 else map(": ".join, wanted.items())
-        return ConfigError(path, ", ".join(wanted), "missing", "; ".join(named))
+        accepted_by_key = {".".join(x): kind.accepted_at(x, _described(_hint_at(kind.settings, x))) for x in missing}
+        named = accepted_by_key.values() if len(accepted_by_key) == 1 else map(": ".join, accepted_by_key.items())
+        return ConfigError.at_field(", ".join(accepted_by_key), "missing", "; ".join(named))
     if first["type"] == "too_short" and not first["input"]:
         empty = "an empty mapping" if isinstance(first["input"], Mapping) else "an empty list"
-        return ConfigError(path, field, empty, "at least one item")
-    found = first["input"]
-    shown = "a mapping" if isinstance(found, Mapping) else "a list" if isinstance(found, list) else _repr(found)
+        return ConfigError.at_field(field, empty, "at least one item")
+    value = first["input"]
+    shown = "a mapping" if isinstance(value, Mapping) else "a list" if isinstance(value, list) else _repr(value)
     if first["type"] == "dataclass_type":
-        accepted = f"a mapping with {', '.join(_keys_at(kind.settings, place))}"
+        accepted = f"a mapping with {', '.join(_keys_at(kind.settings, key))}"
     else:
         accepted = accepted_values(first)
     if first["type"] in ("dataclass_type", "dict_type"):
-        accepted = kind.accepted_at(place, accepted)
-    return ConfigError(path, field, f"found {shown}", accepted)
+        accepted = kind.accepted_at(key, accepted)
+    return ConfigError.at_field(field, f"found {shown}", accepted)
 
 
 def _repr(value: object) -> str:
@@ -319,26 +320,26 @@ def _repr(value: object) -> str:
         return f"a number of more than {sys.get_int_max_str_digits()} digits"
 
 
-def _keys_at(settings: Any, place: Sequence[str]) -> list[str]:
-    """Names of the keys accepted at a place in a dataclass."""
-    return [field.name for field in dataclasses.fields(_hint_at(settings, place))]
+def _keys_at(settings: Any, key: Sequence[str]) -> list[str]:
+    """Names of the keys accepted below a key of a dataclass."""
+    return [field.name for field in dataclasses.fields(_hint_at(settings, key))]
 
 
-def _hint_at(settings: Any, place: Sequence[str]) -> Any:
-    """The type of a place in a dataclass, through `list[X]`, `dict[str, X]` and `X | None`."""
+def _hint_at(settings: Any, key: Sequence[str]) -> Any:
+    """The type at a key of a dataclass, through `list[X]`, `dict[str, X]` and `X | None`."""
     hint = settings
-    for part in place:
+    for part in key:
         hint = _not_none(get_type_hints(hint)[part] if dataclasses.is_dataclass(hint) else get_args(hint)[-1])
     return hint
 
 
-def _keys_named(name: str, settings: Any, place: str = "") -> Iterator[str]:
+def _keys_named(name: str, settings: Any, prefix: str = "") -> Iterator[str]:
     """All keys of a name in a dataclass and those inside it, for one that is written in the wrong mapping."""
     for key, hint in get_type_hints(settings).items():
         if key == name:
-            yield place + key
+            yield prefix + key
         if dataclasses.is_dataclass(inner := _not_none(hint)):
-            yield from _keys_named(name, inner, f"{place}{key}.")
+            yield from _keys_named(name, inner, f"{prefix}{key}.")
 
 
 def _described(hint: Any) -> str:

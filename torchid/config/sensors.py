@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainSerializer, PlainValidator, TypeAdapter
@@ -127,14 +126,14 @@ Choice = Annotated[ChoiceConfig, BeforeValidator(spelled_out)]
 Sensors = Annotated[SensorsConfig, BeforeValidator(spelled_out)]
 
 
-def validate_choice(path: Path, field: str, sensors: ChoiceConfig, may_be_empty: bool = False) -> None:
+def validate_choice(field: str, sensors: ChoiceConfig, may_be_empty: bool = False) -> None:
     """Refuse a named set together with sensors by name, and a choice without any sensor.
 
     Raises:
         ConfigError: either.
     """
     if sensors.set is not None and (sensors.joint_torques or sensors.contact_wrenches):
-        raise ConfigError(path, field, f"set: {sensors.set} together with sensors by name", "one of the two")
+        raise ConfigError.at_field(field, f"set: {sensors.set} together with sensors by name", "one of the two")
     if sensors.empty and not may_be_empty:
         accepted = "full, contacts, joints, or joint_torques, contact_wrenches and ft_sensors by name"
-        raise ConfigError(path, field, "no sensor", accepted)
+        raise ConfigError.at_field(field, "no sensor", accepted)

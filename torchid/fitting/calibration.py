@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import ConfoundedWarning, LogError, join_names, warn
+from torchid.errors import ConfoundedWarning, LogError, about_file, current_file, join_names, warn, warn_about_file
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.robust import RobustLoss, fit_extras_robustly
 from torchid.identifiability.confounding import ExtraEstimate, disagreements, estimate_extras
@@ -152,12 +152,8 @@ def calibrations(
 _NAMED = 6  # sensors or bodies that a warning names
 
 
-def warn_of_confounded(extras: Sequence[ExtraEstimate], source: object = "logs") -> None:
-    """Name sensors whose offset or scale is confounded with other parameters, and these parameters.
-
-    Args:
-        extras: extra parameters of a fit.
-        source: named in warnings of what all logs have in common.
+def warn_of_confounded(extras: Sequence[ExtraEstimate]) -> None:
+    """Name sensors whose offset or scale, in the extra parameters of a fit, is confounded with other parameters.
 
     Warns:
         ConfoundedWarning: one for each log that has some.
@@ -167,9 +163,10 @@ def warn_of_confounded(extras: Sequence[ExtraEstimate], source: object = "logs")
         if confounded:
             named = _grouped(x.extra.label for x in confounded)
             others = _grouped(name for x in confounded for name in x.confounded_with if " of " not in name)
-            message = f"{log or source}: {named}: confounded with {others or 'each other'}; do not trust either"
+            message = f"{named}: confounded with {others or 'each other'}; do not trust either"
             advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
-            warn(f"{message}; {advice}", ConfoundedWarning)
+            with about_file(log or current_file()):
+                warn_about_file(f"{message}; {advice}", ConfoundedWarning)
 
 
 def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:

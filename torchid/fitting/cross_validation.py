@@ -56,8 +56,8 @@ def cross_validate(
 
     Blocks are contiguous in time, see `split_into_folds`: errors of successive samples are alike::
 
-        found = torchid.cross_validate(logs, fitter)
-        found.identified.rms["joint_torque"], found.nominal.rms["joint_torque"]  # [N m]
+        errors = torchid.cross_validate(logs, fitter)
+        errors.identified.rms["joint_torque"], errors.nominal.rms["joint_torque"]  # [N m]
 
     Args:
         logs: bound logs.
@@ -207,17 +207,17 @@ class Scorer:
             without_folds: those of a fit without each fold, by its number; none without cross-validation.
             progress: called with the number of samples done.
         """
-        alike = 0 if self.builder.extras else 1  # nominal parameters of all fits, unless extra ones belong to them
+        first = 0 if self.builder.extras else 1  # nominal parameters differ between fits by extra parameters alone
         sums = []
         for fold in sorted({log.fold for log in logs}):
             of_fold = [log for log in logs if log.fold == fold]
             own = [part for part in parts if part.fold == fold]
-            others = without_folds[fold][alike:] if without_folds else ()
+            others = without_folds[fold][first:] if without_folds else ()
             sums.append(self._sums(of_fold, own, [*compared, *others], progress))
         metrics = self._metrics(sums)
         held_out = None
         if without_folds:
-            held_out = CrossValidation(len(without_folds), metrics[0 if alike else 2], metrics[-1])
+            held_out = CrossValidation(len(without_folds), metrics[0 if first else 2], metrics[-1])
         return TrainingScore(_comparison(metrics), held_out)
 
     def _sums(

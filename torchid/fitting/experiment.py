@@ -13,7 +13,7 @@ from torchid import parameters
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
 from torchid.config.sensors import ChoiceConfig, NoiseConfig
-from torchid.errors import ConfigError, LogError, UnknownNameError, warn
+from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
@@ -48,13 +48,11 @@ class Scene:
         config: the settings.
         robot: the robot.
         contacts: the contacts in use.
-        source: the file, named in errors.
     """
 
     config: ExperimentConfig | AnalyzeConfig
     robot: Robot
     contacts: tuple[Contact, ...]
-    source: object = "experiment"
 
     @property
     def noise(self) -> SensorNoise:
@@ -85,8 +83,8 @@ class Scene:
             sensors = named_sensors(choice.set, robot.n, len(contacts), noise, ft)
         else:
             by_name = choice.joint_torques, choice.contact_wrenches
-            sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, self.source, ft)
-        return with_ft_sensors(sensors, robot, choice.ft_sensors, self.source)
+            sensors = chosen_sensors(robot.joint_names, contacts, *by_name, noise, ft)
+        return with_ft_sensors(sensors, robot, choice.ft_sensors)
 
     def builder(self, sensors: SensorSet) -> RowBuilder:
         """Builder of the rows of some sensors, on the device of the settings."""
@@ -105,7 +103,7 @@ class Scene:
         Warns:
             TorchidWarning: as `conditions_from`.
         """
-        return conditions_from(self.config.estimator, self.robot, self.source)
+        return conditions_from(self.config.estimator, self.robot)
 
     def frozen(self) -> np.ndarray:
         """Parameters of frozen bodies, (12 L,) bool.
@@ -113,7 +111,7 @@ class Scene:
         Raises:
             UnknownNameError: a frozen body that the robot does not have.
         """
-        return frozen_parameters(self.robot, self.config.estimator.frozen, self.source, "estimator.frozen")
+        return frozen_parameters(self.robot, self.config.estimator.frozen, "estimator.frozen")
 
     def fitter(self, builder: RowBuilder, conditions: Conditions) -> LogFitter:
         """Fitter of logs with the estimator of the settings; for a descent, the batch estimator that it approaches.
@@ -162,7 +160,7 @@ class Scene:
             return choose_ridge(parts, blocks, fitter, estimators, self.loss)
         except LogError as error:
             accepted = "a number, or longer logs"
-            raise ConfigError(self.source, "estimator.ridge", f"auto, but {error.found}", accepted) from error
+            raise ConfigError.at_field("estimator.ridge", f"auto, but {error.found}", accepted) from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,12 +190,8 @@ def _stated(noise: NoiseConfig) -> dict[str, Any]:
     return {name: x for name, x in vars(noise).items() if x is not None}
 
 
-def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "experiment") -> Scene:
-    """Load the robot and look its contacts up.
-
-    Args:
-        config: the experiment file.
-        source: its path, named in errors.
+def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
+    """Load the robot of an experiment file and look its contacts up.
 
     Raises:
         InputError: whatever in the file does not fit the robot.
@@ -205,32 +199,31 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig, source: object = "exp
     try:
         torch.empty(0, device=config.device)
     except (RuntimeError, AssertionError) as error:
-        raise ConfigError(
-            source, "device", f"'{config.device}' is not available here", "cpu, cuda, cuda:0, ..."
-        ) from error
+        found = f"'{config.device}' is not available here"
+        raise ConfigError.at_field("device", found, "cpu, cuda, cuda:0, ...") from error
     try:
         robot = load_robot(config.robot.urdf, config.robot.base_link, config.robot.fixed_base, _ft_joints(config))
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise
         field = _ft_field(config, error.name)
-        raise UnknownNameError(source, field, error.name, error.valid, error.what) from error
+        raise UnknownNameError.at_field(field, error.name, error.valid, error.what) from error
     if not robot.nv:
-        raise ConfigError(source, "robot", "a bolted base without a joint, which never moves", "a robot that can move")
-    contacts = validate_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts], source)
-    return Scene(config=config, robot=robot, contacts=contacts, source=source)
+        raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
+    contacts = validate_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts])
+    return Scene(config=config, robot=robot, contacts=contacts)
 
 
-def set_up(config: ExperimentConfig, source: object = "experiment") -> Experiment:
+def set_up(config: ExperimentConfig) -> Experiment:
     """As `set_up_scene`, with sensors resolved by name.
 
     Raises:
         InputError: whatever in the file does not fit the robot, or extra parameters of sensors that are not among the
             measured.
     """
-    scene = set_up_scene(config, source)
+    scene = set_up_scene(config)
     sensors = scene.sensors_of(config.sensors)
-    experiment = Experiment(config=config, robot=scene.robot, contacts=scene.contacts, source=source, sensors=sensors)
+    experiment = Experiment(config=config, robot=scene.robot, contacts=scene.contacts, sensors=sensors)
     _check_terms(experiment)
     return experiment
 
@@ -245,7 +238,7 @@ def _ft_joints(config: ExperimentConfig | AnalyzeConfig) -> list[str]:
 def _ft_field(config: ExperimentConfig | AnalyzeConfig, name: str) -> str:
     """Where a file names a fixed joint."""
     choices = {"sensors": config.sensors} | {f"analysis.compare.{key}": x for key, x in config.analysis.compare.items()}
-    named = (f"{place}.ft_sensors" for place, choice in choices.items() if name in choice.ft_sensors)
+    named = (f"{key}.ft_sensors" for key, choice in choices.items() if name in choice.ft_sensors)
     return next(named, "analysis.candidates.ft_sensors")
 
 
@@ -257,12 +250,11 @@ def _check_terms(experiment: Experiment) -> None:
         for channel in scopes:
             if channel not in measured and len(scopes) < len(CHANNELS):
                 accepted = f"{', '.join(measured)}, or log or all for every kind that is measured"
-                place = f"sensors.{field}.{channel}"
-                raise ConfigError(experiment.source, place, "no such sensor is measured", accepted)
-    for name, wanted in vars(experiment.config.actuators).items():
-        if wanted and "joint_torque" not in measured:
+                raise ConfigError.at_field(f"sensors.{field}.{channel}", "no such sensor is measured", accepted)
+    for name, value in vars(experiment.config.actuators).items():
+        if value and "joint_torque" not in measured:
             accepted = "joint torques among the sensors, or no such key"
-            raise ConfigError(experiment.source, f"actuators.{name}", "set, but no joint torque is measured", accepted)
+            raise ConfigError.at_field(f"actuators.{name}", "set, but no joint torque is measured", accepted)
 
 
 def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
@@ -284,7 +276,7 @@ def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastS
     return settings.consistent(conditions)
 
 
-def conditions_from(settings: EstimatorConfig, robot: Robot, source: object = "experiment") -> Conditions:
+def conditions_from(settings: EstimatorConfig, robot: Robot) -> Conditions:
     """Conditions on the parameters (L, 12) of a robot's bodies, as an experiment file says.
 
     Least squares may break them; those of a descent are a margin alone. `com_inside` leaves out bodies that are frozen,
@@ -293,7 +285,6 @@ def conditions_from(settings: EstimatorConfig, robot: Robot, source: object = "e
     Args:
         settings: of the estimator.
         robot: for its bodies, shapes and symmetry.
-        source: named in errors.
 
     Raises:
         ConfigError: a bound that nothing can meet or that has nothing to bound; shapes nowhere; bodies that are not
@@ -306,29 +297,29 @@ def conditions_from(settings: EstimatorConfig, robot: Robot, source: object = "e
     """
     if settings.name != "consistent":
         return Conditions(margin=settings.margin if settings.name == "sgd" else 0.0, names=robot.body_names)
-    lower, upper = _bounds(settings, robot, source)
+    lower, upper = _bounds(settings, robot)
     return Conditions(
         margin=settings.margin,
         total_mass=settings.total_mass,
-        enclosures=_enclosures(settings, robot, source),
-        mirrors=_mirrors(settings, robot, source),
+        enclosures=_enclosures(settings, robot),
+        mirrors=_mirrors(settings, robot),
         lower=lower,
         upper=upper,
         names=robot.body_names,
     )
 
 
-def _enclosures(settings: EstimatorConfig, robot: Robot, source: object) -> tuple[Enclosure, ...]:
+def _enclosures(settings: EstimatorConfig, robot: Robot) -> tuple[Enclosure, ...]:
     if settings.com_inside is None:
         if settings.com_shapes != EstimatorConfig.com_shapes:
             found = f"{settings.com_shapes}, without com_inside"
-            raise ConfigError(source, "estimator.com_shapes", found, "com_inside: box or ellipsoid as well")
+            raise ConfigError.at_field("estimator.com_shapes", found, "com_inside: box or ellipsoid as well")
         return ()
     bodies = [i for i, body in enumerate(robot.bodies) if not body.massless and body.name not in settings.frozen]
     extents = body_extents(robot, settings.com_shapes, bodies)
     if not extents:
         found = f"{settings.com_inside}, but {robot.path.name} says of no body that is fitted what shape it has"
-        raise ConfigError(source, "estimator.com_inside", found, "null, or a URDF with shapes")
+        raise ConfigError.at_field("estimator.com_inside", found, "null, or a URDF with shapes")
     out, outside = [], []
     for body, extent in extents.items():
         half = extent.half if settings.com_inside == "box" else extent.semi_axes
@@ -340,64 +331,61 @@ def _enclosures(settings: EstimatorConfig, robot: Robot, source: object) -> tupl
     if outside:
         message = f"the URDF's own centre of mass is outside the {settings.com_inside} at {', '.join(outside)}"
         advice = "are the shapes where the matter is? (estimator.com_shapes)"
-        warn(f"{source}: estimator.com_inside: {message}; {advice}")
+        warn_about_file(f"estimator.com_inside: {message}; {advice}")
     return tuple(out)
 
 
-def _mirrors(settings: EstimatorConfig, robot: Robot, source: object) -> tuple[Mirror, ...]:
+def _mirrors(settings: EstimatorConfig, robot: Robot) -> tuple[Mirror, ...]:
     symmetry = settings.symmetry
     if symmetry is None:
         return ()
-    pairs = mirror_pairs(
-        robot, symmetry.left, symmetry.right, symmetry.normal, source, "estimator.symmetry", settings.frozen
-    )
+    tokens = symmetry.left, symmetry.right, symmetry.normal
+    pairs = mirror_pairs(robot, *tokens, "estimator.symmetry", settings.frozen)
     return tuple(
         Mirror(pair.body, pair.image, pair.reflection) for pair in pairs if not robot.bodies[pair.body].massless
     )
 
 
-def _bounds(settings: EstimatorConfig, robot: Robot, source: object) -> tuple[Array | None, Array | None]:
+def _bounds(settings: EstimatorConfig, robot: Robot) -> tuple[Array | None, Array | None]:
     """Lower and upper bounds, (L, 12), None if the file has none."""
     if not settings.bounds:
         return None, None
     lower, upper = np.full(robot.nominal.shape, -np.inf), np.full(robot.nominal.shape, np.inf)
     for name, intervals in settings.bounds.items():
         if name not in robot.body_names:
-            raise UnknownNameError(source, "estimator.bounds", name, robot.body_names)
+            raise UnknownNameError.at_field("estimator.bounds", name, robot.body_names)
         body = robot.body_names.index(name)
         for parameter, (low, high) in intervals.items():
             field = f"estimator.bounds.{name}"
             if parameter not in PARAMETERS:
-                raise UnknownNameError(source, field, parameter, PARAMETERS)
+                raise UnknownNameError.at_field(field, parameter, PARAMETERS)
             number, field = PARAMETERS.index(parameter), f"{field}.{parameter}"
-            _check_fitted(settings, robot, body, parameter, source, field)
-            _check_interval(parameter, low, high, source, field)
+            _check_fitted(settings, robot, body, parameter, field)
+            _check_interval(parameter, low, high, field)
             lower[body, number] = -np.inf if low is None else low
             upper[body, number] = np.inf if high is None else high
     return lower, upper
 
 
-def _check_fitted(
-    settings: EstimatorConfig, robot: Robot, body: int, parameter: str, source: object, field: str
-) -> None:
+def _check_fitted(settings: EstimatorConfig, robot: Robot, body: int, parameter: str, field: str) -> None:
     """Refuse a bound on what stays as it is in the URDF."""
     name, friction = robot.body_names[body], parameter in _FRICTION
     if name in settings.frozen:
-        raise ConfigError(source, field, "a bound on a body that is frozen", "one of the two")
+        raise ConfigError.at_field(field, "a bound on a body that is frozen", "one of the two")
     if friction and robot.bodies[body].joint is None:
-        raise ConfigError(source, field, f"a bound on friction, but {name} is the base", "a body that a joint moves")
+        raise ConfigError.at_field(field, f"a bound on friction, but {name} is the base", "a body that a joint moves")
     if friction and not settings.friction:
-        raise ConfigError(source, field, "a bound on friction, which is not fitted", "friction: true")
+        raise ConfigError.at_field(field, "a bound on friction, which is not fitted", "friction: true")
     if not friction and robot.bodies[body].massless:
-        raise ConfigError(source, field, f"a bound, but {name} has no mass in the URDF", "a body that has")
+        raise ConfigError.at_field(field, f"a bound, but {name} has no mass in the URDF", "a body that has")
 
 
-def _check_interval(parameter: str, low: float | None, high: float | None, source: object, field: str) -> None:
+def _check_interval(parameter: str, low: float | None, high: float | None, field: str) -> None:
     """Refuse what no number, or no body, is within."""
     if low is not None and high is not None and low > high:
-        raise ConfigError(source, field, f"{low:g} above {high:g}", "[lower, upper], null for an open side")
+        raise ConfigError.at_field(field, f"{low:g} above {high:g}", "[lower, upper], null for an open side")
     negative = min(x for x in (low, high, 0.0) if x is not None) < 0.0
     if parameter in _FRICTION and negative:
-        raise ConfigError(source, field, f"[{low}, {high}]", "bounds of at least 0: friction resists")
+        raise ConfigError.at_field(field, f"[{low}, {high}]", "bounds of at least 0: friction resists")
     if parameter in _POSITIVE and high is not None and high <= 0.0:
-        raise ConfigError(source, field, f"at most {high:g}", "an upper bound above 0")
+        raise ConfigError.at_field(field, f"at most {high:g}", "an upper bound above 0")

@@ -144,16 +144,13 @@ class LogFitter:
             return [self.solve_problem(LogProblem(rest, self.assemble(rest))) for rest in rests]
 
 
-def frozen_parameters(
-    robot: Robot, bodies: Collection[str], source: object = "arguments", field: str = "frozen"
-) -> np.ndarray:
+def frozen_parameters(robot: Robot, bodies: Collection[str], field: str = "frozen") -> np.ndarray:
     """Parameters of some bodies, (12 L,) bool, that are to keep their nominal values.
 
     Args:
         robot: the robot.
         bodies: names of the bodies.
-        source: where they are named, for the error.
-        field: there.
+        field: that names them, for the error.
 
     Raises:
         UnknownNameError: a body that the robot does not have.
@@ -161,7 +158,7 @@ def frozen_parameters(
     frozen = np.zeros((len(robot.bodies), PER_BODY), dtype=bool)
     for name in bodies:
         if name not in robot.body_names:
-            raise UnknownNameError(source, field, name, robot.body_names)
+            raise UnknownNameError.at_field(field, name, robot.body_names)
         frozen[robot.body_names.index(name)] = True
     return frozen.flatten()
 

@@ -66,8 +66,8 @@ def estimate_noise(logs: Sequence[Samples], fitter: LogFitter, stated: Collectio
     Where some noise is stated and some not, the stated one counts as right but for a common factor: a filter leaves
     less of it than was recorded. What is estimated is given in the same proportion::
 
-        found = torchid.estimate_noise(logs, fitter, stated=["joint_torque"])
-        found.noise  # a SensorNoise, [N m] and [N]
+        summary = torchid.estimate_noise(logs, fitter, stated=["joint_torque"])
+        summary.noise  # a SensorNoise, [N m] and [N]
 
     Source: variance components by iterated minimum norm estimation, see `torchid.problem.noise`.
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, about_file
+from torchid.errors import LogError, about_file
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.log import (
     NAME_FIELDS,
@@ -171,9 +171,9 @@ def _of_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[s
                 spills[name].append(array)
             elif names.setdefault(name, array).tolist() != array.tolist():
                 found = f"'{names[name]}' and '{array}'"
-                raise FieldError(f"column '{name}'", found, "one name, the same in every row")
+                raise LogError.at_field(f"column '{name}'", found, "one name, the same in every row")
     if not spills:
-        raise FieldError("time", "no samples", "at least one sample")
+        raise LogError.at_field("time", "no samples", "at least one sample")
     return names, {name: spill.array() for name, spill in spills.items()}
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, current_file, excerpt, is_plain
+from torchid.errors import LogError, excerpt, is_plain
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
 from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS, UnknownFieldError, field_shape, is_quaternion
@@ -75,16 +75,16 @@ def parse_header(texts: Sequence[str]) -> TableLayout:
         LogError: a column that is unknown, given twice, missing or too many.
     """
     if len(texts) > MAX_COLUMNS:
-        raise FieldError("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
+        raise LogError.at_field("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
     given: dict[str, dict[str, _Column]] = {}
     for text in texts:
         if len(text) > MAX_LETTERS or not is_plain(text):
             found = f"a name of {len(text)} characters: {excerpt(text)}"
-            raise FieldError("header", found, f"names of one line and at most {MAX_LETTERS} characters")
+            raise LogError.at_field("header", found, f"names of one line and at most {MAX_LETTERS} characters")
         column = _parse_column(text)
         of_field = given.setdefault(column.field, {})
         if text in of_field:
-            raise FieldError(f"column '{text}'", "given twice", "every column once")
+            raise LogError.at_field(f"column '{text}'", "given twice", "every column once")
         of_field[text] = column
     names: dict[str, tuple[str, ...]] = {}
     for field in _COLUMN_FIELDS:
@@ -101,11 +101,11 @@ def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, _Co
     missing = [text for text in expected if text not in given]
     if missing:
         accepted = f"every column of {_column_pattern(field)}; a cell may be empty where nothing was measured"
-        raise FieldError(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
+        raise LogError.at_field(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
     stray = list(given.keys() - set(expected))
     if stray:
         found = f"a {_KIND[_names_of(field)]} that the first field of its kind does not name"
-        raise FieldError(f"column '{stray[0]}'", found, "the same names in all fields")
+        raise LogError.at_field(f"column '{stray[0]}'", found, "the same names in all fields")
 
 
 def _parse_column(text: str) -> _Column:
@@ -116,9 +116,9 @@ def _parse_column(text: str) -> _Column:
     """
     field, _, rest = text.partition(".")
     if _UNIT.search(text):
-        raise FieldError(f"column '{text}'", "a unit in its name", "names without units, values in SI units")
+        raise LogError.at_field(f"column '{text}'", "a unit in its name", "names without units, values in SI units")
     if field not in _COLUMN_FIELDS:
-        raise UnknownFieldError(current_file(), f"column '{text}'", field, _COLUMN_FIELDS)
+        raise UnknownFieldError.at_field(f"column '{text}'", field, _COLUMN_FIELDS)
     components, of = _component_names(field), _names_of(field)
     if of and components:
         name, _, component = rest.rpartition(".")
@@ -126,7 +126,7 @@ def _parse_column(text: str) -> _Column:
         name, component = (rest, "") if of else ("", rest)
     column = _Column(field, name, component)
     if str(column) != text or bool(name) != bool(of) or (component not in components if components else component):
-        raise FieldError(f"column '{text}'", "no such part of this field", _column_pattern(field))
+        raise LogError.at_field(f"column '{text}'", "no such part of this field", _column_pattern(field))
     return column
 
 

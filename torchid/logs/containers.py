@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, TorchidError, during, excerpt
+from torchid.errors import LogError, TorchidError, during, excerpt
 from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.spill import LazyArray, Spill
@@ -101,14 +101,14 @@ class Container(Protocol):
 
 @contextlib.contextmanager
 def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
-    """Turn whatever the readers raise on a damaged file, which no list covers, into a FieldError."""
+    """Turn whatever the readers raise on a damaged file, which no list covers, into a LogError."""
     try:
         yield
     except (TorchidError, Warning):
         raise
     except Exception as error:
         text = excerpt(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
-        raise FieldError(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
+        raise LogError.at_field(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
 
 
 def _suffix(path: Path) -> str:

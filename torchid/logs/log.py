@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, UnknownNameError, about_file, excerpt, is_plain
+from torchid.errors import LogError, UnknownNameError, about_file, excerpt, is_plain
 from torchid.guards import MAX_LETTERS
 from torchid.parameters import WRENCH_COMPONENTS
 
@@ -157,9 +157,9 @@ class Log:
             check_shape(name, array, SHAPES[name], sizes)
             wanted = np.dtype(np.bool_ if name == "contact_active" else np.float64)
             if array.dtype != wanted:
-                raise FieldError(name, f"values of type {array.dtype}", str(wanted))
+                raise LogError.at_field(name, f"values of type {array.dtype}", str(wanted))
         if all(getattr(self, name) is not None for name in WRENCHES):
-            raise FieldError(WRENCHES[1], f"given together with {WRENCHES[0]}", "one of the two")
+            raise LogError.at_field(WRENCHES[1], f"given together with {WRENCHES[0]}", "one of the two")
 
     def __len__(self) -> int:
         """Number of samples N."""
@@ -239,13 +239,13 @@ def check_shape(name: str, array: NDArray[Any], letters: FieldShape, sizes: Mapp
     if not fits:
         named, sized = (f"({', '.join(map(str, shape))})" for shape in (letters, expected))
         accepted = named if named == sized else f"{named} = {sized}"
-        raise FieldError(name, f"shape {array.shape}", f"shape {accepted}")
+        raise LogError.at_field(name, f"shape {array.shape}", f"shape {accepted}")
 
 
 def to_float64(name: str, array: NDArray[Any]) -> FloatArray:
     """The array as float64 (itself where it is already), LogError unless it holds real numbers."""
     if array.dtype.kind not in "fiu":
-        raise FieldError(name, f"values of type {array.dtype}", "real numbers")
+        raise LogError.at_field(name, f"values of type {array.dtype}", "real numbers")
     with np.errstate(over="ignore"):  # a longdouble too large becomes inf, which check_finite reports
         return np.asarray(array, dtype=np.float64)
 
@@ -272,19 +272,19 @@ def check_finite(name: str, values: FloatArray, *, allow_nan: bool = False, labe
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
         accepted = f"numbers of at most {LARGEST:g}" if np.isfinite(values[index]) else "finite numbers"
         accepted += ", or NaN where nothing was measured" if allow_nan else ""
-        raise FieldError(name, f"{values[index]} at {describe_element(index, labels)}", accepted)
+        raise LogError.at_field(name, f"{values[index]} at {describe_element(index, labels)}", accepted)
 
 
 def check_time(time: FloatArray) -> None:
     """Raise LogError unless `time` (N,) [s] has samples, is finite and increases strictly."""
     if not len(time):
-        raise FieldError("time", "no samples", "at least one sample")
+        raise LogError.at_field("time", "no samples", "at least one sample")
     check_finite("time", time)
     still = time[1:] <= time[:-1]
     if still.any():
         i = int(np.argmax(still))
         found = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
-        raise FieldError("time", found, "strictly increasing seconds")
+        raise LogError.at_field("time", found, "strictly increasing seconds")
 
 
 def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) -> FloatArray:
@@ -299,7 +299,7 @@ def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) 
     if bad.any():
         i = int(np.argmax(bad))
         found = f"norm {norm[i]:.6g} at sample {i}"
-        raise FieldError(name, found, f"unit quaternions, to {QUATERNION_TOLERANCE:g}")
+        raise LogError.at_field(name, found, f"unit quaternions, to {QUATERNION_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # what was normalised before stays as it is, to the last bit
     return np.asarray(quat / norm[:, None], dtype=np.float64)
 
@@ -308,19 +308,19 @@ def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:
     """The names in a one-dimensional array of strings or UTF-8 bytes, LogError on anything else or a duplicate."""
     check_shape(name, array, SHAPES[name] or (1,), {})
     if array.size and array.dtype.kind not in "US":
-        raise FieldError(name, f"values of type {array.dtype}", "strings")
+        raise LogError.at_field(name, f"values of type {array.dtype}", "strings")
     try:
         names = tuple(item.decode() if isinstance(item, bytes) else str(item) for item in array.tolist())
     except UnicodeDecodeError as error:
-        raise FieldError(name, f"bytes that are no text ({error})", "UTF-8 strings") from error
+        raise LogError.at_field(name, f"bytes that are no text ({error})", "UTF-8 strings") from error
     seen: set[str] = set()
     for i, item in enumerate(names):
         if len(item) > MAX_LETTERS or not is_plain(item):
             accepted = f"printable names of at most {MAX_LETTERS} characters"
-            raise FieldError(name, f"'{excerpt(item)}' at {i}", accepted)
+            raise LogError.at_field(name, f"'{excerpt(item)}' at {i}", accepted)
         if not item or item in seen:
             found = f"'{item}' again at {i}" if item else f"an empty name at {i}"
-            raise FieldError(name, found, "names that are all different")
+            raise LogError.at_field(name, found, "names that are all different")
         seen.add(item)
     return names
 
@@ -328,7 +328,7 @@ def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:
 def parse_frame(name: str, array: NDArray[Any]) -> str:
     """The one name in an array of strings or UTF-8 bytes of any shape, LogError on anything else."""
     if array.size != 1:
-        raise FieldError(name, f"{array.size} values", "one name")
+        raise LogError.at_field(name, f"{array.size} values", "one name")
     return parse_names(name, array.reshape(1))[0]
 
 
@@ -340,5 +340,7 @@ def parse_flags(name: str, array: NDArray[Any], labels: tuple[str, ...]) -> Bool
     bad = (values != 0.0) & (values != 1.0)
     if bad.any():
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
-        raise FieldError(name, f"{values[index]:g} at {describe_element(index, labels)}", "true and false, or 1 and 0")
+        raise LogError.at_field(
+            name, f"{values[index]:g} at {describe_element(index, labels)}", "true and false, or 1 and 0"
+        )
     return np.asarray(values, dtype=np.bool_)

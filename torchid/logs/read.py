@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, about_file, current_file, during
+from torchid.errors import LogError, about_file, current_file, during
 from torchid.logs.containers import (
     LogKind,
     existing_log_kind,
@@ -110,25 +110,25 @@ def _check_names(names: Collection[str]) -> None:
     known = (*SHAPES, *VARIANTS)
     for name in names:
         if name not in known:
-            raise UnknownFieldError(current_file(), "field", name, known)
+            raise UnknownFieldError.at_field("field", name, known)
     for name in REQUIRED:
         if name not in names:
-            raise FieldError(name, "missing", f"a log with {', '.join(REQUIRED)}")
+            raise LogError.at_field(name, "missing", f"a log with {', '.join(REQUIRED)}")
 
 
 def _check_combination(names: Collection[str]) -> None:
     """Raise LogError on fields that exclude each other, or that need a field that is missing."""
     for one, other in EXCLUSIVE:
         if one in names and other in names:
-            raise FieldError(one, f"given together with {other}", "one of the two")
+            raise LogError.at_field(one, f"given together with {other}", "one of the two")
     for name, others in REQUIRED_WITH.items():
         missing = [other for other in others if other not in names]
         if name in names and missing:
-            raise FieldError(name, f"given without {missing[0]}", f"{name} together with {missing[0]}")
+            raise LogError.at_field(name, f"given without {missing[0]}", f"{name} together with {missing[0]}")
     for name, canonical in VARIANTS.items():
         if name in names and not is_quaternion(name) and not any(map(is_quaternion, names)):
             accepted = f"with base_quat_wxyz or base_quat_xyzw, or as {canonical}"
-            raise FieldError(name, "given without the base's orientation", accepted)
+            raise LogError.at_field(name, "given without the base's orientation", accepted)
 
 
 def _checked(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, UnknownNameError, current_file, warn
+from torchid.errors import LogError, UnknownNameError, warn_about_file
 from torchid.guards import MAX_ARRAYS, check_names, require_plain_name
 from torchid.logs.log import FloatArray
 
@@ -42,13 +42,13 @@ def make_deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
     """
     store = _typestore(channel.encoding)
     if store is None:
-        raise FieldError(topic, f"messages serialized as '{channel.encoding}'", "cdr (ROS 2) or ros1")
+        raise LogError.at_field(topic, f"messages serialized as '{channel.encoding}'", "cdr (ROS 2) or ros1")
     if channel.encoding == "ros1":
         return lambda data: store.deserialize_ros1(data, channel.type)
 
     def deserialize(data: bytes) -> Any:
         if data.startswith(_ZSTD):
-            raise FieldError(topic, "messages compressed one by one", "a bag without message compression")
+            raise LogError.at_field(topic, "messages compressed one by one", "a bag without message compression")
         return store.deserialize_cdr(data, channel.type)
 
     return deserialize
@@ -71,7 +71,7 @@ class _Constant:
     def check(self, value: str) -> None:
         self.value = self.value or require_plain_name(value)
         if value != self.value:
-            raise FieldError(
+            raise LogError.at_field(
                 self._topic, f"{self._field} '{self.value}', then '{require_plain_name(value)}'", f"one {self._field}"
             )
 
@@ -110,15 +110,19 @@ class JointStates:
         if parts != self._parts or "position" not in parts:
             found = f"a message with {' and '.join(parts) or 'nothing'}"
             accepted = f"positions, and in every message {' and '.join(self._parts) or 'the same'}"
-            raise FieldError(self._topic, found, accepted)
+            raise LogError.at_field(self._topic, found, accepted)
         values = [getattr(message, part) for part in parts]
         if any(len(x) != len(names) for x in values):
-            raise FieldError(self._topic, f"{[len(x) for x in values]} values of {len(names)} names", "one per name")
+            raise LogError.at_field(
+                self._topic, f"{[len(x) for x in values]} values of {len(names)} names", "one per name"
+            )
         return np.concatenate([x[order] for x in values])
 
     def _order(self, names: tuple[str, ...]) -> list[int] | slice | None:
         if len(set(names)) != len(names):
-            raise FieldError(self._topic, f"names {', '.join(names[:4])}, ... that repeat", "joints of different names")
+            raise LogError.at_field(
+                self._topic, f"names {', '.join(names[:4])}, ... that repeat", "joints of different names"
+            )
         self.names = self.names or names
         known = {name: i for i, name in enumerate(names)}
         missing = [name for name in self.names if name not in known]
@@ -127,7 +131,7 @@ class JointStates:
         if missing or (not self._given and len(names) != len(self.names)):
             found = f"a message without {missing[0]}" if missing else f"a message with {len(names)} joints"
             accepted = f"all {len(self.names)} joints in every message, or joint_states.joints with those that are"
-            raise FieldError(self._topic, found, accepted)
+            raise LogError.at_field(self._topic, found, accepted)
         order = [known[name] for name in self.names]
         return slice(None) if order == list(range(len(names))) else order  # which need not be copied
 
@@ -151,7 +155,9 @@ class Imu:
         self.frame.check(message.header.frame_id)
         for part in ("linear_acceleration", "angular_velocity"):
             if getattr(message, f"{part}_covariance")[0] == -1.0:
-                raise FieldError(self._topic, f"no {part} (the first of its covariances is -1)", "an IMU with both")
+                raise LogError.at_field(
+                    self._topic, f"no {part} (the first of its covariances is -1)", "an IMU with both"
+                )
         return np.array([*_vector(message.linear_acceleration), *_vector(message.angular_velocity)])
 
     def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
@@ -259,7 +265,7 @@ class TopicMessages:
         self._received.append(received)
         self._values.frombytes(np.asarray(row, dtype=np.float64).tobytes())
         if 8 * len(self._values) > MAX_ARRAYS:
-            raise FieldError(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
+            raise LogError.at_field(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
 
     def to_series(self) -> TopicSeries:
         """All messages in the order of their stamps, each once.
@@ -273,9 +279,9 @@ class TopicMessages:
         """
         if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.other_joints:
             index, (name, *_) = "logs.topics.joint_states.joints", self._decoder.names
-            raise UnknownNameError(current_file(), index, name, self._decoder.other_joints)
+            raise UnknownNameError.at_field(index, name, self._decoder.other_joints)
         if not self._stamps:
-            raise FieldError(self.topic, "no messages", "at least one")
+            raise LogError.at_field(self.topic, "no messages", "at least one")
         stamps: Stamps = np.array(self._stamps, dtype=np.int64)
         rows: FloatArray = np.array(self._values, dtype=np.float64).reshape(len(stamps), -1)
         stamped = bool(stamps.any())
@@ -290,8 +296,7 @@ class TopicMessages:
             if differ.any():
                 at = stamps[again[np.argmax(differ)]] / 1e9
                 found = f"messages of different content with one stamp, {at:.9f} s"
-                raise FieldError(self.topic, found, "every stamp once")
-            message = f"{current_file()}: {self.topic}: {len(again)} messages come twice; each counts once"
-            warn(message)
+                raise LogError.at_field(self.topic, found, "every stamp once")
+            warn_about_file(f"{self.topic}: {len(again)} messages come twice; each counts once")
             stamps, rows = np.delete(stamps, again), np.delete(rows, again, axis=0)
         return TopicSeries(self.topic, stamps, self._decoder.fields(rows), stamped)

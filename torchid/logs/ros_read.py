@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, UnknownNameError, current_file, how_to_install, warn
+from torchid.errors import LogError, UnknownNameError, how_to_install, warn_about_file
 from torchid.logs.containers import list_bag_files, reader_errors_explained
 from torchid.logs.log import FloatArray, is_quaternion, normalize_quaternions
 from torchid.logs.quaternion import make_sign_continuous
@@ -82,7 +82,7 @@ class _CommonClock:
             at = self.seconds(series.stamps[inside])[0]
             found = f"a gap of {step:.4g} s from {at:.4g} s on, where the median step is {median:.4g} s"
             accepted = f"steps of at most {LONGEST_STEP:g} median steps: cut the bag there"
-            raise FieldError(series.topic, found, accepted)
+            raise LogError.at_field(series.topic, found, accepted)
         before, after = np.searchsorted(series.stamps[long], self.stamps[[0, -1]])
         start = int(long[before - 1]) + 1 if before else 0
         return slice(start, int(long[after]) + 1 if after < len(long) else len(series.stamps))
@@ -95,8 +95,7 @@ class _CommonClock:
             return np.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True))
         gaps = np.isnan(values).any(axis=0)
         if gaps.any() and not np.isnan(values[:, gaps]).all():
-            message = f"{current_file()}: {series.topic}: NaN in part of {name}: NaN throughout after interpolation"
-            warn(message)
+            warn_about_file(f"{series.topic}: NaN in part of {name}: NaN throughout after interpolation")
         out = np.full((len(self.stamps), values.shape[1]), np.nan)
         out[:, ~gaps] = spline_derivatives(stamps, values[:, ~gaps], self.time, (0,))[0]
         return out
@@ -125,7 +124,7 @@ def _make_common_clock(
         found = (
             f"{late.topic} starts at {late.stamps[0] / 1e9:.3f} s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
         )
-        raise FieldError("time", f"no stamp of {rate.topic} that all topics cover: {found}", "one common clock")
+        raise LogError.at_field("time", f"no stamp of {rate.topic} that all topics cover: {found}", "one common clock")
     return _CommonClock(stamps)
 
 
@@ -154,10 +153,10 @@ class _Bag:
                 continue
             name, field = topic.topic, f"logs.topics.{role}"
             if name not in self.channels:
-                raise UnknownNameError(current_file(), field, name, self.channels)
+                raise UnknownNameError.at_field(field, name, self.channels)
             decoder, given = _decoder(topic), self.channels[name].type
             if given not in decoder.types:
-                raise FieldError(field, f"{name} carries {given}", " or ".join(decoder.types))
+                raise LogError.at_field(field, f"{name} carries {given}", " or ".join(decoder.types))
             self.decoders[role], self.rows[role] = decoder, TopicMessages(name, decoder)
 
 
@@ -181,7 +180,7 @@ def read_bag(
     """
     files = list_bag_files(path)
     if topics is not None:
-        check_topics(path, topics)
+        check_topics(topics)
     channels: dict[str, Channel] = {}
     for file in files:
         with _open_bag_file(file) as opened:
@@ -189,16 +188,16 @@ def read_bag(
                 first = channels.setdefault(channel.topic, channel)
                 if first != channel:
                     found = f"both {first.type} and {channel.type}"
-                    raise FieldError(channel.topic, found, "one type of message per topic")
+                    raise LogError.at_field(channel.topic, found, "one type of message per topic")
     if topics is None:
-        raise FieldError("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
+        raise LogError.at_field("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
     bag = _Bag(topics, channels)
     _read(bag, files, progress or (lambda share: None))
     series = {role: rows.to_series() for role, rows in bag.rows.items()}
     unstamped = dict.fromkeys(x.topic for x in series.values() if not x.stamped)
     if unstamped:
         what = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
-        warn(f"{current_file()}: {', '.join(unstamped)}: {what}")
+        warn_about_file(f"{', '.join(unstamped)}: {what}")
     sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
     events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
     clock = _make_common_clock(sampled[topics.rate_topic], sampled, events)
@@ -279,7 +278,7 @@ def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -
             frame = bag.topics.imu.frame or decoder.frame.value.removeprefix("/")
             if not frame:
                 accepted = "logs.topics.imu.frame, the frame of the URDF it sits at"
-                raise FieldError(bag.topics.imu.topic, "no header.frame_id", accepted)
+                raise LogError.at_field(bag.topics.imu.topic, "no header.frame_id", accepted)
             out["imu_frame"] = np.array(frame)
     return out
 
@@ -312,7 +311,7 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
         force = np.linalg.norm(measured.fields["wrench"][:, :3], axis=1)
     if np.isnan(force).any() or threshold is None:
         accepted = "forces to compare with contact_force_threshold, or contact_active"
-        raise FieldError(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
+        raise LogError.at_field(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
     return clock.hold(measured, force) > threshold
 
 
@@ -345,5 +344,4 @@ def _check_frame(bag: _Bag, role: str, expected: str | None, otherwise: str = ""
     if found and (expected is None or found.removeprefix("/") != expected.removeprefix("/")):
         taken_for = otherwise if expected is None else f"'{expected}'"
         what = f"frame '{found}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
-        message = f"{current_file()}: {bag.rows[role].topic}: {what}"
-        warn(message)
+        warn_about_file(f"{bag.rows[role].topic}: {what}")

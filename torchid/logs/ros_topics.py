@@ -119,7 +119,7 @@ class Topics:
         return tuple(dict.fromkeys((*self.contact_wrenches, *self.contact_active)))
 
 
-def check_topics(source: object, topics: Topics) -> None:
+def check_topics(topics: Topics) -> None:
     """Make sure that a map of topics is complete.
 
     Raises:
@@ -129,11 +129,11 @@ def check_topics(source: object, topics: Topics) -> None:
     for name, contact in topics.contact_active.items():
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
-            raise ConfigError(source, f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
+            raise ConfigError.at_field(f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
     unsaid = [name for name in topics.contact_wrenches if name not in topics.contact_active]
     if unsaid and topics.contact_force_threshold is None:
         found = f"missing, though nothing else says when {unsaid[0]} touches"
-        raise ConfigError(source, "logs.topics.contact_force_threshold", found, "a force [N], or contact_active")
+        raise ConfigError.at_field("logs.topics.contact_force_threshold", found, "a force [N], or contact_active")
     stamped = [role for role in topics.by_role if not role.startswith("contact_active.")]
     if topics.rate_topic not in stamped:
-        raise UnknownNameError(source, "logs.topics.rate_topic", topics.rate_topic, stamped)
+        raise UnknownNameError.at_field("logs.topics.rate_topic", topics.rate_topic, stamped)

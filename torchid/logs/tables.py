@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import FieldError, LogError, excerpt, how_to_install
+from torchid.errors import LogError, excerpt, how_to_install
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_size
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, column_names, parse_header
 from torchid.logs.containers import atomic_output, reader_errors_explained
@@ -234,7 +234,7 @@ def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
     if column == TEXT_COLUMN:
         if len(words) != 1 or words[0] is None:
             found = " and ".join("an empty cell" if word is None else f"'{excerpt(word)}'" for word in words[:2])
-            raise FieldError(f"column '{column}'", found, "one name, the same in every row")
+            raise LogError.at_field(f"column '{column}'", found, "one name, the same in every row")
         check_names([1], len(words[0]))
         return np.array(words[0].strip())
     numbers = {word: np.nan if word is None else _number(column, word) for word in words}
@@ -247,7 +247,7 @@ def _number(column: str, word: str) -> float:
     try:
         return float(_FLAGS.get(word.strip().lower(), word))
     except ValueError as error:
-        raise FieldError(f"column '{column}'", f"'{excerpt(word)}'", "true and false, or 1 and 0") from error
+        raise LogError.at_field(f"column '{column}'", f"'{excerpt(word)}'", "true and false, or 1 and 0") from error
 
 
 def _columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -263,12 +263,12 @@ def _columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         flat = array.reshape(len(array), -1)
         for j, text in enumerate(column_names(field, names)):
             if text != text.strip():
-                raise FieldError(f"column '{text}'", "a space at its end", "names without")
+                raise LogError.at_field(f"column '{text}'", "a space at its end", "names without")
             columns[text] = flat[:, j]
     layout = parse_header(list(columns))
     for name, given in names.items():
         if given and layout.names.get(name) != given:
-            raise FieldError(name, "names without any values", "a .npz or .h5 file, or a field of them")
+            raise LogError.at_field(name, "names without any values", "a .npz or .h5 file, or a field of them")
     return columns
 
 

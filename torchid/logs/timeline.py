@@ -11,7 +11,7 @@ import numpy as np
 from scipy import signal
 from scipy.interpolate import make_interp_spline
 
-from torchid.errors import FieldError, InputError, current_file, warn
+from torchid.errors import InputError, LogError, warn_about_file
 from torchid.logs.log import BoolArray, FloatArray, check_time
 
 # -------------------------------------------------------------------------------------------------------------- splines
@@ -238,7 +238,7 @@ def lay_out_timeline(
     fewest = FEWEST_DIFFERENTIATED if differentiates else FEWEST_FILTERED
     if len(time) < fewest:
         accepted = f"at least {fewest} to filter, resample or differentiate"
-        raise FieldError("time", f"{len(time)} samples", accepted)
+        raise LogError.at_field("time", f"{len(time)} samples", accepted)
     native = time - time[0]
     step = _median_step(native)
     grid, low_pass = native, None
@@ -259,12 +259,12 @@ def lay_out_timeline(
         _check_rate("sample_rate_hz", sample_rate_hz, FASTEST / step, accepted)
         if cutoff_hz is not None and cutoff_hz >= 0.5 * sample_rate_hz:
             accepted = f"a rate above {2.0 * cutoff_hz:g} Hz, twice the cutoff, so that nothing aliases"
-            raise InputError(current_file(), "preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
+            raise InputError.at_field("preprocessing.sample_rate_hz", f"{sample_rate_hz:g}", accepted)
         output = _uniform(grid[kept], sample_rate_hz)
         if len(output) < 2:
             found = f"{sample_rate_hz:g}, which leaves one sample"
             accepted = f"more than {1.0 / (grid[kept][-1] - grid[kept][0]):.3g} Hz for this log"
-            raise InputError(current_file(), "preprocessing.sample_rate_hz", found, accepted)
+            raise InputError.at_field("preprocessing.sample_rate_hz", found, accepted)
     if low_pass is None or cutoff_hz is None:
         return Timeline(native, grid, kept, output, None, 0.0, float(time[0]))
     passed = low_pass.noise_share * 0.5 / float(np.median(np.diff(grid)))
@@ -279,13 +279,10 @@ def _median_step(native: FloatArray) -> float:
     if steps[longest] > LONGEST_STEP * step:
         found = f"a step of {steps[longest]:.6g} s after sample {longest}"
         accepted = f"steps of at most {LONGEST_STEP:g} times the median of {step:.6g} s; split the log there"
-        raise FieldError("time", found, accepted)
+        raise LogError.at_field("time", found, accepted)
     if steps[shortest] < SHORTEST_STEP * step:
-        message = (
-            f"{current_file()}: time: a step of {steps[shortest]:.6g} s after sample {shortest}, the median being"
-            f" {step:.6g} s: interpolation multiplies the noise there"
-        )
-        warn(message)
+        what = f"a step of {steps[shortest]:.6g} s after sample {shortest}, the median being {step:.6g} s"
+        warn_about_file(f"time: {what}: interpolation multiplies the noise there")
     return step
 
 
@@ -294,7 +291,7 @@ def _check_rate(field: str, value: object, limit: float, meaning: str) -> None:
     if isinstance(value, numbers.Real) and not isinstance(value, bool) and 0.0 < float(value) < limit:
         return
     accepted = f"a number above 0 and below {limit:.6g} Hz, {meaning}"
-    raise InputError(current_file(), f"preprocessing.{field}", repr(value), accepted)
+    raise InputError.at_field(f"preprocessing.{field}", repr(value), accepted)
 
 
 def _unspoiled(grid: FloatArray, step: float, cutoff_hz: float, padding: int) -> slice:
@@ -304,7 +301,7 @@ def _unspoiled(grid: FloatArray, step: float, cutoff_hz: float, padding: int) ->
     if not len(inside) or len(grid) <= padding:
         shortest = max(2.0 * margin, padding * step)
         accepted = f"more than {shortest:.6g} s for a cutoff of {cutoff_hz:g} Hz, which spoils both ends of a log"
-        raise FieldError("time", f"{grid[-1]:.6g} s ({len(grid)} samples)", accepted)
+        raise LogError.at_field("time", f"{grid[-1]:.6g} s ({len(grid)} samples)", accepted)
     return slice(int(inside[0]), int(inside[-1]) + 1)
 
 

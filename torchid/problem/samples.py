@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import LogError, UnknownNameError
+from torchid.errors import LogError, UnknownNameError, about_file
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import unloaded_readings
@@ -231,7 +231,8 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
     """Columns of the log's contacts in the experiment's order, and their activity (N, C)."""
     frames = [contact.frame for contact in contacts]
     for column, name in enumerate(log.contact_names):
-        robot.link(name, "contact_names", log.source)
+        with about_file(log.source):
+            robot.link(name, "contact_names")
         if name not in frames and log.contact_active is not None and log.contact_active[:, column].any():
             raise LogError(log.source, f"contact_names '{name}'", "active, but not among the experiment's contacts",
                            f"contacts: [{{frame: {name}, type: ...}}, ...]")  # fmt: skip

@@ -13,7 +13,15 @@ import torch
 from yourdfpy.urdf import Inertial, Link
 
 from torchid import parameters
-from torchid.errors import MasslessBodyWarning, UnknownNameError, UnphysicalInertiaWarning, UrdfError, during, warn
+from torchid.errors import (
+    MasslessBodyWarning,
+    UnknownNameError,
+    UnphysicalInertiaWarning,
+    UrdfError,
+    current_file,
+    during,
+    warn,
+)
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.robot.tree import BodyJoint, BodyTree, JointGeometry, build_chain, build_tree, joint_geometry, link_poses
 from torchid.robot.urdf import read_urdf
@@ -148,19 +156,18 @@ class Robot:
         columns = [order[name] for name in self.chain.get_joint_parameter_names()]
         return link_poses(self.chain, in_depth_first_order[:, columns])
 
-    def link(self, name: str, field: str = "link", source: object = None) -> tuple[int, Array]:
+    def link(self, name: str, field: str = "link") -> tuple[int, Array]:
         """Body index and pose in that body, (4, 4) [m], of a URDF link.
 
         Args:
             name: the link.
-            field: what named it, for the error.
-            source: the file that is in; the URDF if None.
+            field: what named it, for the error: in `current_file`, or else the URDF.
 
         Raises:
             UnknownNameError: the URDF has no such link.
         """
         if name not in self.links:
-            raise UnknownNameError(source or self.path, field, name, self.links)
+            raise UnknownNameError(current_file() or self.path, field, name, self.links)
         return self.links[name]
 
 

@@ -31,7 +31,6 @@ def mirror_pairs(
     left: str,
     right: str,
     normal: str = "y",
-    source: object = None,
     field: str = "symmetry",
     apart: Collection[str] = (),
 ) -> tuple[MirrorPair, ...]:
@@ -47,16 +46,15 @@ def mirror_pairs(
         left: part of the names of bodies on one side, as "l_".
         right: the part in its stead in the names of their mirror images.
         normal: "x", "y" or "z".
-        source: the file that names them; the URDF if None.
-        field: of that file, for errors.
+        field: that names them, for errors.
         apart: bodies that need no counterpart; two of them are no pair.
 
     Raises:
         ConfigError: no pair at all; a body without its counterpart; a body with two; a pair that is not mirrored, or
             of which one has no mass.
     """
-    source, names = source or robot.path, robot.body_names
-    pairs = _by_name(names, left, right, apart, source, field)
+    names = robot.body_names
+    pairs = _by_name(names, left, right, apart, field)
     poses = robot.link_poses(torch.zeros(1, robot.n, dtype=torch.float64))
     T = np.stack([poses[name][0].numpy() for name in names])
     size = float(np.ptp(T[:, :3, 3], axis=0).max())
@@ -68,34 +66,34 @@ def mirror_pairs(
         off = float(np.linalg.norm(D @ T[i, :3, 3] - T[j, :3, 3]))
         if off > TOLERANCE * size:
             found = f"{pair} are {off:.3g} m from being mirror images along {normal} in a robot of {size:.3g} m"
-            raise ConfigError(source, field, found, f"{accepted}, to {TOLERANCE * size:.2g} m")
+            raise ConfigError.at_field(field, found, f"{accepted}, to {TOLERANCE * size:.2g} m")
         aslant = _angle(robot, T, D, i, j)
         if aslant > TOLERANCE:
-            raise ConfigError(source, field, f"the joints of {pair} are {aslant:.3g} rad off", accepted)
+            raise ConfigError.at_field(field, f"the joints of {pair} are {aslant:.3g} rad off", accepted)
         if robot.bodies[i].massless != robot.bodies[j].massless:
-            raise ConfigError(source, field, f"of {pair} one has no mass", "two bodies that have")
+            raise ConfigError.at_field(field, f"of {pair} one has no mass", "two bodies that have")
         out.append(MirrorPair(i, j, T[j, :3, :3].T @ D @ T[i, :3, :3]))
     return tuple(out)
 
 
 def _by_name(
-    names: tuple[str, ...], left: str, right: str, apart: Collection[str], source: object, field: str
+    names: tuple[str, ...], left: str, right: str, apart: Collection[str], field: str
 ) -> list[tuple[int, int]]:
     """Indices of bodies whose names answer to each other."""
     if left == right:
-        raise ConfigError(source, field, f"'{left}' on both sides", "two different parts of names")
+        raise ConfigError.at_field(field, f"'{left}' on both sides", "two different parts of names")
     images = {name: _images(name, left, right, names) for name in names}
     for name, found in images.items():
         expected = _exchanged(name, left, right)
         if not found and name not in apart and expected != name:
-            raise ConfigError(source, field, f"{name} has no counterpart", f"a body named {expected}")
+            raise ConfigError.at_field(field, f"{name} has no counterpart", f"a body named {expected}")
         if len(found) > 1 or any(images[image] != [name] for image in found):
             others = [other for other in names if other in found or name in images[other]]
-            raise ConfigError(source, field, f"{name} answers to {' and to '.join(others)}", "one counterpart")
+            raise ConfigError.at_field(field, f"{name} answers to {' and to '.join(others)}", "one counterpart")
     pairs = [(i, names.index(images[name][0])) for i, name in enumerate(names) if images[name]]
     if not pairs:
         some = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-        raise ConfigError(source, field, f"no two bodies differ in '{left}' and '{right}'", f"parts of names: {some}")
+        raise ConfigError.at_field(field, f"no two bodies differ in '{left}' and '{right}'", f"parts of names: {some}")
     return [(i, j) for i, j in pairs if i < j and not (names[i] in apart and names[j] in apart)]
 
 

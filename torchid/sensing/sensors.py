@@ -54,7 +54,7 @@ class Contact:
         return tuple(WRENCH_COMPONENTS[k] for k in self.components)
 
 
-def validate_contacts(robot: Robot, contacts: Sequence[Contact], source: object = "contacts") -> tuple[Contact, ...]:
+def validate_contacts(robot: Robot, contacts: Sequence[Contact]) -> tuple[Contact, ...]:
     """The contacts, after making sure that the robot has their frames.
 
     Raises:
@@ -64,9 +64,9 @@ def validate_contacts(robot: Robot, contacts: Sequence[Contact], source: object 
     seen: set[str] = set()
     for index, contact in enumerate(contacts):
         field = f"contacts[{index}]"
-        robot.link(contact.frame, f"{field}.frame", source)
+        robot.link(contact.frame, f"{field}.frame")
         if contact.frame in seen:
-            raise SensorError(source, f"{field}.frame", f"'{contact.frame}' named twice", "each frame once")
+            raise SensorError.at_field(f"{field}.frame", f"'{contact.frame}' named twice", "each frame once")
         seen.add(contact.frame)
     return tuple(contacts)
 
@@ -161,7 +161,7 @@ def named_sensors(name: str, n: int, contacts: int, noise: SensorNoise | None = 
     return SensorSet(torques, np.full((contacts, 6), wrench), noise or SensorNoise())
 
 
-def with_ft_sensors(sensors: SensorSet, robot: Robot, names: Iterable[str], source: object = "sensors") -> SensorSet:
+def with_ft_sensors(sensors: SensorSet, robot: Robot, names: Iterable[str]) -> SensorSet:
     """The set with force/torque sensors in limbs, by the names of their fixed joints, beside what it has.
 
     Raises:
@@ -170,7 +170,7 @@ def with_ft_sensors(sensors: SensorSet, robot: Robot, names: Iterable[str], sour
     torque = sensors.torque.copy()
     for name in names:
         if name not in robot.ft_names:
-            raise UnknownNameError(source, "sensors.ft_sensors", name, robot.ft_names)
+            raise UnknownNameError.at_field("sensors.ft_sensors", name, robot.ft_names)
         first = robot.n + 6 * robot.ft_names.index(name)
         torque[first : first + 6] = True
     return replace(sensors, torque=torque)
@@ -182,7 +182,6 @@ def chosen_sensors(
     joint_torques: Iterable[str],
     contact_wrenches: Mapping[str, Iterable[str]],
     noise: SensorNoise | None = None,
-    source: object = "sensors",
     ft: int = 0,
 ) -> SensorSet:
     """A set chosen by name.
@@ -193,7 +192,6 @@ def chosen_sensors(
         joint_torques: joints whose torque is measured.
         contact_wrenches: measured components ("fx" ... "mz") by contact frame.
         noise: of the sensors.
-        source: named in errors.
         ft: force/torque sensors in limbs that the robot has; none of them is in the set.
 
     Raises:
@@ -203,20 +201,20 @@ def chosen_sensors(
     torque = np.zeros(len(joint_names) + 6 * ft, dtype=bool)
     for name in joint_torques:
         if name not in joint_names:
-            raise UnknownNameError(source, "sensors.joint_torques", name, joint_names)
+            raise UnknownNameError.at_field("sensors.joint_torques", name, joint_names)
         torque[list(joint_names).index(name)] = True
     frames = [contact.frame for contact in contacts]
     wrench = np.zeros((len(frames), 6), dtype=bool)
     for frame, names in contact_wrenches.items():
         if frame not in frames:
-            raise UnknownNameError(source, "sensors.contact_wrenches", frame, frames)
+            raise UnknownNameError.at_field("sensors.contact_wrenches", frame, frames)
         contact = contacts[frames.index(frame)]
         for name in names:
             field_name = f"sensors.contact_wrenches.{frame}"
             if name not in WRENCH_COMPONENTS:
-                raise UnknownNameError(source, field_name, name, contact.component_names)
+                raise UnknownNameError.at_field(field_name, name, contact.component_names)
             if name not in contact.component_names:
                 found = f"'{name}', which a {contact.kind} contact cannot exert"
-                raise SensorError(source, field_name, found, ", ".join(contact.component_names))
+                raise SensorError.at_field(field_name, found, ", ".join(contact.component_names))
             wrench[frames.index(frame), WRENCH_COMPONENTS.index(name)] = True
     return SensorSet(torque, wrench, noise or SensorNoise())

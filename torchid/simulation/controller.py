@@ -36,14 +36,13 @@ class Stance:
     rotations: Array
 
 
-def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float], source: object) -> Stance:
+def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]) -> Stance:
     """Put the robot on its feet, its base level and its centre of mass over their middle, close to a posture.
 
     Args:
         plant: the robot; left in the stance.
         feet: what it stands on.
         posture: joint positions by name [rad or m]; others are 0, or the end of their range nearest to it.
-        source: named in errors.
 
     Raises:
         UnknownNameError: a joint that the robot does not have.
@@ -51,16 +50,16 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
     """
     for name in posture:
         if name not in plant.joint_names:
-            raise UnknownNameError(source, "posture", name, plant.joint_names)
+            raise UnknownNameError.at_field("posture", name, plant.joint_names)
     low, high = plant.limits.T
     for name, value in posture.items():
         joint = plant.joint_names.index(name)
         if not low[joint] <= value <= high[joint]:
             accepted = f"{low[joint]:g} to {high[joint]:g}, the joint's limits"
-            raise InputError(source, f"posture.{name}", f"{value:g}", accepted)
+            raise InputError.at_field(f"posture.{name}", f"{value:g}", accepted)
     joints = np.clip([posture.get(name, 0.0) for name in plant.joint_names], low, high)
     plant.place(np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 0.0], joints]))
-    rotations = np.stack([_flattened(plant.foot(i).rotation, foot, source) for i, foot in enumerate(feet)])
+    rotations = np.stack([_flattened(plant.foot(i).rotation, foot) for i, foot in enumerate(feet)])
     targets = np.stack([plant.foot(i).position for i in range(len(feet))])
     for target, R, foot in zip(targets, rotations, feet, strict=True):
         target[2] = -np.min(foot.arms @ R[2] - foot.radii)
@@ -81,7 +80,7 @@ def find_stance(plant: Plant, feet: Sequence[Foot], posture: Mapping[str, float]
     if not np.abs(off).max() < _TOLERANCE:
         worst = np.abs(off).max()
         found = f"no stance near it with all feet on the floor and the base level: off by {worst:.2g} m or rad"
-        raise InputError(source, "posture", found, "joint positions, by name, in which the robot nearly stands")
+        raise InputError.at_field("posture", found, "joint positions, by name, in which the robot nearly stands")
     return Stance(plant.position.copy(), plant.com.copy(), targets, rotations)
 
 
@@ -99,7 +98,7 @@ def _tasks(plant: Plant, feet: Sequence[Foot], targets: Array, rotations: Array)
     return A, np.concatenate([*off, above, rotation_error(plant.base_rotation, np.eye(3))])
 
 
-def _flattened(R: Array, foot: Foot, source: object) -> Array:
+def _flattened(R: Array, foot: Foot) -> Array:
     """The rotation nearest to R that puts all points of the foot at one height."""
     if foot.constrained < 6:
         return R.copy()
@@ -109,7 +108,7 @@ def _flattened(R: Array, foot: Foot, source: object) -> Array:
     angle = np.arctan2(np.linalg.norm(axis), normal[2])
     if angle > _STEEPEST:
         found = f"{foot.frame} is {np.degrees(angle):.0f} degrees off the horizontal"
-        raise InputError(source, "posture", found, f"joint positions that put it within {np.degrees(_STEEPEST):.0f}")
+        raise InputError.at_field("posture", found, f"joint positions that put it within {np.degrees(_STEEPEST):.0f}")
     return Rotation.from_rotvec(angle * axis / max(float(np.linalg.norm(axis)), 1e-12)).as_matrix() @ R
 
 
@@ -167,8 +166,8 @@ class Controller:
 
         com_J = M[:3] / plant.mass  # the base's linear rows are the momentum of everything
         drift = (bias[:3] - plant.weight) / plant.mass
-        wanted = _servo(goal.com[0] - plant.com, goal.com[1] - com_J @ velocity, goal.com[2])
-        tasks.append((_CENTRE, com_J, wanted - drift))
+        target = _servo(goal.com[0] - plant.com, goal.com[1] - com_J @ velocity, goal.com[2])
+        tasks.append((_CENTRE, com_J, target - drift))
 
         turn = np.zeros((3, nv))
         turn[:, 3:6] = np.eye(3)
@@ -180,12 +179,12 @@ class Controller:
             off = np.concatenate([p - foot.position, rotation_error(foot.rotation, self._rotations[i])])
             if goal.load[i] > ALOFT:
                 off[2] = 0.0  # the floor gives way
-                weight, wanted = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
+                weight, target = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
             else:
                 rate = np.concatenate([v, np.zeros(3)]) - foot.velocity
-                weight, wanted = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
+                weight, target = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
             rows = slice(self._feet[i].constrained)
-            tasks.append((weight, foot.J[rows], (wanted - foot.bias)[rows]))
+            tasks.append((weight, foot.J[rows], (target - foot.bias)[rows]))
 
         joints = np.zeros((plant.n, nv))
         joints[:, 6:] = np.diag(np.where(goal.driven, _JOINT, _POSTURE))
@@ -247,7 +246,6 @@ class ReferenceMotion:
         joint_names: of the robot, in the plant's order.
         feet: frames of the feet.
         control_hz: control rate [Hz].
-        source: named in errors.
 
     Raises:
         UnknownNameError: a wave moves something that the robot does not have.
@@ -261,24 +259,23 @@ class ReferenceMotion:
         joint_names: Sequence[str],
         feet: Sequence[str],
         control_hz: float,
-        source: object,
     ) -> None:
         self.name = config.name
         self._stance = stance
         names = (*BODY, *joint_names)
         if config.duration_s * control_hz < 2.0:
-            found, wanted = f"{config.duration_s:g}", f"at least two control steps, {2.0 / control_hz:g} s"
-            raise InputError(source, f"motions.{config.name}.duration_s", found, wanted)
+            accepted = f"at least two control steps, {2.0 / control_hz:g} s"
+            raise InputError.at_field(f"motions.{config.name}.duration_s", f"{config.duration_s:g}", accepted)
         steps = round((LEAD_S + config.duration_s) * control_hz)
         self.time = np.arange(steps) / control_hz - LEAD_S
         grown = _smooth((self.time + LEAD_S) / LEAD_S)
         moved = np.zeros((steps, len(names)))
         for index, wave in enumerate(config.waves):
             if wave.what not in names:
-                raise UnknownNameError(source, f"motions.{config.name}.waves.{index}.what", wave.what, names)
+                raise UnknownNameError.at_field(f"motions.{config.name}.waves.{index}.what", wave.what, names)
             if wave.hz >= 0.5 * control_hz:
                 accepted = f"below {0.5 * control_hz:g}, half of control_hz"
-                raise InputError(source, f"motions.{config.name}.waves.{index}.hz", f"{wave.hz:g}", accepted)
+                raise InputError.at_field(f"motions.{config.name}.waves.{index}.hz", f"{wave.hz:g}", accepted)
             sine = np.sin(2.0 * np.pi * (wave.hz * self.time + wave.phase))
             moved[:, names.index(wave.what)] += wave.amplitude * grown * sine
         self._moved = _with_derivatives(moved, control_hz)
@@ -286,10 +283,10 @@ class ReferenceMotion:
         if config.steps and config.steps.swing_s + 2.0 * config.steps.transfer_s > 1.0 / config.steps.hz:
             found = f"{config.steps.swing_s:g} in the air and twice {config.steps.transfer_s:g} to transfer the load"
             accepted = f"at most the period of {1.0 / config.steps.hz:g} s together"
-            raise InputError(source, f"motions.{config.name}.steps.swing_s", found, accepted)
+            raise InputError.at_field(f"motions.{config.name}.steps.swing_s", found, accepted)
         for frame in config.steps.order if config.steps else ():
             if frame not in feet:
-                raise UnknownNameError(source, f"motions.{config.name}.steps.order", frame, feet)
+                raise UnknownNameError.at_field(f"motions.{config.name}.steps.order", frame, feet)
         height, self._load = _steps(config.steps, feet, self.time)
         self._lift = _with_derivatives(height, control_hz)
 

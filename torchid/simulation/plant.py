@@ -54,13 +54,12 @@ class Foot:
         return 6 if form_polygon(np.array(self.points)) else 3
 
 
-def find_feet(settings: list[FootConfig], urdf: Path, source: object) -> tuple[Foot, ...]:
+def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:
     """The feet with their contact points, from the file or from the URDF's collision spheres.
 
     Args:
         settings: of the simulation file.
         urdf: the robot.
-        source: named in errors.
 
     Raises:
         UnknownNameError: the URDF has no such link.
@@ -73,19 +72,19 @@ def find_feet(settings: list[FootConfig], urdf: Path, source: object) -> tuple[F
     feet = []
     for foot in settings:
         if foot.frame not in links:
-            raise UnknownNameError(source, "feet", foot.frame, links)
+            raise UnknownNameError.at_field("feet", foot.frame, links)
         if frames.count(foot.frame) > 1:
-            raise ConfigError(source, "feet", f"'{foot.frame}' named twice", "every foot once")
+            raise ConfigError.at_field("feet", f"'{foot.frame}' named twice", "every foot once")
         if foot.points:
             points = tuple((x, y, z) for x, y, z in foot.points)
             feet.append(Foot(foot.frame, points, (_RADIUS,) * len(points)))
             continue
-        spheres = [_sphere(urdf, foot.frame, shape) for shape in links[foot.frame].findall("collision")]
-        found = [sphere for sphere in spheres if sphere is not None]
-        if not found:
+        shapes = links[foot.frame].findall("collision")
+        spheres = [sphere for shape in shapes if (sphere := _sphere(urdf, foot.frame, shape)) is not None]
+        if not spheres:
             missing = f"no points, and {urdf.name} has no collision spheres at {foot.frame}"
-            raise ConfigError(source, "feet", missing, "points: [[x, y, z], ...] in the frame of the foot")
-        feet.append(Foot(foot.frame, tuple(point for point, _ in found), tuple(radius for _, radius in found)))
+            raise ConfigError.at_field("feet", missing, "points: [[x, y, z], ...] in the frame of the foot")
+        feet.append(Foot(foot.frame, tuple(point for point, _ in spheres), tuple(radius for _, radius in spheres)))
     return tuple(feet)
 
 

@@ -1,4 +1,4 @@
-"""One motion of a simulation file: an exact recording, whether the robot stayed on its feet, what its sensors read."""
+"""Motions of a simulation file: a robot put on its feet, an exact recording, how it stood, what its sensors read."""
 
 from __future__ import annotations
 
@@ -21,6 +21,70 @@ from torchid.simulation.plant import Foot, Plant, find_feet, form_polygon
 _REPORT_S = 0.25  # simulated seconds between two checks of whether the robot stands
 
 
+def set_up_simulation(config: SimulationConfig) -> Simulation:
+    """Put the robot on its feet.
+
+    Raises:
+        InputError: the URDF, the feet or the posture cannot be simulated.
+    """
+    feet = find_feet(config.feet, config.robot.urdf)
+    plant = Plant(config.robot.urdf, feet, config.physics_hz, config.friction.levels)
+    simulation = Simulation(config, plant, feet, find_stance(plant, feet, config.posture))
+    simulation.require_support(np.ones(len(feet), dtype=bool), "feet")
+    return simulation
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A robot on its feet, ready to move."""
+
+    config: SimulationConfig
+    plant: Plant
+    feet: tuple[Foot, ...]
+    stance: Stance
+
+    def require_support(self, support: BoolArray, field: str) -> None:
+        """Require that feet, (F,) bool, can support a robot.
+
+        Raises:
+            InputError: their contact points lie on a line.
+        """
+        standing = zip(self.feet, self.stance.feet, self.stance.rotations, support, strict=True)
+        points = [middle + foot.arms @ R.T for foot, middle, R, on in standing if on]
+        if not points or not form_polygon(np.concatenate(points)):
+            names = ", ".join(foot.frame for foot, on in zip(self.feet, support, strict=True) if on)
+            found = f"stands on {names} alone, whose contact points lie on a line" if names else "no foot on the floor"
+            raise InputError.at_field(field, found, "three points on the floor that do not, at any time")
+
+    def reference(self, config: MotionConfig) -> ReferenceMotion:
+        """The reference of a motion: a goal for every control step.
+
+        Raises:
+            UnknownNameError: it moves what the robot does not have.
+            InputError: it is too short, or lifts feet that the robot cannot do without.
+        """
+        plant, hz = self.plant, self.config.control_hz
+        motion = ReferenceMotion(config, self.stance, plant.joint_names, plant.foot_frames, hz)
+        for support in motion.supports:
+            self.require_support(support, f"motions.{config.name}.steps")
+        return motion
+
+    def run(self, config: MotionConfig, progress: Callable[[float], None] | None = None) -> tuple[Recording, Stability]:
+        """Simulate a motion.
+
+        Args:
+            config: the motion.
+            progress: called with the seconds simulated since the last call.
+
+        Raises:
+            InputError: the robot falls, slips, or its zero-moment point leaves the bounds.
+        """
+        recording = record(self, self.reference(config), progress)
+        stability = measure_stability(self, recording)
+        stability.require_within(self.config.bounds, config.name)
+        return recording, stability
+
+
 @dataclass(frozen=True)
 class Recording:
     """One motion as it truly was, sampled at the physics rate from time 0 on.
@@ -35,41 +99,21 @@ class Recording:
     rotations: Array
 
 
-def require_field(log: Log, name: str) -> Array:
-    """A field of an exact log, which must have it.
-
-    Raises:
-        LogError: the log lacks it.
-    """
-    values: Array | None = getattr(log, name)
-    if values is None:
-        raise LogError(log.source, name, "missing", "an exact log that torchid simulate wrote")
-    return values
-
-
 def record(
-    plant: Plant,
-    controller: Controller,
-    stance: Stance,
-    motion: ReferenceMotion,
-    config: SimulationConfig,
-    source: object,
-    progress: Callable[[float], None] | None = None,
+    simulation: Simulation, motion: ReferenceMotion, progress: Callable[[float], None] | None = None
 ) -> Recording:
     """Simulate a motion.
 
     Args:
-        plant: the robot.
-        controller: what drives it.
-        stance: where it starts.
+        simulation: the robot in its stance, the rates, and the height that its base must keep.
         motion: what it does.
-        config: rates, and the height that the base must keep.
-        source: named in errors.
         progress: called with the seconds simulated since the last call.
 
     Raises:
         InputError: the robot falls.
     """
+    config, plant, stance = simulation.config, simulation.plant, simulation.stance
+    controller = Controller(plant, simulation.feet, stance.rotations, config.friction.levels or (0.0, 0.0))
     plant.place(stance.position)
     frames: list[tuple[Array, ...]] = []
     per_goal = round(config.physics_hz / config.control_hz)
@@ -86,8 +130,8 @@ def record(
         if step % report_every == 0:
             if plant.unstable or not abs(plant.position[2] - stance.position[2]) <= config.bounds.height_m:
                 when = f"at {time:.2f} s" if time >= 0.0 else f"{-time:.2f} s before the log begins"
-                found, wanted = f"the robot falls {when}", "a gentler motion, or another posture"
-                raise InputError(source, f"motions.{motion.name}", found, wanted)
+                accepted = "a gentler motion, or another posture"
+                raise InputError.at_field(f"motions.{motion.name}", f"the robot falls {when}", accepted)
             if progress is not None:
                 progress(report_every / config.control_hz)
     position, velocity, feet, rotations, *pushed = (np.array(x) for x in zip(*frames, strict=True))
@@ -140,7 +184,7 @@ class Stability:
     effort: float
     unloaded: tuple[float, ...]
 
-    def require_within(self, bounds: BoundsConfig, motion: str, source: object) -> None:
+    def require_within(self, bounds: BoundsConfig, motion: str) -> None:
         """Require that the robot stayed within the bounds of standing.
 
         Raises:
@@ -154,27 +198,18 @@ class Stability:
             (f"a joint needs {100 * self.effort:.0f} % of its effort limit", self.effort <= 1.0),
         ):
             if not allowed:
-                wanted = "a gentler motion, another posture or wider bounds"
-                raise InputError(source, f"motions.{motion}", found, wanted)
+                accepted = "a gentler motion, another posture or wider bounds"
+                raise InputError.at_field(f"motions.{motion}", found, accepted)
 
 
-def stability(
-    recording: Recording, plant: Plant, stance: Stance, feet: tuple[Foot, ...], load: float, source: object
-) -> Stability:
-    """Measure how a robot stood.
-
-    Args:
-        recording: what it did.
-        plant: the robot.
-        stance: where it started.
-        feet: what it stood on.
-        load: vertical force [N] from which on a foot counts as standing.
-        source: named in errors.
+def measure_stability(simulation: Simulation, recording: Recording) -> Stability:
+    """Measure how a robot stood; a foot stands from a vertical force of `sensors.contact_threshold` [N] on.
 
     Raises:
         InputError: a foot never bears that much.
     """
-    log = recording.log
+    log, load = recording.log, simulation.config.sensors.contact_threshold
+    plant, stance, feet = simulation.plant, simulation.stance, simulation.feet
     wrench = require_field(log, "contact_wrench_local")
     R = recording.rotations
     force, moment = ((R @ part[..., None])[..., 0] for part in (wrench[..., :3], wrench[..., 3:]))
@@ -184,7 +219,8 @@ def stability(
     for foot, most in zip(feet, bearing, strict=True):
         if most <= load:
             found = f"{load:g} N, but {foot.frame} never bears more than {most:.3g} N"
-            raise InputError(source, "sensors.contact_threshold", found, "a fraction of what a standing foot bears")
+            accepted = "a fraction of what a standing foot bears"
+            raise InputError.at_field("sensors.contact_threshold", found, accepted)
     low, high = plant.limits.T
     height = require_field(log, "base_position_world")[:, 2]
     return Stability(
@@ -227,79 +263,6 @@ def _zmp_margin(position: Array, force: Array, moment: Array, stance: Stance, fe
         inside = zmp[(on == state).all(axis=1)]
         margin = min(margin, float(-(inside @ hull[:, :2].T + hull[:, 2]).max()))
     return margin
-
-
-@dataclass(frozen=True)
-class Simulation:
-    """A robot on its feet, ready to move."""
-
-    config: SimulationConfig
-    source: object
-    plant: Plant
-    feet: tuple[Foot, ...]
-    stance: Stance
-
-    def reference(self, config: MotionConfig) -> ReferenceMotion:
-        """The reference of a motion: a goal for every control step.
-
-        Raises:
-            UnknownNameError: it moves what the robot does not have.
-            InputError: it is too short, or lifts feet that the robot cannot do without.
-        """
-        frames = self.plant.foot_frames
-        motion = ReferenceMotion(
-            config, self.stance, self.plant.joint_names, frames, self.config.control_hz, self.source
-        )
-        for support in motion.supports:
-            self.require_support(support, f"motions.{config.name}.steps")
-        return motion
-
-    def require_support(self, support: BoolArray, field: str) -> None:
-        """Require that feet, (F,) bool, can support a robot.
-
-        Raises:
-            InputError: their contact points lie on a line.
-        """
-        standing = zip(self.feet, self.stance.feet, self.stance.rotations, support, strict=True)
-        points = [middle + foot.arms @ R.T for foot, middle, R, on in standing if on]
-        if not points or not form_polygon(np.concatenate(points)):
-            names = ", ".join(foot.frame for foot, on in zip(self.feet, support, strict=True) if on)
-            found = f"stands on {names} alone, whose contact points lie on a line" if names else "no foot on the floor"
-            raise InputError(self.source, field, found, "three points on the floor that do not, at any time")
-
-    def run(self, config: MotionConfig, progress: Callable[[float], None] | None = None) -> tuple[Recording, Stability]:
-        """Simulate a motion.
-
-        Args:
-            config: the motion.
-            progress: called with the seconds simulated since the last call.
-
-        Raises:
-            InputError: the robot falls, slips, or its zero-moment point leaves the bounds.
-        """
-        friction = self.config.friction.levels or (0.0, 0.0)
-        controller = Controller(self.plant, self.feet, self.stance.rotations, friction)
-        recording = record(
-            self.plant, controller, self.stance, self.reference(config), self.config, self.source, progress
-        )
-        found = stability(
-            recording, self.plant, self.stance, self.feet, self.config.sensors.contact_threshold, self.source
-        )
-        found.require_within(self.config.bounds, config.name, self.source)
-        return recording, found
-
-
-def set_up_simulation(config: SimulationConfig, source: object = "simulation") -> Simulation:
-    """Put the robot on its feet.
-
-    Raises:
-        InputError: the URDF, the feet or the posture cannot be simulated.
-    """
-    feet = find_feet(config.feet, config.robot.urdf, source)
-    plant = Plant(config.robot.urdf, feet, config.physics_hz, config.friction.levels)
-    simulation = Simulation(config, source, plant, feet, find_stance(plant, feet, config.posture, source))
-    simulation.require_support(np.ones(len(feet), dtype=bool), "feet")
-    return simulation
 
 
 def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: str | None = None) -> Log:
@@ -374,3 +337,15 @@ def _loaded(wrench: Array, threshold: float) -> BoolArray:
     mean = force.mean(axis=0)
     direction = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     return np.einsum("nfi,fi->nf", force, direction) > threshold
+
+
+def require_field(log: Log, name: str) -> Array:
+    """A field of an exact log, which must have it.
+
+    Raises:
+        LogError: the log lacks it.
+    """
+    values: Array | None = getattr(log, name)
+    if values is None:
+        raise LogError(log.source, name, "missing", "an exact log that torchid simulate wrote")
+    return values
