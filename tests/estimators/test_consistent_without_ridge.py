@@ -49,7 +49,7 @@ def fit(problem: LinearProblem, conditions: Conditions, prior: Prior, method: Me
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         estimate = Consistent(0.0, prior, conditions, method).solve(problem)
-    return Fit(estimate, any("goes on falling" in str(warning.message) for warning in caught))
+    return Fit(estimate, any("keeps decreasing" in str(warning.message) for warning in caught))
 
 
 def check(problem: LinearProblem, conditions: Conditions, prior: Prior, method: Method, accuracy: float) -> Fit:

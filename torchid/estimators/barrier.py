@@ -94,9 +94,8 @@ def find_strictly_feasible(problem: ConicProblem, patience: int = _STEPS * _STAG
 def _phase_one(problem: ConicProblem, kappa: float) -> ConicProblem:
     """Min s, with s added to every eigenvalue and slack: a point with negative s is strictly feasible.
 
-    Boyd, Vandenberghe, section 11.4, with two additions. A quadratic that fades with the barrier keeps directions
-    without a minimum bounded. A lower bound on s ends the search at a slack that suffices: 122 steps instead of 211 for
-    the worst of 600 random problems.
+    Boyd, Vandenberghe, section 11.4, with two additions. A quadratic that fades with the barrier bounds directions
+    without a minimum. A lower bound on s saves steps: 122 instead of 211 for the worst of 600 random problems.
     """
     n, blocks, rows = len(problem.linear), len(problem.F0), len(problem.h)
     return replace(
@@ -161,10 +160,8 @@ class _CentralPath:
             rates = torch.cat([torch.linalg.eigvalsh(change).ravel(), growth]).numpy()
             shares = torch.cat([weights.repeat_interleave(4), torch.full_like(slack, kappa)]).numpy()
             length = _step_length(float(quadratic_gradient @ move), float(move @ self.H @ move), rates, shares)
-            after = self._factors(x + length * move)
-            while after is None and length > _SHORTEST:  # exactly, the step's length keeps it feasible
-                length *= 0.5
-                after = self._factors(x + length * move)
+            while (after := self._factors(x + length * move)) is None and length > _SHORTEST:
+                length *= 0.5  # infeasible by rounding alone
             if after is None:
                 break
             x, factors = x + length * move, after
@@ -213,8 +210,7 @@ def _step_length(slope: float, curvature: float, rates: Array, shares: Array) ->
 
 def _solve_damped(A: Tensor, b: Tensor) -> Tensor:
     """A^-1 b for A positive semidefinite, with the least damping that works (Levenberg)."""
-    diagonal = A.diagonal().abs().clamp_min(torch.finfo(A.dtype).tiny)
-    scale = diagonal.rsqrt()
+    scale = A.diagonal().abs().clamp_min(torch.finfo(A.dtype).tiny).rsqrt()
     scaled = scale[:, None] * A * scale
     damping = 0.0
     while True:
