@@ -159,14 +159,7 @@ def validate_parameters(**arrays: Array) -> None:
 
 
 def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float = 1e-9) -> list[Violation]:
-    """The conditions that parameters (L, 12) violate by more than `tolerance` of their scale.
-
-    Args:
-        phi: parameters.
-        scale: (L, 12), the size that a deviation of each parameter is measured in (`parameter_scale`).
-        conditions: what to check.
-        tolerance: relative.
-    """
+    """Conditions that parameters (L, 12) violate by more than `tolerance` of their `parameter_scale`, (L, 12)."""
     validate_parameters(phi=phi, scale=scale)
     conditions.validate_bodies(len(phi))
     out: list[Violation] = []

@@ -74,7 +74,7 @@ class LearnableParameters(nn.Module, ABC):
 
 
 class FreeParameters(LearnableParameters):
-    """Any phi: `raw` is a linear function of it."""
+    """Any phi, an affine function of `raw`."""
 
     def __init__(self, problem: LinearProblem) -> None:
         """Start at the nominal parameters."""
