@@ -1,4 +1,4 @@
-"""Least squares with the nominal parameters as prior, and what every estimator returns."""
+"""Least squares with the nominal parameters as prior, and the estimate that every estimator returns."""
 
 from __future__ import annotations
 

@@ -250,7 +250,7 @@ def _term(coefficient: float, name: str) -> str:
 
 @dataclass(frozen=True)
 class StateReport:
-    """A contact state in the logs; what concerns the base is None if it is fixed.
+    """A contact state in the logs; entries on the base are None for a fixed base.
 
     Attributes:
         name: frames in contact, joined by "+".

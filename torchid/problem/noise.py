@@ -273,7 +273,8 @@ class VarianceComponentEstimator:
             share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
             step = self._step(M, q, estimated)
             least = np.maximum(_SHARE / np.maximum(share, 1e-12), _SMALLEST**2 / variance)
-            step = np.where(estimated, np.maximum(step, _block_max(least, self._blocks)), 1.0)
+            least_of_block = np.where(self._blocks > 0.0, least[:, None], 0.0).max(axis=0, initial=0.0)
+            step = np.where(estimated, np.maximum(step, least_of_block), 1.0)
             factor = self._blocks @ step
             variance = variance * factor
             if _change(M, factor) < _STEADY:
@@ -354,11 +355,6 @@ def _change(M: Array, factor: Array) -> float:
     before = M.sum(1)
     after = np.divide(M @ factor, before, out=np.ones_like(before), where=before > 0.0)
     return float(np.abs(np.sqrt(after) - 1.0).max(initial=0.0))
-
-
-def _block_max(values: Array, blocks: Array) -> Array:
-    """The largest value of each block."""
-    return np.where(blocks > 0.0, values[:, None], 0.0).max(axis=0, initial=0.0)
 
 
 def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:

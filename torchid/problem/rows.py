@@ -95,6 +95,8 @@ class RowBuilder(nn.Module):
     functions in `torchid.regressor` and `torchid.sensing.projection`, but processes samples one contact state at a
     time, where all shapes are constant, and multiplies W^T with the bodies' wrenches without forming K.
     `tests/problem/test_rows_two_ways.py` compares both; read the reference implementation first.
+
+    `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m].
     """
 
     def __init__(
@@ -116,16 +118,12 @@ class RowBuilder(nn.Module):
         self.contacts = tuple(contacts)
         self.sensors = sensors
         self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)
+        self.frames = self._layouts.frames
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
         self._layouts.clear()  # their tensors are not buffers of the module
         super()._apply(fn, recurse)
         return self
-
-    @property
-    def frames(self) -> list[tuple[int, Array]]:
-        """Node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]."""
-        return self._layouts.frames
 
     @property
     def width(self) -> int:

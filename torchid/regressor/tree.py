@@ -82,7 +82,8 @@ class KinematicTree(nn.Module):
         joint_map, (L, n + 6 F), joint_constant: positions of the base (0) and all L - 1 joints from the robot's degrees
             of freedom, of which the first n move.
 
-    `sign_width`: as in `Regressor`. `node_of`: node of each of the robot's bodies. `body_of`: body of each node; for a
+    `n_nodes`: one for each body, and five more for every force/torque sensor in a limb. `sign_width`: as in
+    `Regressor`. `node_of`: node of each of the robot's bodies. `body_of`: body of each node; for a
     massless node the body beyond the weld.
     """
 
@@ -109,7 +110,7 @@ class KinematicTree(nn.Module):
         self.slides = [node.slides for node in nodes]
         self.kinds = [node.kind for node in nodes]
         self.base_rows, self.n, self.n_dofs, self.n_rows = robot.base_rows, robot.n, robot.n_dofs, robot.n_rows
-        count = len(nodes)
+        count = self.n_nodes = len(nodes)
         joint_frame = np.tile(np.eye(4), (count, 1, 1))
         for index, node in enumerate(nodes[1:], start=1):
             joint_frame[index, :3, :3] = _rotation_to_z(node.axis)
@@ -150,11 +151,6 @@ class KinematicTree(nn.Module):
     def _register(self, name: str, value: np.ndarray) -> None:
         dtype = torch.int64 if value.dtype.kind == "i" else torch.float64
         self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)
-
-    @property
-    def n_nodes(self) -> int:
-        """Number of nodes: one for each body, and five more for every force/torque sensor in a limb."""
-        return len(self.parents)
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:
         """Sign of velocities [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""

@@ -224,7 +224,7 @@ def _mesh_vertices(urdf: Path, filename: str) -> Array:
     try:
         with np.errstate(all="ignore"):
             mesh = trimesh.load(io.BytesIO(content), kind, force="mesh", process=False, skip_materials=True)
-    except Exception as error:  # noqa: B902 - readers of several formats raise what they like
+    except Exception as error:  # noqa: B902 - readers of different formats raise different errors
         raise MeshError(f"{excerpt(filename)}: {type(error).__name__}: {excerpt(str(error))}") from error
     units = getattr(mesh, "units", None)
     with np.errstate(all="ignore"):  # overflow, which the check that follows refuses

@@ -88,6 +88,7 @@ def build_tree(
         raise UnknownNameError(path, "robot.base_link", base_link, names)
     _check_welds(path, names, joints, ft_joints)
     mimics = _resolve_mimics(path, joints)
+    locked = {name for name, mimic in mimics.items() if not mimic.master}
     neighbours: dict[str, list[tuple[Joint, bool]]] = {name: [] for name in names}
     for joint in joints:  # children before parents, each in the URDF's order
         neighbours[joint.parent].append((joint, False))
@@ -100,7 +101,7 @@ def build_tree(
         name, joint, reverse = stack.pop()
         if joint is None:
             _start_body(tree, name, None)
-        elif joint.name in ft_joints or (joint.type in MOVING_TYPES and not _is_locked(joint, mimics)):
+        elif joint.name in ft_joints or (joint.type in MOVING_TYPES and joint.name not in locked):
             _start_body(tree, name, _body_joint(tree, joint, reverse, mimics.get(joint.name)))
         else:
             parent = joint.child if reverse else joint.parent
@@ -182,10 +183,6 @@ def _check_mimic_size(path: Path, joint: str, multiplier: float, offset: float) 
     if not max(abs(multiplier), abs(offset)) <= MAX_NUMBER:
         found = f"multiplier {multiplier:g} and offset {offset:g} along its chain"
         raise UrdfError(path, f"joint '{joint}', <mimic>", found, f"at most {MAX_NUMBER:g}")
-
-
-def _is_locked(joint: Joint, mimics: dict[str, Mimic]) -> bool:
-    return joint.name in mimics and not mimics[joint.name].master
 
 
 def _start_body(tree: BodyTree, name: str, joint: BodyJoint | None) -> None:

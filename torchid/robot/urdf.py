@@ -91,8 +91,7 @@ def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
                 joint.dynamics.friction = float(joint.dynamics.friction or 0.0)
     except ValueError as error:
         raise UrdfError(path, "XML", f"a number cannot be read: {error}", "decimal numbers") from error
-    _check_masses(path, model.links)
-    _check_joint_values(path, model.joints)
+    _check_values(path, model.links, model.joints)
     return model.links, model.joints
 
 
@@ -192,14 +191,13 @@ def _check_link(path: Path, link: etree._Element) -> None:
         raise UrdfError(path, field, f"no {', '.join(missing)}", "all six numbers of <inertia> [kg m^2]")
 
 
-def _check_masses(path: Path, links: list[Link]) -> None:
+def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
+    """Refuse negative masses and friction, and axes that are zero."""
     for link in links:
         if link.inertial is not None and link.inertial.mass < 0.0:
             field = f"link '{link.name}', <inertial>"
             raise UrdfError(path, field, f"mass {link.inertial.mass:g} kg", "mass > 0, or 0 for a massless link")
 
-
-def _check_joint_values(path: Path, joints: list[Joint]) -> None:
     for joint in joints:
         field = f"joint '{joint.name}'"
         if joint.dynamics is not None and min(joint.dynamics.damping, joint.dynamics.friction) < 0.0:
@@ -215,7 +213,7 @@ _BYTES_PER_INSTANCE = 2**15  # [bytes] added for every instance of a geometry: b
 
 
 class MeshError(Exception):
-    """A mesh file that is missing, lies elsewhere, or cannot be read."""
+    """A mesh file that is missing, outside the package, or cannot be read."""
 
 
 def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:

@@ -126,8 +126,8 @@ def assess_sensors(
     for state in states:
         generic = demands(robot, contacts, [state], everything, seed)
         straight = demands(robot, contacts, [state], everything, joint_position=np.zeros(robot.n))
-        cause = _Cause(generic, straight, mounted, choice)
-        checks.append(_assess_state(builder, state, drawn, postures.get(state), cause))
+        state_demands = _StateDemands(generic, straight, mounted, choice)
+        checks.append(_assess_state(builder, state, drawn, postures.get(state), state_demands))
     return checks
 
 
@@ -202,7 +202,7 @@ def describe_wrench(wrench: Array) -> str:
 
 
 @dataclass(frozen=True)
-class _Cause:
+class _StateDemands:
     """Demands of a state at a random posture and at position zero, the mounted sensors, and candidates for remedies."""
 
     generic: Sequence[Demand]
@@ -221,14 +221,14 @@ class _Cause:
 
 
 def _assess_state(
-    builder: RowBuilder, state: ContactState, drawn: Array, recorded: Array | None, cause: _Cause
+    builder: RowBuilder, state: ContactState, drawn: Array, recorded: Array | None, state_demands: _StateDemands
 ) -> BaseObservability:
     zero = np.zeros((1, drawn.shape[1]))
     generic, straight = base_values(builder, state, drawn), base_values(builder, state, zero)
     ranks, lost = base_rank(generic), None
     if ranks.max() < 6:
         regular = zero if base_rank(straight)[0] == ranks.max() else drawn[[int(ranks.argmax())]]
-        lost = _lost_base(builder, state, regular, cause)
+        lost = _lost_base(builder, state, regular, state_demands)
     return BaseObservability(
         state=state,
         name=state_name(builder.contacts, state),
@@ -236,22 +236,22 @@ def _assess_state(
         zero=PostureSummary.of(straight),
         recorded=None if recorded is None else PostureSummary.of(base_values(builder, state, recorded)),
         lost=lost,
-        dependent=cause.dependent(),
+        dependent=state_demands.dependent(),
     )
 
 
-def _lost_base(builder: RowBuilder, state: ContactState, posture: Array, cause: _Cause) -> LostBase:
+def _lost_base(builder: RowBuilder, state: ContactState, posture: Array, state_demands: _StateDemands) -> LostBase:
     [(_, V)] = builder.null_space_bases(resting_samples(posture, state), state)
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
     directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]
-    missing = cause.missing()
-    groups = zip(cause.generic, missing, strict=True)
+    missing = state_demands.missing()
+    groups = zip(state_demands.generic, missing, strict=True)
     return LostBase(
         posture=posture[0],
         directions=directions,
         descriptions=tuple(describe_wrench(wrench) for wrench in simple_wrench_basis(directions)),
         unmet_groups=tuple((demand.frames, dimensions) for demand, dimensions in groups if dimensions),
-        remedies=tuple(c for c in cause.choice if sum(cause.missing(c)) < sum(missing)),
+        remedies=tuple(c for c in state_demands.choice if sum(state_demands.missing(c)) < sum(missing)),
     )
 
 
