@@ -51,9 +51,6 @@ def map_chunks(
         builder.layout(state)
     lock = threading.Lock()
 
-    def run(part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]]) -> Result:
-        return reduce(pieces(part))
-
     def pieces(
         part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]],
     ) -> Iterator[tuple[Samples, ContactState]]:
@@ -64,7 +61,7 @@ def map_chunks(
                 with lock:
                     progress(len(piece))
 
-    return run_in_workers(tasks, run, threads or worker_count(builder.device))
+    return run_in_workers(tasks, lambda part: reduce(pieces(part)), threads or worker_count(builder.device))
 
 
 def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[ContactState, slice | torch.Tensor]]:

@@ -30,18 +30,17 @@ def state_name(contacts: Sequence[Contact], state: ContactState) -> str:
 
 
 class Columns:
-    """Columns of the rows: those of `reduced_layout`, then two friction columns for each of the L - 1 joints."""
+    """Columns of the rows: those of `reduced_layout`, then two friction columns for each of the L - 1 joints.
+
+    `count`: their number, without the right-hand side.
+    """
 
     def __init__(self, tree: KinematicTree) -> None:
         """Lay out the columns of a robot."""
         self.tree = tree
         self.layout = reduced_layout(tree)
         self.joint_rows: list[JointRow] = joint_rows(tree, self.layout)
-
-    @property
-    def count(self) -> int:
-        """Number of columns, without the right-hand side."""
-        return self.layout.count + 2 * (self.tree.n_nodes - 1)
+        self.count = self.layout.count + 2 * (tree.n_nodes - 1)
 
     def friction(self, body: int) -> int:
         """The first of the two friction columns of a body's joint."""
@@ -142,15 +141,8 @@ class ContactStateLayouts:
 
     def layout(self, state: ContactState) -> ContactStateLayout:
         """The layout of a contact state, cached."""
-        if state not in self._cache:
-            self._cache[state] = self._lay_out(state)
-        return self._cache[state]
-
-    def clear(self) -> None:
-        """Drop all layouts, when the robot's constants move to another device or precision."""
-        self._cache.clear()
-
-    def _lay_out(self, state: ContactState) -> ContactStateLayout:
+        if state in self._cache:
+            return self._cache[state]
         touching: dict[int, list[int]] = {}
         for contact, active in enumerate(state):
             if active:
@@ -166,7 +158,7 @@ class ContactStateLayouts:
         )
         nodes_below, starts = self._nodes_below([body for body, _, _ in moved]), self.columns.layout.starts
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
-        return ContactStateLayout(
+        self._cache[state] = ContactStateLayout(
             bodies,
             coupled,
             tuple(joint for joint in measured if joint not in moving),
@@ -182,6 +174,11 @@ class ContactStateLayouts:
                 if extra.dof in coupled or (extra.contact is not None and state[extra.contact[0]])
             ),
         )
+        return self._cache[state]
+
+    def clear(self) -> None:
+        """Drop all layouts, when the robot's constants move to another device or precision."""
+        self._cache.clear()
 
     def _nodes_below(self, moved: list[int]) -> range:
         """Hull of the subtrees of some nodes; with a floating base, all nodes."""

@@ -96,7 +96,8 @@ class RowBuilder(nn.Module):
     time, where all shapes are constant, and multiplies W^T with the bodies' wrenches without forming K.
     `tests/problem/test_rows_two_ways.py` compares both; read the reference implementation first.
 
-    `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m].
+    `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
+    number of columns, those of the bodies' parameters and one for each of `extras`.
     """
 
     def __init__(
@@ -119,16 +120,12 @@ class RowBuilder(nn.Module):
         self.sensors = sensors
         self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)
         self.frames = self._layouts.frames
+        self.width = self.columns.count + len(self.extras)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
         self._layouts.clear()  # their tensors are not buffers of the module
         super()._apply(fn, recurse)
         return self
-
-    @property
-    def width(self) -> int:
-        """Number of columns: those of the bodies' parameters, then one for each of `extras`."""
-        return self.columns.count + len(self.extras)
 
     def to_columns(self, phi: Array) -> Tensor:
         """Parameters (M, 12 L), or (M, 12 L + E) with values of the `extras`, in these columns: (M, width)."""
