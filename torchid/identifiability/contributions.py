@@ -86,7 +86,9 @@ def contributions(
         done: called with the number of samples processed.
     """
     directions = prior_directions(builder, problem.scale * problem.free)
-    nuisance = NuisanceColumns.of(builder, directions)
+    first = directions.shape[1] - len(builder.extras)  # nuisance parameters are last
+    of_log = [first + number for number, extra in enumerate(builder.extras) if extra.per_log]
+    nuisance = NuisanceColumns(of_log, list(range(first, directions.shape[1] - len(of_log))))
     data = ScaledParts(parts, directions, nuisance)
     by_log = leave_one_out(data, [part.source for part in parts], rank_tolerance)
     by_state = leave_one_out(data, [state_name(builder.contacts, part.state) for part in parts], rank_tolerance)
@@ -105,13 +107,6 @@ class NuisanceColumns:
 
     of_log: list[int]
     of_all: list[int]
-
-    @classmethod
-    def of(cls, builder: RowBuilder, directions: Array) -> NuisanceColumns:
-        """Of the columns `directions`, as `prior_directions` has them, the nuisance parameters last."""
-        first = directions.shape[1] - len(builder.extras)
-        own = [first + number for number, extra in enumerate(builder.extras) if extra.per_log]
-        return cls(own, list(range(first, directions.shape[1] - len(own))))
 
 
 class ScaledParts:
@@ -145,13 +140,7 @@ class ScaledParts:
 
 
 def leave_one_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float) -> list[PartContribution]:
-    """Contribution of the parts of each name: what is lost without them.
-
-    Args:
-        data: all parts.
-        names: of each part.
-        rank_tolerance: as in `LeastSquares`.
-    """
+    """Contribution of the parts of each name, by the `names` of all parts; `rank_tolerance` as in `LeastSquares`."""
 
     def rank(values: Array) -> int:
         return numerical_rank(values, rank_tolerance, values.shape)
@@ -217,12 +206,11 @@ def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Seq
         return InformationGain.of(np.asarray(np.linalg.eigvalsh(H)))
 
     everything, out = gain(information.total), []
-    frames = [contact.frame for contact in builder.contacts]
     limbs = [name.rpartition(".")[0] for name in dof_names[builder.tree.n :: 6]]
     for kind, names, lost in (
         ("joint torque", dof_names, information.torques),
         ("wrench in a limb", limbs, information.limbs),
-        ("contact wrench", frames, information.wrenches),
+        ("contact wrench", [contact.frame for contact in builder.contacts], information.wrenches),
     ):
         for index, H in lost.items():
             difference = everything - gain(information.total - H)
