@@ -3,9 +3,9 @@
     python scripts/benchmark.py [--samples 65536] [--repeats 5]
 
 Needs the packages pin and example-robot-data (extra `[oracle]`) and Clarabel (extra `[certified]`). Pipelines
-start from the arrays of a log and end with parameters, `joints` sensors: torques measured, contact forces not, two
-thirds of the samples on all feet. Consistent parameters are timed on a log of Solo12 that a robot with other, possible
-parameters could have left, with noise.
+start from the arrays of a log and end with parameters. Sensors are `joints` (torques measured, contact forces not); all
+feet are in contact in two thirds of the samples. Consistent parameters are timed on noisy data of Solo12 that were
+generated with other, physically consistent parameters.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from torchid.sensing import Contact, SensorNoise, named_sensors
 
 @dataclass(frozen=True)
 class Case:
-    """A robot with the feet it stands on."""
+    """A robot with its feet."""
 
     name: str
     urdf: str
@@ -60,9 +60,9 @@ CASES = (
 def robots_folder() -> Path:
     """Where the package example-robot-data keeps its URDFs."""
     for folder in Path(pin.__file__).resolve().parents:
-        found = folder / "share" / "example-robot-data" / "robots"
-        if found.is_dir():
-            return found
+        robots = folder / "share" / "example-robot-data" / "robots"
+        if robots.is_dir():
+            return robots
     raise SystemExit(f"benchmark: the package example-robot-data is missing; {how_to_install('oracle')}")
 
 
@@ -82,32 +82,32 @@ def random_samples(robot: Robot, contacts: int, count: int) -> Samples:
 
 
 class PerSample:
-    """The usual way: one sample at a time through Pinocchio's regressor and NumPy's decompositions."""
+    """Reference pipeline: one sample at a time with Pinocchio's regressor and NumPy's decompositions."""
 
     def __init__(self, urdf: Path, robot: Robot, case: Case) -> None:
         """Load the model and look up joints and feet."""
         self.model = pin.buildModelFromUrdf(str(urdf), pin.JointModelFreeFlyer())
         self.data = self.model.createData()
         joints = [self.model.joints[self.model.getJointId(name)] for name in robot.joint_names]
-        self.q_place = np.array([joint.idx_q for joint in joints])
-        self.v_place = np.array([joint.idx_v for joint in joints])
+        self.q_index = np.array([joint.idx_q for joint in joints])
+        self.v_index = np.array([joint.idx_v for joint in joints])
         self.feet = [self.model.getFrameId(foot, pin.FrameType.BODY) for foot in case.feet]
         self.rows = 3 if case.kind == "point" else 6
         noise = SensorNoise()
         self.variance = np.append(noise.base_std, np.full(robot.n, noise.joint_torque)) ** 2
 
     def states(self, samples: Samples) -> tuple[Array, Array, Array, Array]:
-        """Pinocchio's q, v, a and the torques in its order."""
+        """q, v, a and torques in Pinocchio's order."""
         count, model = len(samples), self.model
         q, v, a, f = (np.zeros((count, size)) for size in (model.nq, model.nv, model.nv, model.nv))
         base_q, base_v, base_a = (x.numpy() for x in samples.coordinates())
         q[:, 3:7] = base_q[:, 3:7]
-        q[:, self.q_place] = samples.joint_position
+        q[:, self.q_index] = samples.joint_position
         v[:, :6] = base_v[:, :6]
-        v[:, self.v_place] = samples.joint_velocity
+        v[:, self.v_index] = samples.joint_velocity
         a[:, :6] = base_a[:, :6]
-        a[:, self.v_place] = samples.joint_acceleration
-        f[:, self.v_place] = samples.torque
+        a[:, self.v_index] = samples.joint_acceleration
+        f[:, self.v_index] = samples.torque
         return q, v, a, f
 
     def projected(self, q: Array, v: Array, a: Array, f: Array, active: Array) -> tuple[Array, Array]:
@@ -131,7 +131,7 @@ class PerSample:
         return np.linalg.lstsq(np.vstack([b[0] for b in blocks]), np.concatenate([b[1] for b in blocks]), rcond=None)[0]
 
     def by_gram(self, samples: Samples) -> Array:
-        """Normal equations summed sample by sample (half of the digits)."""
+        """Normal equations summed sample by sample (loses half of the digits)."""
         q, v, a, f = self.states(samples)
         columns = 10 * (self.model.njoints - 1) + 2 * (self.model.nv - 6)
         gram, right = np.zeros((columns, columns)), np.zeros(columns)
@@ -149,18 +149,18 @@ class PerSample:
 
 
 def torques_of(robot: Robot, case: Case, samples: Samples, phi: Array, noise: float) -> Samples:
-    """The same motion with the torques and unseen foot forces of a robot with parameters (12 L,), and noise [N m]."""
+    """The same motion with noisy torques [N m] of a robot with parameters (12 L,) and unmeasured foot forces."""
     regressor, feet = Regressor(robot), [FrameJacobian(robot, foot) for foot in case.feet]
     rows = 3 if case.kind == "point" else 6
     rng, torques = torch.Generator().manual_seed(1), []
     for start in range(0, len(samples), 1024):
         part = samples[start : start + 1024]
         q, v, a = part.coordinates()
-        needed = regressor(q, v, a) @ torch.from_numpy(phi)
+        generalized = regressor(q, v, a) @ torch.from_numpy(phi)
         J = torch.cat([foot(q)[:, :rows] for foot in feet], dim=1)
         J = J * part.active.repeat_interleave(rows, dim=1)[..., None]
-        carried = (torch.linalg.pinv(J[:, :, :6].mT) @ needed[:, :6, None]).mT @ J
-        torques.append(needed[:, 6:] - carried[:, 0, 6:])
+        contact = (torch.linalg.pinv(J[:, :, :6].mT) @ generalized[:, :6, None]).mT @ J
+        torques.append(generalized[:, 6:] - contact[:, 0, 6:])
     exact = torch.cat(torques)
     noisy = exact + noise * torch.randn(exact.shape, generator=rng, dtype=exact.dtype)
     return replace(samples, torque=noisy)
@@ -190,13 +190,13 @@ def measure_consistent(count: int, repeats: int) -> dict[str, float]:
     return medians({name: (pipeline(estimator), 10**6) for name, estimator in estimators.items()}, repeats)
 
 
-def medians(contestants: dict[str, tuple[Callable[[], object], int]], repeats: int) -> dict[str, float]:
-    """Median microseconds per sample; all contestants take turns, so that a busy machine slows them alike."""
-    times: dict[str, list[float]] = {name: [] for name in contestants}
-    for work, _ in contestants.values():
+def medians(pipelines: dict[str, tuple[Callable[[], object], int]], repeats: int) -> dict[str, float]:
+    """Median microseconds per sample; the pipelines take turns, so that other load affects all alike."""
+    times: dict[str, list[float]] = {name: [] for name in pipelines}
+    for work, _ in pipelines.values():
         work()
     for _ in range(repeats):
-        for name, (work, size) in contestants.items():
+        for name, (work, size) in pipelines.items():
             times[name].append(microseconds(work, size))
     return {name: statistics.median(values) for name, values in times.items()}
 
@@ -217,7 +217,7 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
     contacts = [Contact(foot, case.kind) for foot in case.feet]
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts)))
     samples = random_samples(robot, len(contacts), count)
-    old, regressor = PerSample(urdf, robot, case), Regressor(robot)
+    per_sample, regressor = PerSample(urdf, robot, case), Regressor(robot)
     few = samples[torch.arange(0, count, 32)]
 
     def pipeline() -> None:
@@ -234,15 +234,15 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
     def reduced(part: Samples) -> ChunkDynamics:
         return builder.dynamics(part)
 
-    contestants: dict[str, tuple[Callable[[], object], int]] = {
-        "K, Pinocchio": (lambda: old.regressors(few), len(few)),
+    pipelines: dict[str, tuple[Callable[[], object], int]] = {
+        "K, Pinocchio": (lambda: per_sample.regressors(few), len(few)),
         "K, torchid, 12 L columns": (in_chunks(lambda part: regressor.from_motion(part.motion())), count),
         "wrench columns, torchid": (in_chunks(reduced), count),
-        "per sample, lstsq": (lambda: old.by_stack(few), len(few)),
-        "per sample, Gram": (lambda: old.by_gram(few), len(few)),
+        "per sample, lstsq": (lambda: per_sample.by_stack(few), len(few)),
+        "per sample, Gram": (lambda: per_sample.by_gram(few), len(few)),
         "torchid": (pipeline, count),
     }
-    return medians(contestants, repeats)
+    return medians(pipelines, repeats)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Make the logs and the URDF that ship with the package: a quadruped that sways and lifts its feet in turn.
+"""Write the demo URDF and logs of the package: a quadruped that sways and lifts its feet in turn.
 
     python scripts/make_demo.py
 
@@ -19,7 +19,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "torchid" / "demo"
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 RATE_HZ = 100.0
 TORQUE_NOISE, FORCE_NOISE, ANGLE_NOISE, POSITION_NOISE = 0.1, 0.5, 2e-5, 1e-5  # N m, N, rad, m
-STEP_S, LIFT_M, UNLOADED = 1.6, 0.06, 0.3  # a foot's share of the load is gone at 30 % of its lift
+STEP_S, LIFT_M, UNLOADED = 1.6, 0.06, 0.3  # a foot is unloaded at 30 % of its lift
 COULOMB, VISCOUS = 0.3, 0.05  # N m, N m s/rad
 
 
@@ -75,7 +75,7 @@ def base_motion(time: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray,
 
 
 def lift(time: np.ndarray) -> np.ndarray:
-    """How far each foot is off the ground, (N, 4) from 0 to 1; one foot at a time, at rest in between."""
+    """Height of each foot above the ground, (N, 4) from 0 to 1; one foot at a time, with pauses."""
     phase = time / STEP_S
     height = np.zeros((len(time), len(LEGS)))
     for leg in range(len(LEGS)):
@@ -86,7 +86,7 @@ def lift(time: np.ndarray) -> np.ndarray:
 
 
 def leg_angles(model: pin.Model, base: np.ndarray, feet: np.ndarray) -> np.ndarray:
-    """Joint angles (N, 12) that put the feet, (N, 4, 3), where they should be (Newton's method)."""
+    """Joint angles (N, 12) at which the feet have positions (N, 4, 3), by Newton's method."""
     data, names = model.createData(), [f"{leg}_foot" for leg in LEGS]
     frames = [model.getFrameId(name, pin.FrameType.BODY) for name in names]
     guess = np.tile([0.0, 0.7, -1.4], len(LEGS))
@@ -118,16 +118,16 @@ def perturbed(model: pin.Model, rng: np.random.Generator) -> pin.Model:
 def forces(
     model: pin.Model, q: np.ndarray, v: np.ndarray, a: np.ndarray, load: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint torques (12,) and foot forces in the feet's axes (4, 3); feet carry the trunk in proportion to `load`."""
+    """Joint torques (12,) and foot forces in the feet's axes (4, 3); feet share the load in proportion to `load`."""
     data = model.createData()
-    needed = pin.rnea(model, data, q, v, a)
+    generalized = pin.rnea(model, data, q, v, a)
     frames = [model.getFrameId(f"{leg}_foot", pin.FrameType.BODY) for leg in LEGS]
     J = np.vstack([pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL)[:3] for frame in frames])
     share = np.repeat(load, 3)
     J_base = J[:, :6].T
-    force = share * (J_base.T @ np.linalg.solve((J_base * share) @ J_base.T, needed[:6]))
+    force = share * (J_base.T @ np.linalg.solve((J_base * share) @ J_base.T, generalized[:6]))
     friction = COULOMB * np.sign(v[6:]) + VISCOUS * v[6:]
-    return needed[6:] + friction - J[:, 6:].T @ force, force.reshape(-1, 3)
+    return generalized[6:] + friction - J[:, 6:].T @ force, force.reshape(-1, 3)
 
 
 def record(model: pin.Model, true: pin.Model, seconds: float, rng: np.random.Generator, path: Path) -> None:

@@ -39,7 +39,7 @@ def main() -> int:
 
 
 def reproduce(options: argparse.Namespace) -> None:
-    """Run the study as asked."""
+    """Run the study with the options of the command line."""
     check_free(options.output, options.overwrite, STUDY)
     experiments = {name: CONFIGS / f"biped_{name}.yaml" for name in SENSOR_SETS}
     with about_file(SIMULATION):

@@ -1,14 +1,14 @@
 """Which files and functions of torchid run between a log file and the parameters fitted to it?
 
     python scripts/trace_path.py                        # the experiment that comes with torchid
-    python scripts/trace_path.py my.yaml --functions    # yours, with every function in the order of its first call
+    python scripts/trace_path.py my.yaml --functions    # another one, with functions in order of first calls
 
 Three paths:
 - identify: `torchid identify` as a whole, from the command line to the run folder;
 - log to phi: the part of it from the first call into `torchid/logs` until the estimate that it returns exists;
-- library: from `read_log` to `LeastSquares.solve` by the calls of the README. Noise is taken as stated, nothing judged.
+- library: from `read_log` to `LeastSquares.solve` by the calls of the README, with the stated noise and without checks.
 
-Functions have a name: lambdas, comprehensions and what runs while modules are imported are left out.
+Named functions are counted; lambdas, comprehensions and what runs while modules are imported are not.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Trace:
     def __init__(self, calls: Sequence[tuple[str, int, str, int]] = ()) -> None:
         """Start with some calls."""
         self.calls = list(calls)
-        self.estimates: list[tuple[object, int]] = []  # what has phi, and how many calls there were before it
+        self.estimates: list[tuple[object, int]] = []  # objects with phi, and the number of calls before each
         self.identified: Any = None  # what the function `identify` returned
 
     def run(self, action: Callable[[], object]) -> Trace:
@@ -97,7 +97,7 @@ def _depth(frame: FrameType | None) -> int:
 
 
 def import_everything() -> None:
-    """Import all modules, but those whose libraries are missing, so that no import is traced."""
+    """Import all modules whose libraries are installed, so that no import is traced."""
     for module in pkgutil.walk_packages([str(PACKAGE)], "torchid."):
         if not module.name.endswith("__main__"):
             with suppress(ImportError):
@@ -133,9 +133,9 @@ def main() -> int:
         arguments = ["identify", str(options.file), f"output={folder}/run"]
         whole = Trace().run(lambda: command_line(arguments))
     if whole.identified is None:
-        return 1  # the command has said why
+        return 1  # the command has printed the reason
     paths = {"identify": whole, "log to phi": whole.from_log()}
-    with suppress(KeyError):  # of an experiment file that says more than these calls can
+    with suppress(KeyError):  # the experiment file uses keys that these calls do not support
         paths["library"] = Trace().run(lambda: library_path(options.file)).from_log()
     for name, trace in paths.items():
         print(f"{name:14} {trace}")

@@ -1,10 +1,10 @@
-"""A small network beside the rigid body: what do rigid bodies and friction not explain?
+"""Train small networks beside the rigid bodies, for forces that rigid bodies and friction do not explain.
 
     python scripts/train_residual.py                                     # on the log that comes with torchid
-    python scripts/train_residual.py my.yaml estimator.friction=false    # yours; friction is left to the network
+    python scripts/train_residual.py my.yaml estimator.friction=false    # another log; friction is left to the networks
 
-How strongly the networks are held back is chosen by held-out blocks of the training logs, unless --weight says it. The
-logs under `test` are only looked at in the end. Curves go to TensorBoard: `tensorboard --logdir runs/residual`.
+The regularization weight of the networks is chosen by held-out blocks of the training logs, unless --weight is given.
+The logs under `test` are evaluated at the end only. Curves go to TensorBoard: `tensorboard --logdir runs/residual`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class JointNetworks(nn.Module):
     """r(q, v, a): a small network for every joint's torque, from that joint's own motion; no force on the base."""
 
     def __init__(self, n: int, hidden: int = 16) -> None:
-        """Start at no force at all."""
+        """Start with zero force."""
         super().__init__()
         self.n = n
         self.weight = nn.Parameter(torch.randn(n, hidden, 3, dtype=torch.float64))
@@ -51,7 +51,7 @@ class JointNetworks(nn.Module):
 
 
 def main() -> int:
-    """Train without and with the networks, and print what they change."""
+    """Train without and with the networks, and print their effect."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", nargs="?", default=DEMO, help="experiment file")
     parser.add_argument("overrides", nargs="*", help="key.subkey=value")
@@ -67,7 +67,7 @@ def compare(options: argparse.Namespace) -> None:
     """Train twice on the same batches."""
     config = load_config(options.file, options.overrides)
     if not config.logs.test:
-        raise ConfigError(options.file, "logs.test", "none", "logs to judge the networks by")
+        raise ConfigError(options.file, "logs.test", "none", "logs to evaluate the networks on")
     with about_file(options.file):
         experiment = set_up(config)
     robot = experiment.robot
@@ -101,7 +101,7 @@ def compare(options: argparse.Namespace) -> None:
 
 
 def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
-    """Say what the networks took of the force, and from which bodies."""
+    """Print the networks' share of the force, and the bodies whose parameters they change most."""
     if effect is None:
         return
     if effect.choice is not None:
@@ -112,7 +112,7 @@ def print_effect(effect: ResidualEffect | None, bodies: Sequence[str]) -> None:
         print(f"  (the largest within one standard error, {effect.choice.standard_error:.2g}, of the least)")
     for name, share in effect.shares.items():
         print(f"{name.replace('_', ' ')}: the networks give {100.0 * share:.3g} %, rms {effect.rms[name]:.3g}")
-    print(f"of the networks' force rigid bodies could give {100.0 * effect.rigid_share:.3g} %")
+    print(f"rigid bodies can explain {100.0 * effect.rigid_share:.3g} % of the networks' force")
     most = sorted(zip(effect.moved_scaled, effect.moved_errors, bodies, strict=True), reverse=True)[:3]
     moved = (f"{body} ({scaled:.2g} of its size, {errors:.2g} standard errors)" for scaled, errors, body in most)
     print(f"parameters moved most: {', '.join(moved)}")

@@ -1,7 +1,6 @@
 """The description of the demo biped: the lower half of a Sarcos-size humanoid, 16 joints, 66 kg.
 
-The URDF that ships with the package is made from it (`scripts/make_biped.py`), and MuJoCo's model from that URDF, so
-that the two cannot disagree.
+`scripts/make_biped.py` writes the URDF of the package from it; MuJoCo's model is made from that URDF.
 """
 
 from __future__ import annotations
@@ -95,7 +94,7 @@ def biped_urdf() -> bytes:
 def _on_side(segment: Segment, side: str) -> Segment:
     """The left leg's segment, or its mirror image in the x-z plane."""
     sign = 1.0 if side == "l" else -1.0
-    turned = segment.axis in "xz" and side == "r"  # a mirrored rotation about x or z turns the other way
+    reversed_axis = segment.axis in "xz" and side == "r"  # a mirrored rotation about x or z turns the other way
     low, high = segment.limits
 
     def mirrored(v: Triple) -> Triple:
@@ -107,7 +106,7 @@ def _on_side(segment: Segment, side: str) -> Segment:
         segment.parent if segment.parent == "pelvis" else f"{side}_{segment.parent}",
         mirrored(segment.origin),
         segment.axis,
-        (-high, -low) if turned else (low, high),
+        (-high, -low) if reversed_axis else (low, high),
         segment.mass,
         mirrored(segment.com),
         segment.box,

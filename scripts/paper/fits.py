@@ -20,7 +20,7 @@ from torchid.problem.predict import force_series, null_space_part
 
 @dataclass(frozen=True)
 class StateRank:
-    """A contact state of the training logs: samples in it, and independent combinations that they determine."""
+    """A contact state of the training logs: number of samples, and rank of their rows."""
 
     name: str
     samples: int

@@ -70,17 +70,17 @@ def bar_figure(title: str, groups: Sequence[Bars]) -> Figure:
     figure = Figure(figsize=(2.5 * len(groups) + 0.6, 3.4), layout="constrained")
     axes = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
     for axis, group in zip(axes, groups, strict=True):
-        place = np.arange(len(group.heights))
+        position = np.arange(len(group.heights))
         median, least, greatest = 100.0 * np.array(list(group.heights.values())).T
-        axis.bar(place, median, 0.7, color=[*_COLORS[: len(place) - 1], "black"])
-        axis.errorbar(place, median, yerr=[median - least, greatest - median], fmt="none", ecolor="0.4", capsize=3)
-        for x, y, top in zip(place, median, greatest, strict=True):
+        axis.bar(position, median, 0.7, color=[*_COLORS[: len(position) - 1], "black"])
+        axis.errorbar(position, median, yerr=[median - least, greatest - median], fmt="none", ecolor="0.4", capsize=3)
+        for x, y, top in zip(position, median, greatest, strict=True):
             axis.annotate(f"{y:.2g}", (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=7)
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter(LogFormatter())  # the default writes formulas, which names forbid, see STYLE
         axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         axis.margins(y=0.15)
-        axis.set_xticks(place, list(group.heights), rotation=40, ha="right")
+        axis.set_xticks(position, list(group.heights), rotation=40, ha="right")
         axis.set_title(group.name, loc="left", fontsize=9)
     axes[0].set_ylabel("rms of error / rms of measured [%]")
     figure.suptitle(title, x=0.01, ha="left")
@@ -186,7 +186,7 @@ _SHOWN_S = 3.0
 
 
 def write_study(folder: Path, results: Results, series: Series) -> None:
-    """Write everything that a study found.
+    """Write all results of a study.
 
     Args:
         folder: exists; gets `results.json`, `tables.txt`, `rms.png`, `forces.png`, `projected.png`, `tensorboard/`.

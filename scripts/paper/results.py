@@ -1,4 +1,4 @@
-"""What the study found: errors on the unseen log by condition, and whether the three claims of the paper hold."""
+"""Results of the study: errors on the unseen log by condition, and whether the three claims of the paper hold."""
 
 from __future__ import annotations
 
@@ -81,12 +81,12 @@ class Results:
             figure: a key of `error_figures`.
             against: "exact" or "measured".
         """
-        found = [
+        values = [
             error_figures(getattr(record, against))[figure]
             for record in self.records
             if (record.condition, record.training, record.sensors) == (condition, training, sensors)
         ]
-        return Spread(float(np.median(found)), min(found), max(found))
+        return Spread(float(np.median(values)), min(values), max(values))
 
 
 def error_figures(metrics: Metrics) -> dict[str, float]:
@@ -119,7 +119,7 @@ class Claim:
 
 
 def examine_claims(results: Results, condition: str, training: str) -> tuple[Claim, Claim, Claim]:
-    """Examine the claims of section V, on medians of the errors against what truly happened.
+    """Examine the claims of section V, on medians of the errors against the true forces.
 
     (1) Full sensing is adequate everywhere: good on every group of rows. (2) Contacts only is good on the base rows and
     poor on joint torques. (3) Joints only is the best of the three sets inside the projected space, and poor outside,

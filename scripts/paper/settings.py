@@ -63,7 +63,7 @@ class Study:
     nominal_draws: int = 5
 
     def __post_init__(self) -> None:
-        """Make sure that there is something to fit on, and something to test on."""
+        """Check that there are motions for training, and one for testing."""
         names = [motion.name for motion in self.simulation.motions]
         kinds = [name.startswith(SQUATS) for name in names], [name.startswith(UNSEEN) for name in names]
         if not any(kinds[0]) or sum(kinds[1]) != 1:

@@ -29,7 +29,7 @@ from torchid.simulation import sensor_log
 
 @dataclass(frozen=True)
 class _Draw:
-    """One draw of a condition: training samples by group, and the unseen log as measured and as it truly was."""
+    """One draw of a condition: training samples by group, and the unseen log as measured and without imperfections."""
 
     condition: Condition
     number: int
@@ -39,7 +39,7 @@ class _Draw:
 
 
 class Reproduction:
-    """A study under way."""
+    """Runs a study."""
 
     def __init__(self, study: Study) -> None:
         """Read the experiment files.
@@ -95,7 +95,7 @@ class Reproduction:
         return self.study.noise_draws if condition.random else 1
 
     def _simulated(self, friction: bool, folder: Path, names: Sequence[str]) -> dict[str, Log]:
-        """What the robot did, with or without friction in its joints."""
+        """Exact logs of the motions, with or without joint friction."""
         config = self.study.simulation
         plant = replace(config.friction, enabled=friction)
         simulate(replace(config, output=folder, friction=plant))

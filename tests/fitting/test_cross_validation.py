@@ -24,7 +24,7 @@ from torchid.errors import BaseLostError
 from torchid.estimators import LeastSquares
 from torchid.fitting.cross_validation import with_all_readings
 from torchid.fitting.experiment import set_up
-from torchid.identifiability.base_parameters import StateReport, _of_base, require_base
+from torchid.identifiability.base_parameters import StateReport, _base_statistics, require_base
 from torchid.identifiability.confounding import TotalMass
 from torchid.logs import read_log
 from torchid.logs.preprocess import preprocess
@@ -342,12 +342,12 @@ def test_a_ratio_that_is_no_number_is_absurd() -> None:
 def test_the_rank_is_that_of_most_samples_and_not_of_the_best() -> None:
     values = torch.ones(64, 6)
     values[:63, 2:] = 0.0
-    rank, smallest, full, shares = _of_base(values, torch.ones(64))
+    rank, smallest, full, shares = _base_statistics(values, torch.ones(64))
     assert (rank, smallest, full) == (2, 0.0, 1 / 64)
     assert shares == {6: 1 / 64, 2: 63 / 64}
     with pytest.raises(BaseLostError, match=r"rank 2 of 6, 6 in 1.6 % of them"):
         require_base([StateReport("stand", 64, 6, rank, smallest, full, shares)])
-    rank, smallest, full, shares = _of_base(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
+    rank, smallest, full, shares = _base_statistics(values.flip(0), torch.tensor([1000.0] + [1.0] * 63))
     assert rank == 6, "a sample counts as often as it stands for others"
 
 

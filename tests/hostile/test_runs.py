@@ -143,5 +143,5 @@ def test_states_are_alike_if_they_are_made_of_the_same() -> None:
         ("n", float("nan")),
         ("empty", {0: 1}),
     ):
-        with pytest.raises(ValueError, match=rf"state\.{key}.* is of another"):
+        with pytest.raises(ValueError, match=rf"state\.{key}.* has the wrong"):
             require_same_structure(one | {key: value}, one)

@@ -242,7 +242,7 @@ def pushed(w: World, log: Samples) -> Tensor:
         wrench = log.wrench[:, place]
         if log.wrench_in_world:
             poses = w.robot.link_poses(log.joint_position)
-            R = log.rotation_world_base @ poses[contact.frame][:, :3, :3]
+            R = log.base.rotation @ poses[contact.frame][:, :3, :3]
             wrench = (wrench.unflatten(1, (2, 3)) @ R).flatten(1)
         used = list(contact.components)
         pushing = (wrench * log.active[:, place, None])[:, used]

@@ -95,7 +95,7 @@ def test_parameters_are_those_found_with_the_pose(sensors: str) -> None:
 def test_neither_heading_nor_place_nor_velocity_is_asked_for() -> None:
     robot, oracle, log = recorded()
     samples = bind_log(with_imu(oracle, log, IMU), robot, CONTACTS)
-    assert samples.rotation_world_base is None
+    assert samples.base.rotation is None
     K = Regressor(robot)(*samples.coordinates())
     expected = Regressor(robot)(*map(torch.from_numpy, states_of(log)))
     np.testing.assert_allclose(K, expected, rtol=0.0, atol=1e-12 * float(expected.abs().max()))

@@ -98,7 +98,7 @@ def local_wrenches(robot: Robot, contacts: Sequence[Contact], samples: Samples) 
     if not samples.wrench_in_world:
         return samples.wrench
     poses = robot.link_poses(samples.joint_position)
-    R = torch.stack([samples.rotation_world_base @ poses[c.frame][:, :3, :3] for c in contacts], dim=1)
+    R = torch.stack([samples.base.rotation @ poses[c.frame][:, :3, :3] for c in contacts], dim=1)
     return (samples.wrench.unflatten(2, (2, 3)) @ R).flatten(2)
 
 

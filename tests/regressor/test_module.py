@@ -28,9 +28,9 @@ from synthetic import (
 from torchid import parameters
 from torchid.errors import UnknownNameError
 from torchid.regressor import FrameJacobian, Regressor, motion_from_state
-from torchid.regressor.columns import reduced_layout, reduction_matrix
-from torchid.regressor.kinematics import body_states, joint_motion
-from torchid.regressor.regressor import all_wrench_columns, joint_row, joint_rows, joint_screw_axes
+from torchid.regressor.columns import all_wrench_columns, reduced_layout, reduction_matrix
+from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
+from torchid.regressor.regressor import joint_row, joint_rows
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 

@@ -159,7 +159,7 @@ def test_roll_pitch_and_yaw_turn_a_box_as_the_urdf_means(tmp_path: Path) -> None
 def test_a_plate_keeps_an_interior_and_a_point_is_no_shape(tmp_path: Path) -> None:
     extent = one(tmp_path, '<visual><geometry><box size="0.4 0.2 0"/></geometry></visual>')
     np.testing.assert_allclose(extent.half, [0.2, 0.1, 0.0002])
-    with pytest.warns(TorchidWarning, match="no shapes at base: where their matter lies is not known"):
+    with pytest.warns(TorchidWarning, match="no shapes at base: their extent is unknown"):
         body_extents(load(write(tmp_path, link("base", INERTIAL + ball(0.0)))))
 
 
@@ -270,7 +270,7 @@ def test_bodies_without_shapes_are_listed_once(tmp_path: Path) -> None:
     with pytest.warns(TorchidWarning) as caught:
         assert list(extents(write(tmp_path, *elements, *joints))) == ["d"]
     (message,) = (str(warning.message) for warning in caught)
-    assert message.endswith("machine.urdf: no shapes at a, b, c: where their matter lies is not known")
+    assert message.endswith("machine.urdf: no shapes at a, b, c: their extent is unknown")
 
 
 def test_the_unit_of_a_collada_file_counts(tmp_path: Path) -> None:

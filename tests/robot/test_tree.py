@@ -185,7 +185,7 @@ def test_a_joint_that_mimics_a_fixed_one_is_held_at_its_offset(kind: str, base_l
         joint("held", "stand", "arm", kind, mimic("weld", 2.0, 0.7)),
         joint("held_too", "arm", "tip", kind, mimic("held", 3.0, -0.1)),
     )
-    with pytest.warns(TorchidWarning, match="'weld' is fixed, so it is held still too") as caught:
+    with pytest.warns(TorchidWarning, match="'weld' is fixed, so that it is fixed too") as caught:
         robot = load_robot(path, base_link)
     assert [f"joint '{name}'" in str(w.message) for w, name in zip(caught, ("held", "held_too"), strict=True)] == [
         True

@@ -15,14 +15,14 @@ from torchid.estimators.conic_problem import ConicProblem, Solution
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
 
-_LOOSE = 1e-6  # relative gap beyond which another try is made, and in the end a warning
-_OUTSIDE = 1e-8  # violation of a condition, in units of the scale, beyond which another try is made; rarely exceeded
-_FAR = 1e-7  # and beyond which, in the end, a warning
+_LOOSE = 1e-6  # relative gap above which the next try follows, and after the last one a warning
+_OUTSIDE = 1e-8  # violation of a condition, in units of the scale, above which the next try follows
+_FAR = 1e-7  # violation above which there is a warning after the last try
 _TRIES = ((1.0, 1.0), (0.1, 1.0), (0.01, 10.0), (10.0, 10.0), (0.1, 100.0), (100.0, 1000.0))
 """Units of the objective and of the tolerance: Clarabel stalls on one in 300 problems with an entropic prior."""
-_AGAIN = ((0.1, 1.0), (1.0, 1.0), (0.01, 10.0), (0.1, 100.0))  # units of the objective before anything is explained
+_AGAIN = ((0.1, 1.0), (1.0, 1.0), (0.01, 10.0), (0.1, 100.0))  # the same in units of the objective at nominal
 _ENDED = ("Solved", "AlmostSolved", "InsufficientProgress")
-"""States in which there is a point; its gap says how good it is."""
+"""States of Clarabel with a point; its gap says how accurate it is."""
 
 
 class _SolverError(Exception):
@@ -41,20 +41,20 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
     size = max(problem.constant, problem.floor, 10.0 * float(problem.weights.max(initial=0.0)))
     whole = max(problem.constant + float(problem.target @ problem.target), size)
     tries = [(unit * size, share) for unit, share in _TRIES] + [(unit * whole, share) for unit, share in _AGAIN]
-    found, status = [], ""
+    solutions, status = [], ""
     for unit, share in tries:
         try:
-            found.append(_solve(problem, unit, share * tolerance))
+            solutions.append(_solve(problem, unit, share * tolerance))
         except _SolverError as error:
             status = str(error)
             continue
-        if _excess(problem, found[-1]) <= 1.0:
-            return found[-1]
-    if not found:
+        if _excess(problem, solutions[-1]) <= 1.0:
+            return solutions[-1]
+    if not solutions:
         with one_thread():
             find_strictly_feasible(problem)  # its error names the condition
-        raise InputError("estimator", "method", f"certified, but Clarabel says {status}", "barrier")
-    best = min(found, key=lambda solution: _excess(problem, solution))
+        raise InputError("estimator", "method", f"certified, but Clarabel ends with {status}", "barrier")
+    best = min(solutions, key=lambda solution: _excess(problem, solution))
     if best.gap <= _LOOSE * max(best.objective, problem.floor) and _violation(problem, best) <= _FAR:
         return best
     message = f"estimator: the conic solver stopped at a gap of {best.gap:.1g} to {best.objective:.3g}"
@@ -64,7 +64,7 @@ def solve_certified(problem: ConicProblem, tolerance: float = 1e-10) -> Solution
 
 
 def _excess(problem: ConicProblem, solution: Solution) -> float:
-    """The gap or the largest violation, whichever is larger, in units of what is accepted."""
+    """The larger of gap and largest violation, each relative to its tolerance."""
     gap = solution.gap / max(solution.objective, problem.floor)
     return max(gap / _LOOSE, _violation(problem, solution) / _OUTSIDE)
 
@@ -93,7 +93,7 @@ class _Program:
     cones: list[Any] = field(default_factory=list)
 
     def require(self, cone: Any, A: Array, columns: np.ndarray, b: Array) -> slice:
-        """Require b - A x[columns] to be in a cone; returns the place of its multipliers."""
+        """Require b - A x[columns] to be in a cone; returns the slice of its multipliers."""
         start = sum(map(len, self.b))
         self.rows.append((A, columns))
         self.b.append(b)
@@ -107,12 +107,12 @@ class _Program:
             index = np.repeat(np.arange(len(A)), len(columns)), np.tile(columns, len(A))
             blocks.append(sparse.coo_matrix((A.ravel(), index), (len(A), len(self.q))))
         A = sparse.csc_matrix(sparse.vstack(blocks))
-        A.eliminate_zeros()  # a factorization would keep them, and take two to six times as long
+        A.eliminate_zeros()  # else the factorization takes two to six times as long
         return A
 
 
 def _solve(problem: ConicProblem, size: float, tolerance: float) -> Solution:
-    """Solve in units of the objective: tolerances are absolute for small numbers.
+    """Solve in units `size` of the objective: Clarabel's tolerances are absolute for small numbers.
 
     The misfit is a variable of its own, as squares of R would cost digits. A weighted log det F is the sum of t_i, with
     exp(t_i) <= L_ii and [[F, L], [L^T, diag(L)]] >= 0 for a lower triangular L.
@@ -139,15 +139,15 @@ def _solve(problem: ConicProblem, size: float, tolerance: float) -> Solution:
     ]
     for number, k in enumerate(np.flatnonzero(weighted)):
         _require_log_det(program, problem, int(k), n + m + number * (width - n - m) // count, size)
-    found = _run(program, tolerance)
-    best, multipliers = np.array(found.x)[:n], size * np.array(found.z)
+    result = _run(program, tolerance)
+    best, multipliers = np.array(result.x)[:n], size * np.array(result.z)
     best = best - problem.E.T @ (problem.E @ best - problem.e)
     Z = np.zeros_like(problem.F0)
     Z[~weighted] = np.array([_positive(_smat(multipliers[at])) for at in at_blocks]).reshape(-1, 4, 4)
     Z[weighted] = problem.weights[weighted, None, None] * np.linalg.inv(problem.blocks(best)[weighted])
     y = np.maximum(multipliers[at_rows], 0.0)
     gap = abs(problem.gap(best, Z, y))  # negative where the solver's accuracy leaves x outside
-    return Solution(best, problem.objective(best), gap, int(found.iterations))
+    return Solution(best, problem.objective(best), gap, int(result.iterations))
 
 
 def _require_log_det(program: _Program, problem: ConicProblem, block: int, start: int, size: float) -> None:
@@ -168,7 +168,7 @@ def _require_log_det(program: _Program, problem: ConicProblem, block: int, start
 
 
 def _run(program: _Program, tolerance: float) -> Any:
-    """Clarabel's solution, also one that is not quite optimal: the gap says by how much.
+    """Clarabel's solution, optimal or not: the gap says by how much.
 
     Raises:
         _SolverError: nothing was found.
@@ -178,10 +178,10 @@ def _run(program: _Program, tolerance: float) -> Any:
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     P = sparse.csc_matrix(sparse.diags(program.P))
     A, b = program.matrix(), np.concatenate(program.b)
-    found = clarabel.DefaultSolver(P, program.q, A, b, program.cones, settings).solve()
-    if str(found.status) not in _ENDED or not np.isfinite(found.x).all():
-        raise _SolverError(str(found.status))
-    return found
+    result = clarabel.DefaultSolver(P, program.q, A, b, program.cones, settings).solve()
+    if str(result.status) not in _ENDED or not np.isfinite(result.x).all():
+        raise _SolverError(str(result.status))
+    return result
 
 
 _LOWER = np.tril_indices(4)

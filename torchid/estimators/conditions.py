@@ -1,4 +1,4 @@
-"""Conditions of physical consistency on the parameters, and by how much given parameters violate them."""
+"""Conditions of physical consistency, and violations of them by given parameters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchid.settings import BelowOne, Positive, validate_settings
 
 EnclosureKind = Literal["box", "ellipsoid"]
 
-_ROUNDING = 1e-6  # of matrices that users write down with six digits
+_ROUNDING = 1e-6  # of matrices given with six digits
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Enclosure:
     half: Array
 
     def __post_init__(self) -> None:
-        """Check kind, place and size."""
+        """Check kind, centre, axes and size."""
         validate_settings(self)
         if np.shape(self.centre) != (3,) or not np.isfinite(self.centre).all():
             raise ValueError(f"centre: found {_short(self.centre)}; accepted: three finite numbers")
@@ -42,10 +42,10 @@ class Enclosure:
 
 @dataclass(frozen=True)
 class Mirror:
-    """Two bodies that are mirror images, friction included, or one that is symmetric.
+    """Two bodies that are mirror images, friction included, or one symmetric body.
 
-    `reflection`, (3, 3), orthogonal, takes the first link's vectors to the second's. Its determinant is -1, or 1 for
-    equal bodies whose links are turned.
+    `reflection`, (3, 3), orthogonal, maps vectors of the first link to the second's. Its determinant is -1, or 1 for
+    equal bodies with rotated links.
     """
 
     body: int
@@ -53,7 +53,7 @@ class Mirror:
     reflection: Array
 
     def __post_init__(self) -> None:
-        """Check that lengths stay."""
+        """Check that the reflection is orthogonal."""
         _check_orthogonal("reflection", self.reflection)
 
 
@@ -99,7 +99,7 @@ class Conditions:
         return self.names[body] if self.names else f"body {body}"
 
     def validate_bodies(self, bodies: int) -> None:
-        """Refuse conditions on bodies that a robot of so many does not have.
+        """Refuse conditions on bodies that a robot with this many does not have.
 
         Raises:
             ValueError: names the body.
@@ -112,11 +112,13 @@ class Conditions:
         """Lower and upper bounds (L, 12), friction at least 0."""
         lower = np.full((bodies, PER_BODY), -np.inf) if self.lower is None else self.lower.copy()
         upper = np.full((bodies, PER_BODY), np.inf) if self.upper is None else self.upper
-        for name, bound, never in (("lower", lower, np.inf), ("upper", upper, -np.inf)):
+        for name, bound, impossible in (("lower", lower, np.inf), ("upper", upper, -np.inf)):
             if bound.shape != (bodies, PER_BODY):
                 raise ValueError(f"{name}: found shape {bound.shape}; accepted: ({bodies}, {PER_BODY})")
-            if np.isnan(bound).any() or (bound == never).any():
-                raise ValueError(f"{name}: found NaN or {never}; accepted: numbers, {-never} where there is no bound")
+            if np.isnan(bound).any() or (bound == impossible).any():
+                raise ValueError(
+                    f"{name}: found NaN or {impossible}; accepted: numbers, {-impossible} where there is no bound"
+                )
         lower[:, parameters.FRICTION] = np.maximum(lower[:, parameters.FRICTION], 0.0)
         return lower, upper
 
@@ -157,53 +159,42 @@ def validate_parameters(**arrays: Array) -> None:
 
 
 def violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float = 1e-9) -> list[Violation]:
-    """The conditions that parameters (L, 12) violate by more than `tolerance` of their natural size.
-
-    Args:
-        phi: parameters.
-        scale: (L, 12), the size that a deviation of each parameter is measured in (`parameter_scale`).
-        conditions: what to check.
-        tolerance: relative.
-    """
+    """Conditions that parameters (L, 12) violate by more than `tolerance` of their `parameter_scale`, (L, 12)."""
     validate_parameters(phi=phi, scale=scale)
     conditions.validate_bodies(len(phi))
     out: list[Violation] = []
     for body in np.flatnonzero(phi[:, parameters.INERTIAL].any(axis=1)):
-        out += _matter_violations(int(body), phi[body], scale[body], conditions.margin, tolerance)
+        out += _inertia_violations(int(body), phi[body], scale[body], conditions.margin, tolerance)
     for enclosure in (e for e in conditions.enclosures if phi[e.body, parameters.MASS] > 0.0):
-        outside = _excursion(phi[enclosure.body], enclosure)
+        outside, condition = _excursion(phi[enclosure.body], enclosure), f"centre of mass outside its {enclosure.kind}"
         if outside > tolerance:
-            out.append(
-                Violation(enclosure.body, f"centre of mass outside its {enclosure.kind}", outside, "of its size")
-            )
+            out.append(Violation(enclosure.body, condition, outside, "of its size"))
     for mirror in conditions.mirrors:
         image = mirror_matrix(mirror.reflection) @ phi[mirror.body]
-        off = float(np.max(np.abs(image - phi[mirror.image]) / scale[mirror.image]))
-        if off > tolerance:
-            out.append(
-                Violation(mirror.image, f"no mirror image of {conditions.body_name(mirror.body)}", off, "of its scale")
-            )
+        error = float(np.max(np.abs(image - phi[mirror.image]) / scale[mirror.image]))
+        if error > tolerance:
+            condition = f"no mirror image of {conditions.body_name(mirror.body)}"
+            out.append(Violation(mirror.image, condition, error, "of its scale"))
     if conditions.total_mass is not None:
-        off = float(abs(phi[:, parameters.MASS].sum() - conditions.total_mass))
-        if off > tolerance * conditions.total_mass:
-            out.append(Violation(None, "total mass is another", off, "kg"))
+        error = float(abs(phi[:, parameters.MASS].sum() - conditions.total_mass))
+        if error > tolerance * conditions.total_mass:
+            out.append(Violation(None, "total mass is another", error, "kg"))
     return out + _bound_violations(phi, scale, conditions, tolerance)
 
 
 def _bound_violations(phi: Array, scale: Array, conditions: Conditions, tolerance: float) -> list[Violation]:
     """Parameters outside their bounds."""
-    out = []
-    lower, upper = conditions.bounds(len(phi))
+    out, (lower, upper) = [], conditions.bounds(len(phi))
     beyond = np.maximum(lower - phi, phi - upper)
     for body, number in zip(*np.nonzero(beyond > tolerance * scale), strict=True):
         name = parameters.PARAMETERS[number]
         negative = number >= parameters.FRICTION.start and phi[body, number] < 0.0
-        what = f"{name} negative" if negative else f"{name} beyond its bounds"
-        out.append(Violation(int(body), what, float(beyond[body, number]), parameters.UNITS[number]))
+        condition = f"{name} negative" if negative else f"{name} beyond its bounds"
+        out.append(Violation(int(body), condition, float(beyond[body, number]), parameters.UNITS[number]))
     return out
 
 
-def _matter_violations(body: int, phi: Array, scale: Array, margin: float, tolerance: float) -> list[Violation]:
+def _inertia_violations(body: int, phi: Array, scale: Array, margin: float, tolerance: float) -> list[Violation]:
     """Mass, inertia about the centre of mass, triangle inequality, pseudo-inertia of one body."""
     if phi[parameters.MASS] <= 0.0:
         return [Violation(body, "mass not positive", float(-phi[parameters.MASS]), "kg")]
@@ -222,7 +213,7 @@ def _matter_violations(body: int, phi: Array, scale: Array, margin: float, toler
 
 
 def _excursion(phi: Array, enclosure: Enclosure) -> float:
-    """How far the centre of mass is outside, as a share of the half sizes; negative inside."""
+    """Distance of the centre of mass outside its enclosure, as a share of the half sizes; negative inside."""
     com = phi[parameters.FIRST_MOMENT] / phi[parameters.MASS]
     local = np.abs(enclosure.axes.T @ (com - enclosure.centre)) / enclosure.half
     return float((local.max() if enclosure.kind == "box" else np.linalg.norm(local)) - 1.0)

@@ -37,7 +37,7 @@ class _Block:
 
 
 class _Variables:
-    """The entry of x of every free parameter, and the values of the others, all in units of their scale.
+    """Indices in x of the free parameters, and the values of the fixed ones, all in units of their scale.
 
     `deviations @ x` is the deviation of the free parameters from nominal, (n,).
     """
@@ -55,11 +55,11 @@ class _Variables:
         """Variables of a body's inertial parameters, (10,)."""
         return self.index[body, parameters.INERTIAL]
 
-    def measure(self, roots: Mapping[int, Array]) -> None:
-        """Measure deviations of bodies' pseudo-inertias by roots L, (4, 4): J = J_0 + L U L^T with x the numbers of U.
+    def use_pseudo_inertia_roots(self, roots: Mapping[int, Array]) -> None:
+        """Use the entries of U as variables, with J = J_0 + L U L^T and roots L, (4, 4), of the pseudo-inertias.
 
-        The priors of pseudo-inertias are then as stiff in all directions; in units of the scale they are 1e20 times
-        stiffer across a flat body than along it, and rounding hides all else.
+        Then the priors of pseudo-inertias are equally stiff in all directions. In units of the scale they would be 1e20
+        times stiffer across a flat body than along it, and ill-conditioned.
         """
         for body, root in roots.items():
             self.deviations[np.ix_(self.ten(body), self.ten(body))] = parameters.change_of_frame(root)
@@ -82,25 +82,27 @@ def build_conic_problem(
         conditions: on the parameters.
         ridge: weight of the prior.
         prior: the distance from the nominal parameters, as in `Consistent`.
-        reference: (12 L,), whose pseudo-inertias are the metric of a pull-back prior; None for the nominal ones.
+        reference: (12 L,), parameters whose pseudo-inertias are the metric of a pull-back prior; None for nominal ones.
     """
     conditions.validate_bodies(len(problem.nominal) // PER_BODY)
     x = _Variables(problem, conditions)
     if prior != "euclidean":
         measured = problem.nominal if reference is None else reference
         scaled = measured.reshape(-1, PER_BODY) / x.scale
-        x.measure({body: _root(scaled[body], x.body_name(body), prior) for body in x.bodies})
-    blocks = [_pseudo_inertia(x, body, conditions.margin) for body in x.bodies]
+        x.use_pseudo_inertia_roots(
+            {body: _pseudo_inertia_root(scaled[body], x.body_name(body), prior) for body in x.bodies}
+        )
+    blocks = [_pseudo_inertia_block(x, body, conditions.margin) for body in x.bodies]
     enclosures = [enclosure for enclosure in conditions.enclosures if enclosure.body in x.bodies]
-    blocks += [_ellipsoid(x, enclosure) for enclosure in enclosures if enclosure.kind == "ellipsoid"]
-    boxes = [_box(x, enclosure) for enclosure in enclosures if enclosure.kind == "box"]
+    blocks += [_ellipsoid_block(x, enclosure) for enclosure in enclosures if enclosure.kind == "ellipsoid"]
+    boxes = [_box_conditions(x, enclosure) for enclosure in enclosures if enclosure.kind == "box"]
     E, e = _equalities(x, conditions)
     rows = remove_implied([*_bounds(x, conditions), *sum(boxes, [])], E, e)
     weights, linear, metric = np.zeros(len(blocks)), np.zeros(x.count), np.eye(x.count)
     if prior == "pullback":
         metric = _pullback_metric(x)
     elif prior == "entropic":
-        relative = [_relative(x, body) for body in x.bodies]
+        relative = [_relative_block(x, body) for body in x.bodies]
         for block in relative:
             metric[block.variables] = 0.0
             linear[block.variables] = ridge * np.trace(block.F, axis1=1, axis2=2)
@@ -144,7 +146,7 @@ def _floor(problem: LinearProblem, ridge: float) -> float:
     return max(_FLOOR_OF_DATA * data, _FLOOR_OF_RIDGE * ridge) or 1.0
 
 
-def _pseudo_inertia(x: _Variables, body: int, margin: float) -> _Block:
+def _pseudo_inertia_block(x: _Variables, body: int, margin: float) -> _Block:
     """Scaled pseudo-inertia of a body less the margin, positive semidefinite (Wensing, Kim, Slotine 2018)."""
     F0 = parameters.pseudo_inertia(x.nominal[body]) - margin * np.eye(4)
     return _block(x, f"pseudo-inertia of {x.body_name(body)}", body, F0, parameters.PSEUDO_BASIS)
@@ -157,7 +159,7 @@ def _block(x: _Variables, name: str, body: int, F0: Array, slopes: Array) -> _Bl
     return _Block(name, F0, by_variable, variables)
 
 
-def _ellipsoid(x: _Variables, enclosure: Enclosure) -> _Block:
+def _ellipsoid_block(x: _Variables, enclosure: Enclosure) -> _Block:
     """[[m 1, u], [u^T, m]] with u = (m com - m centre) / half along the axes: positive iff |u| <= m."""
     body, slopes = enclosure.body, np.zeros((10, 4, 4))
     to_axes = (enclosure.axes / enclosure.half).T  # (3, 3)
@@ -171,7 +173,7 @@ def _ellipsoid(x: _Variables, enclosure: Enclosure) -> _Block:
     return _block(x, f"centre of mass of {x.body_name(body)}", body, F0, slopes)
 
 
-def _box(x: _Variables, enclosure: Enclosure) -> list[LinearCondition]:
+def _box_conditions(x: _Variables, enclosure: Enclosure) -> list[LinearCondition]:
     """M half +- (m com - m centre) >= 0 along each axis of the box."""
     out = []
     for axis, half in zip(enclosure.axes.T, enclosure.half, strict=True):
@@ -185,18 +187,15 @@ def _box(x: _Variables, enclosure: Enclosure) -> list[LinearCondition]:
 
 
 def _bounds(x: _Variables, conditions: Conditions) -> list[LinearCondition]:
-    """Bounds of the free parameters, without those that coincide, which `_equalities` has."""
+    """Bounds of the free parameters, except coinciding ones, which are in `_equalities`."""
     lower, upper = conditions.bounds(len(x.free))
     out = []
     for bound, sign, word in ((lower, 1.0, "lower"), (upper, -1.0, "upper")):
         for body, number in zip(*np.nonzero(np.isfinite(bound) & x.free & ~_coincide(x, lower, upper)), strict=True):
             row = sign * x.deviations[x.index[body, number]]
             limit = sign * (bound[body, number] / x.scale[body, number] - x.nominal[body, number])
-            out.append(
-                LinearCondition(
-                    f"{word} bound of {parameters.PARAMETERS[number]} of {x.body_name(body)}", row, float(limit)
-                )
-            )
+            name = f"{word} bound of {parameters.PARAMETERS[number]} of {x.body_name(body)}"
+            out.append(LinearCondition(name, row, float(limit)))
     return out
 
 
@@ -210,9 +209,9 @@ def _equalities(x: _Variables, conditions: Conditions) -> tuple[Array, Array]:
     out: list[LinearCondition] = []
     if conditions.total_mass is not None:
         mass = np.eye(PER_BODY)[parameters.MASS] / conditions.total_mass
-        found = [x.row(body, mass) for body in range(len(x.free))]
-        row = np.sum([row for row, _ in found], axis=0)
-        out.append(LinearCondition("total_mass", row, 1.0 - sum(constant for _, constant in found)))
+        mass_rows = [x.row(body, mass) for body in range(len(x.free))]
+        row = np.sum([row for row, _ in mass_rows], axis=0)
+        out.append(LinearCondition("total_mass", row, 1.0 - sum(constant for _, constant in mass_rows)))
     for mirror in conditions.mirrors:
         reflected = mirror_matrix(mirror.reflection)
         for number, unit in enumerate(np.eye(PER_BODY)):
@@ -244,15 +243,15 @@ def _pullback_metric(x: _Variables) -> Array:
     return np.concatenate(rows)
 
 
-def _relative(x: _Variables, body: int) -> _Block:
+def _relative_block(x: _Variables, body: int) -> _Block:
     """J_0^-1/2 J J_0^-1/2 of a body."""
     return _Block(f"pseudo-inertia of {x.body_name(body)}", np.eye(4), parameters.PSEUDO_BASIS, x.ten(body))
 
 
-def _root(scaled: Array, called: str, prior: Prior) -> Array:
+def _pseudo_inertia_root(scaled: Array, called: str, prior: Prior) -> Array:
     """L, (4, 4), of the pseudo-inertia J = L L^T of scaled parameters (12,)."""
     J = parameters.pseudo_inertia(scaled)
     if np.linalg.eigvalsh(J)[0] <= np.finfo(float).eps * np.trace(J):
-        found = f"{prior}, but no density of matter has the parameters of {called} that it measures from"
-        raise InputError("estimator", "prior", found, "euclidean, or bodies that can exist")
+        found = f"{prior}, but the pseudo-inertia of {called} that it is relative to is not positive definite"
+        raise InputError("estimator", "prior", found, "euclidean, or physically consistent bodies")
     return np.asarray(np.linalg.cholesky(J))

@@ -14,7 +14,7 @@ EQUAL_WITHIN = 1e-9
 """Numbers closer than this share of their scale count as equal."""
 
 SEARCH_RADIUS = 1e3
-"""Radius within which a gap holds, in scales of the parameters, along directions that the data do not determine."""
+"""Radius, in scales of the parameters, within which a gap is valid along directions that the data do not determine."""
 
 
 @dataclass(frozen=True)
@@ -140,23 +140,23 @@ class ConicProblem:
             y: (M,) >= 0, multipliers of the rows.
         """
         blocks, weighted = self.blocks(x), self.weights > 0.0
-        turned = np.zeros_like(self.F)  # w F^-1 dF F^-1, change of the multiplier of a weighted block
+        multiplier_slopes = np.zeros_like(self.F)  # w F^-1 dF F^-1 of weighted blocks
         inverse = np.linalg.inv(blocks[weighted])[:, None]
-        turned[weighted] = self.weights[weighted, None, None, None] * inverse @ self.F[weighted] @ inverse
+        multiplier_slopes[weighted] = self.weights[weighted, None, None, None] * inverse @ self.F[weighted] @ inverse
         hessian = self.hessian.copy()
         pairs = (self.variables[:, :, None], self.variables[:, None, :])
-        np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", turned, self.F))
+        np.add.at(hessian, pairs, np.einsum("kuij,kvij->kuv", multiplier_slopes, self.F))
         residual = self.gradient(x) - self.G.T @ y - self._gathered(Z)
-        # A Newton step gives the part of it that the quadratic and the log-determinants balance at least cost.
+        # A Newton step balances the part of it in directions in which quadratic and log-determinants are stiff enough.
         values, vectors = np.linalg.eigh(self.null_space.T @ hessian @ self.null_space)
         modes = vectors.T @ (self.null_space.T @ residual)
         balanced = np.abs(modes) <= 2.0 * SEARCH_RADIUS * values
         lengths = modes[balanced] / np.maximum(values[balanced], np.finfo(float).tiny)
         step = -self.null_space @ (vectors[:, balanced] @ lengths)
-        taken = np.einsum("kv,kvij->kij", step[self.variables], turned)
-        left = self.null_space.T @ (residual + self.hessian @ step + self._gathered(taken))
-        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + SEARCH_RADIUS * np.abs(left).sum()
-        products = blocks @ (Z - taken)
+        multiplier_change = np.einsum("kv,kvij->kij", step[self.variables], multiplier_slopes)
+        unbalanced = self.null_space.T @ (residual + self.hessian @ step + self._gathered(multiplier_change))
+        gap = 0.5 * step @ self.hessian @ step + y @ (self.G @ x - self.h) + SEARCH_RADIUS * np.abs(unbalanced).sum()
+        products = blocks @ (Z - multiplier_change)
         gap += np.trace(products[~weighted], axis1=1, axis2=2).sum()
         weights = self.weights[weighted, None]
         relative = np.linalg.eigvals(products[weighted]).real / weights

@@ -44,10 +44,10 @@ class ConsistentEstimate(ConstrainedEstimate):
 class Consistent(Regularized):
     """min ||A phi - b||^2 / rows + ridge * prior(phi) over all physically consistent phi.
 
-    With `ridge` 0 the limit for ridge -> 0, the least prior among all minimizers: what data do not determine stays
-    nominal. Where conditions are active that limit need not exist, see `ridge_limit`.
+    With `ridge` 0 the limit for ridge -> 0, the least prior among all minimizers: parameters that the data do not
+    determine stay nominal. With active conditions that limit need not exist, see `ridge_limit`.
 
-    Parameters that are not free stay nominal, whether or not they meet the conditions: `violations` tells. "barrier"
+    Parameters that are not free stay nominal, whether or not they meet the conditions (see `violations`). "barrier"
     stays strictly inside them; "certified" meets them to the accuracy of its solver, mostly 1e-9 of the scale, and
     warns beyond 1e-7.
 
@@ -127,7 +127,7 @@ def nearest_consistent(
 ) -> Array:
     """The physically consistent parameters nearest to given ones (Mistry, Schaal, Yamane 2009, III-B).
 
-    Bodies without mass stay so; friction of zero stays zero unless a bound or a mirror image says otherwise.
+    Bodies without mass stay massless; friction of zero stays zero unless a bound or a mirror image requires more.
 
     Args:
         phi: (L, 12), physically consistent or not.
@@ -158,7 +158,7 @@ def nearest_consistent(
 
 
 def _changeable(phi: Array, conditions: Conditions) -> np.ndarray:
-    """Which parameters may change, (L, 12) bool."""
+    """Parameters that may change, (L, 12) bool."""
     conditions.validate_bodies(len(phi))
     lower, _ = conditions.bounds(len(phi))
     free = (phi != 0.0) | (lower > 0.0)

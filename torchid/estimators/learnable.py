@@ -14,8 +14,8 @@ from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 
-_LEAST_FRICTION = 0.01  # of its scale: where friction starts if the URDF has none, since a softplus is never 0
-_LEAST_EIGENVALUE = 1e-3  # above the margin, for a URDF's body that has a smaller one
+_LEAST_FRICTION = 0.01  # of its scale: initial friction if the URDF has none, since a softplus is never 0
+_LEAST_EIGENVALUE = 1e-3  # above the margin: initial one of a body whose nominal eigenvalue is smaller
 
 
 class LearnableParameters(nn.Module, ABC):
@@ -57,8 +57,8 @@ class LearnableParameters(nn.Module, ABC):
         """Set the preconditioner to (H + damping I)^(-1/2).
 
         H is the Gauss-Newton Hessian at the nominal parameters of the mean squared residual plus ridge, in the
-        variables of `constrained`. Without it a problem of condition number 1e5 takes first-order methods some 1e10
-        steps; without the damping, directions that the data hardly excite would be stretched until no step is safe.
+        variables of `constrained`. Without it first-order methods need some 1e10 steps at condition number 1e5. Without
+        damping, steps along directions that the data hardly excite would be too long.
         """
         start = torch.zeros_like(self.raw)
         slopes = torch.autograd.functional.jacobian(self.constrained, start, vectorize=True).cpu()
@@ -74,7 +74,7 @@ class LearnableParameters(nn.Module, ABC):
 
 
 class FreeParameters(LearnableParameters):
-    """Any phi: `raw` moves it along straight lines."""
+    """Any phi, an affine function of `raw`."""
 
     def __init__(self, problem: LinearProblem) -> None:
         """Start at the nominal parameters."""
@@ -86,7 +86,7 @@ class FreeParameters(LearnableParameters):
 
 
 class LogCholeskyParameters(LearnableParameters):
-    """Only phi of bodies that can exist: scaled pseudo-inertias above a margin, positive friction.
+    """Only physically consistent phi: scaled pseudo-inertias above a margin, positive friction.
 
     J = margin I + R R^T with R = R_0 M, where R_0 is the Cholesky factor at the nominal parameters and M is lower
     triangular with the logarithms of its diagonal and its other entries as coordinates, so that M is the identity where
@@ -99,7 +99,7 @@ class LogCholeskyParameters(LearnableParameters):
     friction_start: Tensor
 
     def __init__(self, problem: LinearProblem, margin: float = Conditions.margin) -> None:
-        """Start at the nominal parameters, or the nearest eigenvalues inside.
+        """Start at the nominal parameters, with eigenvalues raised above the margin.
 
         Args:
             problem: the problem.

@@ -1,4 +1,4 @@
-"""Least squares with the nominal parameters as prior, and what every estimator returns."""
+"""Least squares with the nominal parameters as prior, and the estimate that every estimator returns."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from torchid.settings import NotNegative, Tolerance, validate_settings
 IDENTIFIED, PRIOR, COMBINED = "identified", "dominated by the prior", "only in combination"
 UNOBSERVABLE, FIXED = "cannot be seen", "fixed"
 VERDICTS = (IDENTIFIED, PRIOR, COMBINED, UNOBSERVABLE, FIXED)
+
+_OBSERVABLE = 1e-12  # squared share in the row space: that of a finger in a sum with the trunk's mass is 1e-7
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Estimate:
 
     @property
     def residual_std(self) -> float:
-        """Standard deviation of the whitened residual: 1 where the stated sensor noise explains everything."""
+        """Standard deviation of the whitened residual: 1 if the stated sensor noise explains all of it."""
         return residual_std(self.cost, self.rows, self.rank, self.oversampling)
 
     @property
@@ -64,13 +66,12 @@ class Estimate:
         """One of `VERDICTS` for every parameter, (P,).
 
         "identified": the data determine it and have the larger share; "dominated by the prior": they determine it, but
-        the nominal value has the larger share; "only in combination": they determine it together with others, not
-        alone, however large their share; "cannot be seen": it is unobservable, no row depends on it; "fixed": not free.
+        the nominal value has the larger share; "only in combination": they determine only sums with other parameters,
+        however large their share; "cannot be seen": unobservable, no row depends on it; "fixed": not free.
 
         Source: the three kinds of Atkeson, An, Hollerbach, IJRR 1986, and the prior.
         """
-        larger_share = self.data_share >= 0.5
-        decided = [np.isnan(self.data_share), ~self.observable, ~self.identifiable, ~larger_share]
+        decided = [np.isnan(self.data_share), ~self.observable, ~self.identifiable, self.data_share < 0.5]
         return np.select(decided, [FIXED, UNOBSERVABLE, COMBINED, PRIOR], IDENTIFIED)
 
     def verdict_counts(self) -> dict[str, int]:
@@ -81,9 +82,8 @@ class Estimate:
 def residual_std(cost: float, rows: int, rank: int, oversampling: float) -> float:
     """Standard deviation of whitened residuals whose noise fills 1/oversampling of the band.
 
-    A fit of slow motions removes `oversampling` times the variance of one row for each independent parameter. In a log
-    so short that no variance would remain, some of the motion must lie outside the band, and the residual counts as if
-    its rows were independent but fewer.
+    A fit of slow motions removes `oversampling` times the variance of one row for each independent parameter. A log so
+    short that no variance would remain must have motion outside the band; its rows count as independent but fewer.
     """
     return float(np.sqrt(cost / max(rows - oversampling * rank, (rows - rank) / oversampling, 1.0)))
 
@@ -106,31 +106,28 @@ class ConstrainedEstimate(Estimate):
 
     @property
     def increase(self) -> float | None:
-        """By how much the conditions raise the objective; None where the unconstrained one is not known."""
+        """Increase of the objective by the conditions; None if the unconstrained one is unknown."""
         return None if self.unconstrained is None else self.objective - self.unconstrained
 
     @property
     def relative_increase(self) -> float | None:
-        """The increase as a share of the unconstrained objective; None where that is not known or 0."""
+        """The increase as a share of the unconstrained objective; None if that is unknown or 0."""
         return None if self.increase is None or not self.unconstrained else self.increase / self.unconstrained
 
 
 @contextmanager
 def report_rounding(estimator: str) -> Iterator[None]:
-    """Run an estimator, and turn a failure of its linear algebra into an error that says what to change.
+    """Turn a failure of an estimator's linear algebra into an error that says what to change.
 
     Raises:
-        InputError: a decomposition failed, as rounding hides the solution.
+        InputError: a decomposition failed.
     """
     try:
         yield
     except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
-        found = f"{estimator} comes to no result: rounding hides it ({error})"
+        found = f"{estimator} failed numerically ({error})"
         accepted = "a larger ridge, fewer free parameters, or nominal bodies of plausible masses and sizes"
         raise InputError("estimator", "name", found, accepted) from error
-
-
-_OBSERVABLE = 1e-12  # squared share in the row space: a finger's in a sum with the trunk's mass is 1e-7
 
 
 @dataclass(frozen=True)
@@ -164,7 +161,7 @@ class Regularized:
 class LeastSquares(Regularized):
     """min ||A phi - b||^2 / rows + ridge ||(phi - nominal) / scale||^2.
 
-    With `ridge` 0 the deviation from the nominal parameters of least scaled norm among all minimizers.
+    With `ridge` 0 the minimizer whose scaled deviation from the nominal parameters has the least norm.
     """
 
     @report_rounding("least_squares")
@@ -177,7 +174,7 @@ class LeastSquares(Regularized):
         NaN where the data alone do not determine the parameter.
 
         Raises:
-            InputError: rounding hides the solution.
+            InputError: a decomposition failed.
         """
         free, scale = problem.free, problem.scale[problem.free]
         A = problem.A[:, free] * scale
@@ -186,14 +183,10 @@ class LeastSquares(Regularized):
         null_share = np.linalg.norm(np.eye(A.shape[1]) - pinv @ A, axis=1)  # of each parameter in the null space
         gain = pinv
         if self.ridge > 0.0:
-            prior = np.sqrt(self.ridge * problem.rows) * np.eye(A.shape[1])
-            stacked = np.vstack([A, prior])
-            gain = _pseudo_inverse(stacked, 0.0)[0][:, : len(b)]
-            gain = pinv @ (A @ gain)  # the null space stays nominal: a tiny ridge would leave it to rounding
-        step = gain @ b
-
+            stacked = np.vstack([A, np.sqrt(self.ridge * problem.rows) * np.eye(A.shape[1])])
+            gain = pinv @ (A @ _pseudo_inverse(stacked, 0.0)[0][:, : len(b)])  # no rounding in A's null space
         phi = problem.nominal.copy()
-        phi[free] += scale * step
+        phi[free] += scale * (gain @ b)
         cost = problem.cost(phi)
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         observable, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)

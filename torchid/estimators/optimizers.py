@@ -1,4 +1,4 @@
-"""Optimizers and learning-rate schedules of `torch.optim`, by name, and a trial of their options."""
+"""Optimizers and learning-rate schedules of `torch.optim`, by name, and a test of their options."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class OptimizerUse:
     """How an optimizer of torch is used for the preconditioned parameters.
 
     Attributes:
-        defaults: options for those that are not given. Torch's own suit networks of unknown curvature; that of the
-            preconditioned parameters is near one.
-        alone: further options where none at all is given.
-        full_batch: whether a step takes all samples at once, an epoch being one step: a line search or a memory of
-            signs compares gradients from step to step, which differ by chance between mini-batches. Gradients are not
+        defaults: of options that are not given. Torch's own are for unknown curvature; that of the preconditioned
+            parameters is near one.
+        alone: further defaults if no option is given.
+        full_batch: whether every step takes all samples, so that an epoch is one step: a line search or a memory of
+            signs compares gradients between steps, which differ randomly between mini-batches. Gradients are then not
             clipped.
     """
 
@@ -56,7 +56,7 @@ OPTIMIZERS: dict[str, OptimizerUse] = {
     "Rprop": OptimizerUse({"lr": 0.2}, full_batch=True),
     "SGD": OptimizerUse({"lr": 0.5}, {"momentum": 0.9, "nesterov": True}),
 }
-"""The supported optimizers, those that come near the closed form; docs/estimators.md says how near."""
+"""The supported optimizers: those that converge to the closed form (figures in docs/estimators.md)."""
 
 
 def optimizer_names() -> list[str]:
@@ -81,11 +81,11 @@ def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimi
         InputError: an option it does not take.
     """
     name, options = _split(chosen)
-    found = dict(_classes(torch.optim, Optimizer)).get(name)
-    if found is not None and name not in OPTIMIZERS:
+    cls = dict(_classes(torch.optim, Optimizer)).get(name)
+    if cls is not None and name not in OPTIMIZERS:
         accepted = ", ".join(optimizer_names())
         raise InputError("estimator", f"optimizer {name}", _UNSUITED.get(name, "not supported"), accepted)
-    if found is None:
+    if cls is None:
         raise _unknown("optimizer", name, optimizer_names())
     if name == "LBFGS" and len(groups) > 1:  # it takes one group
         if any("lr" in group for group in groups):
@@ -93,10 +93,11 @@ def make_optimizer(chosen: Mapping[str, Any], groups: Sequence[Group]) -> Optimi
                 "estimator", "residual_lr", "set, but LBFGS has one lr for all", "None, or another optimizer"
             )
         groups = [{"params": [x for group in groups for x in group["params"]]}]
+    use = OPTIMIZERS[name]
     try:
-        return found(list(groups), **{**_defaults(OPTIMIZERS[name], options), **options})
+        return cls(list(groups), **{**use.defaults, **(options or use.alone)})
     except _FAILURES as error:
-        raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(found)) from error
+        raise InputError("estimator", f"optimizer {name}", _short(error), _accepted(cls)) from error
 
 
 def make_schedule(chosen: Mapping[str, Any] | None, optimizer: Optimizer, epochs: int) -> LRScheduler | None:
@@ -109,19 +110,19 @@ def make_schedule(chosen: Mapping[str, Any] | None, optimizer: Optimizer, epochs
 
     Raises:
         UnknownNameError: `torch.optim.lr_scheduler` has no such class.
-        InputError: an option it does not take, or one that only code can give.
+        InputError: an option it does not take, or one that a settings file cannot express.
     """
     if chosen is None:
         return None
     name, options = _split(chosen)
-    found = dict(_classes(lr_scheduler, LRScheduler)).get(name)
-    if found is None:
+    cls = dict(_classes(lr_scheduler, LRScheduler)).get(name)
+    if cls is None:
         raise _unknown("schedule", name, schedule_names())
-    lengths = {key: epochs for key in _WHOLE_RUN if key in inspect.signature(found).parameters}
+    lengths = {key: epochs for key in _WHOLE_RUN if key in inspect.signature(cls).parameters}
     try:
-        return found(optimizer, **{**lengths, **options})
+        return cls(optimizer, **{**lengths, **options})
     except _FAILURES as error:
-        raise InputError("estimator", f"schedule {name}", _short(error), _accepted(found)) from error
+        raise InputError("estimator", f"schedule {name}", _short(error), _accepted(cls)) from error
 
 
 def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
@@ -133,7 +134,7 @@ def step_schedule(schedule: LRScheduler | None, loss: float) -> None:
 
 
 def try_out(optimizer: Mapping[str, Any], schedule: Mapping[str, Any] | None, epochs: int) -> None:
-    """Take two steps on a parabola, and the schedule through all epochs: options that do not work fail here.
+    """Take two steps on a parabola and run the schedule through all epochs, so that invalid options fail early.
 
     Arguments as of `make_optimizer` and `make_schedule`.
 
@@ -142,11 +143,11 @@ def try_out(optimizer: Mapping[str, Any], schedule: Mapping[str, Any] | None, ep
         InputError: options, or a kind of optimizer, that do not work here.
     """
     x = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
-    tried = make_optimizer(optimizer, [{"params": [x]}])
-    schedule_of = make_schedule(schedule, tried, epochs)
+    trial = make_optimizer(optimizer, [{"params": [x]}])
+    trial_schedule = make_schedule(schedule, trial, epochs)
 
     def loss() -> torch.Tensor:
-        tried.zero_grad()
+        trial.zero_grad()
         value = x.square().sum()
         value.backward()
         return value
@@ -155,15 +156,15 @@ def try_out(optimizer: Mapping[str, Any], schedule: Mapping[str, Any] | None, ep
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             for _ in range(2):
-                tried.step(loss)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
+                trial.step(loss)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
     except _FAILURES as error:
         found = f"cannot take a step: {_short(error)}"
         raise InputError("estimator", f"optimizer {optimizer['name']}", found, "other options") from error
     try:
         for _ in range(epochs):
-            step_schedule(schedule_of, 1.0)
+            step_schedule(trial_schedule, 1.0)
     except _FAILURES as error:
-        found, name = f"does not last {epochs} epochs: {_short(error)}", (schedule or {}).get("name")
+        found, name = f"fails within {epochs} epochs: {_short(error)}", (schedule or {}).get("name")
         raise InputError("estimator", f"schedule {name}", found, "other options, or another schedule") from error
 
 
@@ -173,23 +174,19 @@ def _split(chosen: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     return options.pop("name"), options
 
 
-def _defaults(method: OptimizerUse, options: Mapping[str, Any]) -> dict[str, Any]:
-    return dict(method.defaults) if options else {**method.defaults, **method.alone}
-
-
 def _classes(module: Any, base: type) -> list[tuple[str, Any]]:
-    found = inspect.getmembers(module, inspect.isclass)
-    return [(name, x) for name, x in found if issubclass(x, base) and x is not base and not name.startswith("_")]
+    members = inspect.getmembers(module, inspect.isclass)
+    return [(name, x) for name, x in members if issubclass(x, base) and x is not base and not name.startswith("_")]
 
 
 def _unknown(field: str, name: str, names: Sequence[str]) -> UnknownNameError:
-    """The refusal of a name; one that is right but for its case is the nearest (`sgd` is like no name to difflib)."""
+    """Error for an unknown name; it suggests one that differs in case only (difflib does not match `sgd` to SGD)."""
     same = [known for known in names if known.lower() == name.lower()]
     return UnknownNameError("estimator", field, name, same or names)
 
 
-def _accepted(found: Any) -> str:
-    options = [name for name in inspect.signature(found).parameters if name not in ("params", "optimizer")]
+def _accepted(cls: Any) -> str:
+    options = [name for name in inspect.signature(cls).parameters if name not in ("params", "optimizer")]
     return f"options {', '.join(options)}"
 
 

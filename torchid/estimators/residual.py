@@ -15,7 +15,7 @@ from torchid.parameters import INERTIAL, PER_BODY, Array
 from torchid.problem import LinearProblem, MiniBatches
 
 CANDIDATE_WEIGHTS = (10.0, 1.0, 0.1, 0.01, 0.001, 0.0)
-"""Candidates: a module that could give any force gives 1 / (1 + weight) of the parameters' residual."""
+"""Candidate weights: a module that can fit any force fits the share 1 / (1 + weight) of the residual."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def choose_weight(candidates: Sequence[float], losses: Array, alone: float) -> W
 
 @dataclass(frozen=True)
 class ResidualEffect:
-    """The share of a residual module in the force, on the training samples.
+    """Effect of a residual module on force and parameters, on the training samples.
 
     Attributes:
         weight: under which it was trained.
@@ -64,10 +64,10 @@ class ResidualEffect:
         rms: of the module's force by group, "base_force" [N], "base_moment" [N m], "joint_torque" [N m, N] and
             "limb_wrench" [N, N m].
         shares: by group, that rms over the rms of the whole force, rigid bodies and module together.
-        rigid_share: the rms of the part of the module's projected whitened force that rigid bodies could give, over its
-            own rms; 0 if they could give none of it.
-        moved: (12 L,), by how much the module moves the parameters: the least squares estimate on the force without the
-            module's part less that on the whole force.
+        rigid_share: rms of the part of the module's projected whitened force that rigid bodies can explain, over the
+            rms of all of it.
+        moved: (12 L,), change of the parameters by the module: the least squares estimate on the force less the
+            module's part, minus that on the whole force.
         moved_scaled: (L,), the largest of each body's ten inertial parameters, in units of their scale.
         moved_errors: (L,), likewise in standard errors of the parameters that the data determine, NaN without any.
     """
@@ -85,13 +85,13 @@ class ResidualEffect:
 def residual_effect(
     loss: Loss, problem: LinearProblem, batches: MiniBatches, estimator: LeastSquares, choice: WeightChoice | None
 ) -> ResidualEffect | None:
-    """The share of a loss's residual module in the force; None without a module.
+    """Effect of a loss's residual module; None without a module.
 
     Args:
-        loss: with parameters and module as they are now.
+        loss: with the current parameters and module.
         problem: the compressed samples.
         batches: the samples.
-        estimator: whose estimates are compared.
+        estimator: for the estimates with and without the module's part.
         choice: how the weight was chosen.
     """
     if loss.residual is None:
@@ -100,9 +100,11 @@ def residual_effect(
         gradient, square = _correlation(loss, batches)
         rms, shares = _by_group(loss.residual, loss.learnable().cpu().numpy(), batches)
     free = problem.free
-    lacking = np.linalg.lstsq(problem.A[:, free].T, gradient[free], rcond=None)[0]  # A^T lacking = K^T W W^T r, summed
-    plain, rest = (estimator.solve(x) for x in (problem, replace(problem, b=problem.b - lacking)))
-    moved = rest.phi - plain.phi
+    explained = np.linalg.lstsq(problem.A[:, free].T, gradient[free], rcond=None)[
+        0
+    ]  # A^T explained = sum of K^T W W^T r
+    plain, without_module = (estimator.solve(x) for x in (problem, replace(problem, b=problem.b - explained)))
+    moved = without_module.phi - plain.phi
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = np.abs(moved) / np.where(plain.standard_error > 0.0, plain.standard_error, np.nan)
     return ResidualEffect(
@@ -110,7 +112,7 @@ def residual_effect(
         choice=choice,
         rms=rms,
         shares=shares,
-        rigid_share=float(np.linalg.norm(lacking) / np.sqrt(square)) if square else 0.0,
+        rigid_share=float(np.linalg.norm(explained) / np.sqrt(square)) if square else 0.0,
         moved=moved,
         moved_scaled=_largest(np.abs(moved) / problem.scale),
         moved_errors=_largest(errors),
@@ -138,8 +140,8 @@ def _by_group(module: nn.Module, phi: Array, batches: MiniBatches) -> tuple[dict
         force = module(q, v, a)
         for name, rows in _groups(base_rows, v.shape[1], rigid.shape[1]).items():
             per_row = 1.0 / (batches.samples * (rows.stop - rows.start))
-            for sums, found in ((own, force), (whole, rigid + force)):
-                sums[name] = sums.get(name, 0.0) + per_row * float(found[:, rows].square().sum())
+            for sums, part in ((own, force), (whole, rigid + force)):
+                sums[name] = sums.get(name, 0.0) + per_row * float(part[:, rows].square().sum())
     shares = {name: float(np.sqrt(own[name] / x)) if x else 0.0 for name, x in whole.items()}
     return {name: float(np.sqrt(x)) for name, x in own.items()}, shares
 
@@ -152,6 +154,6 @@ def _groups(base_rows: int, nv: int, rows: int) -> dict[str, slice]:
 
 
 def _largest(x: Array) -> Array:
-    """Largest of each body's ten inertial numbers, (L,), of (12 L,); NaN where all are."""
+    """Largest of each body's ten inertial entries, (L,), of (12 L,); NaN if all are."""
     by_body = x.reshape(-1, PER_BODY)[:, INERTIAL]
     return np.where(np.isnan(by_body).all(axis=1), np.nan, np.nan_to_num(by_body).max(axis=1))

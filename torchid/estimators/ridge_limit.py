@@ -1,4 +1,4 @@
-"""The limit of consistent estimates for ridge -> 0, in which parameters that data do not determine stay nominal."""
+"""The limit of consistent estimates for ridge -> 0: parameters that the data do not determine stay nominal."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from torchid.parameters import Array
 from torchid.problem import LinearProblem
 from torchid.problem.chunks import one_thread
 
-_RIDGES = 10.0 ** -np.arange(0.0, 15.0, 2.0)  # of the least misfit without conditions, or of the floor
-_SETTLED = 1e-5  # relative change of the misfit when the ridge falls to a hundredth; the rest is a hundredth of it
-_STEADY = 0.01  # and of the prior: where parameters grow without bound it is a factor of two and more
-_BOUNDED = 1.25  # growth up to which a path that rounding ends has come near its limit
+_RIDGES = 10.0 ** -np.arange(0.0, 15.0, 2.0)  # relative to the least misfit without conditions, or to the floor
+_SETTLED = 1e-5  # relative change of the misfit, with a hundredth of the ridge, at which the path has converged
+_STEADY = 0.01  # relative change of the prior at convergence; where parameters grow without bound it doubles or more
+_BOUNDED = 1.25  # growth of the deviation up to which a path that rounding ends is taken as converged
 _EXACT = 1e-7  # relative excess of a misfit that counts as 0
-_NEAR = 1e-3  # relative excess over the least misfit without conditions at which these may cost nothing at all
-_SLACK = 1e-6  # of a point that shows that the conditions allow what the data determine
-_SEARCH = 60  # Newton steps for such a point: one that exists is found in 10 to 40
-_CLOSE = 0.1  # of the excess: tolerance of the discrepancy principle
-_TRIES = 12
-_RESOLVED = 1e-7  # of the prior
-_FAR = 10.0  # times `SEARCH_RADIUS`: where the search for a limit ends
-_PLAUSIBLE = 10.0  # scales: a limit further away follows the noise
+_NEAR = 1e-3  # relative excess over the least misfit without conditions below which a feasible point is searched
+_SLACK = 1e-6  # least slack of that point
+_SEARCH = 60  # Newton steps for that point: if it exists, 10 to 40 find it
+_CLOSE = 0.1  # tolerance of the discrepancy principle, relative to the excess
+_TRIES = 12  # ridges for the discrepancy principle
+_RESOLVED = 1e-7  # relative accuracy of the prior
+_FAR = 10.0  # distance from nominal, in `SEARCH_RADIUS`, at which the path ends
+_PLAUSIBLE = 10.0  # largest deviation, in scales, of a plausible limit: beyond, it fits the noise
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class RidgeLimit:
 
     Attributes:
         conic: the problem.
-        misfit: of the limit, where equalities fix what the data determine; None where `conic` has a small ridge.
-        tolerance: relative gap at which the small ridge's part of the objective is resolved.
+        misfit: of the limit, if equalities fix what the data determine; None if `conic` has a small ridge instead.
+        tolerance: relative gap that resolves the small ridge's part of the objective.
     """
 
     conic: ConicProblem
@@ -47,7 +47,7 @@ class RidgeLimit:
     tolerance: float = 1e-9
 
     def without_ridge(self, solution: Solution, data: ConicProblem) -> Solution:
-        """A minimizer of `conic` as one of the misfit alone.
+        """A minimizer of `conic` with objective and gap of the misfit alone.
 
         No feasible point of up to twice its prior has a misfit lower by more than the gap.
         """
@@ -60,19 +60,18 @@ class RidgeLimit:
 def ridge_limit(problem: LinearProblem, conditions: Conditions, prior: Prior, rank_tolerance: float) -> RidgeLimit:
     """The well-posed problem whose minimizer is the limit for ridge -> 0: the least prior among all of least misfit.
 
-    Where the conditions are strictly feasible at the misfit of least squares, equalities fix what the data determine,
-    and the prior alone is minimized. Else the ridge is so small that a hundredth of it changes nothing.
+    If the conditions are strictly feasible at the misfit of least squares, equalities fix what the data determine, and
+    the prior alone is minimized. Else the ridge is so small that a hundredth of it changes nothing.
 
-    A limit need not exist: nothing bounds a body's inertia from above, and at an active condition the misfit can go on
-    falling, ever more slowly, while parameters that the data do not determine grow without bound, or until one is tens
-    or hundreds of its scales away. Then the least prior is taken among all parameters whose misfit is at most that
-    expected of the true ones (Morozov's discrepancy principle).
+    A limit need not exist: nothing bounds a body's inertia from above, and at an active condition the misfit can keep
+    decreasing while parameters that the data do not determine grow without bound, or to hundreds of their scales. Then
+    the result is the least prior at the misfit expected of the true parameters (Morozov's discrepancy principle).
 
     Args:
         problem: the data.
         conditions: on the parameters.
         prior: the distance from the nominal parameters, as in `Consistent`.
-        rank_tolerance: as in `LeastSquares`: what the data determine.
+        rank_tolerance: as in `LeastSquares`.
 
     Raises:
         InputError: the conditions exclude each other, or a prior other than the Euclidean one has nominal bodies that
@@ -83,9 +82,9 @@ def ridge_limit(problem: LinearProblem, conditions: Conditions, prior: Prior, ra
     """
     path = _RegularizationPath(problem, conditions, prior)
     find_strictly_feasible(path.data)  # its error names the condition
-    fixed = _Fixed.of(path, rank_tolerance)
-    if (found := fixed.at_nearest(np.zeros(len(path.data.linear)))) is not None:
-        return found
+    fixed = _EqualityProblem.of(path, rank_tolerance)
+    if (limit := fixed.at_nearest(np.zeros(len(path.data.linear)))) is not None:
+        return limit
     unit, steps, searched = max(fixed.misfit, path.data.floor), list[_Step](), False
     for share in _RIDGES:
         ridge = float(share * unit / max(1.0, steps[0].prior if steps else 1.0))
@@ -93,34 +92,35 @@ def ridge_limit(problem: LinearProblem, conditions: Conditions, prior: Prior, ra
         if step is None:
             break
         steps.append(step)
-        found = fixed.at_nearest(step.x)
-        if found is None and not searched and step.misfit - fixed.misfit <= _NEAR * unit:
-            found, searched = fixed.at_feasible(step.x), True
-        if found is not None:
-            return found
-        blocked = step.ridge > ridge and _change(steps) <= _NEAR * max(step.misfit, path.data.floor)
-        if blocked or path.distance_from_nominal(step) > _FAR * SEARCH_RADIUS:
-            break
-        if len(steps) > 1 and _change(steps) <= _SETTLED * max(step.misfit, path.data.floor) and _prior_steady(steps):
+        limit = fixed.at_nearest(step.x)
+        if limit is None and not searched and step.misfit - fixed.misfit <= _NEAR * unit:
+            limit, searched = fixed.at_feasible(step.x), True
+        if limit is not None:
+            return limit
+        if path.has_ended(steps, ridge):
             break
     if not steps:
         raise np.linalg.LinAlgError("no ridge gives a minimizer")
-    distances = [path.distance_from_nominal(step) for step in steps[-2:]]
-    as_near_as_rounding_allows = len(steps) == 1 or distances[1] <= _BOUNDED * distances[0]
-    if as_near_as_rounding_allows and path.largest_deviation(steps[-1]) <= _PLAUSIBLE:
+    converged = len(steps) == 1 or steps[-1].distance <= _BOUNDED * steps[-2].distance
+    if converged and steps[-1].largest_deviation <= _PLAUSIBLE:
         return steps[-1].limit
     return path.by_discrepancy_principle(steps, fixed.rank)
 
 
 @dataclass(frozen=True)
 class _Step:
-    """The minimizer x, (n,), with some ridge, its conic problem, its misfit and its prior."""
+    """The minimizer x, (n,), with some ridge, its conic problem, its misfit and its prior.
+
+    `distance`: norm of its deviation from the nominal parameters, in units of the scale; `largest_deviation`: of one.
+    """
 
     ridge: float
     conic: ConicProblem
     x: Array
     misfit: float
     prior: float
+    distance: float
+    largest_deviation: float
 
     @property
     def limit(self) -> RidgeLimit:
@@ -136,7 +136,7 @@ class _RegularizationPath:
         self.data = build_conic_problem(problem, conditions, 0.0, prior)
 
     def at(self, ridge: float) -> _Step | None:
-        """The minimizer with a ridge, None where rounding hides it."""
+        """The minimizer with a ridge; None if it cannot be computed for rounding."""
         conic = build_conic_problem(self.problem, self.conditions, ridge, self.prior)
         with warnings.catch_warnings():
             warnings.simplefilter("error", NumericalWarning)
@@ -144,36 +144,32 @@ class _RegularizationPath:
                 x = solve_barrier(conic).x
             except (NumericalWarning, np.linalg.LinAlgError):
                 return None
-        misfit = self.data.objective(x)
-        return _Step(ridge, conic, x, misfit, (conic.objective(x) - misfit) / ridge)
+        misfit, deviation = self.data.objective(x), self.data.deviations @ x
+        prior = (conic.objective(x) - misfit) / ridge
+        return _Step(ridge, conic, x, misfit, prior, float(np.linalg.norm(deviation)), float(np.abs(deviation).max()))
 
     def towards(self, ridge: float, before: float) -> _Step | None:
-        """The minimizer with the ridge nearest to `ridge`, coming from `before`, that rounding does not hide."""
+        """The minimizer with `ridge` or, if it cannot be computed, the nearest one towards the ridge `before`."""
         while ridge <= 0.5 * before:
             if (step := self.at(ridge)) is not None:
                 return step
             ridge = float(np.sqrt(ridge * before))
         return None
 
-    def distance_from_nominal(self, step: _Step) -> float:
-        """Distance from the nominal parameters, in units of their scale."""
-        return float(np.linalg.norm(self.data.deviations @ step.x))
-
-    def largest_deviation(self, step: _Step) -> float:
-        """Largest distance of a parameter from its nominal value, in units of its scale."""
-        return float(np.abs(self.data.deviations @ step.x).max())
-
-    def prior_alone(self) -> ConicProblem:
-        """The same conditions without data."""
-        nothing = np.zeros((0, len(self.problem.nominal)))
-        problem = replace(self.problem, A=nothing, b=np.zeros(0), residual=0.0, rows=1)
-        return build_conic_problem(problem, self.conditions, 1.0, self.prior)
+    def has_ended(self, steps: list[_Step], ridge: float) -> bool:
+        """Whether the last step, towards `ridge`, is far from nominal, converged, or as close as rounding allows."""
+        step = steps[-1]
+        if len(steps) == 1 or step.distance > _FAR * SEARCH_RADIUS:
+            return step.distance > _FAR * SEARCH_RADIUS
+        decrease, size = steps[-2].misfit - step.misfit, max(step.misfit, self.data.floor)
+        steady = abs(step.prior - steps[-2].prior) <= _STEADY * step.prior
+        return (decrease <= _NEAR * size and step.ridge > ridge) or (decrease <= _SETTLED * size and steady)
 
     def by_discrepancy_principle(self, steps: list[_Step], rank: int) -> RidgeLimit:
         """The least prior at the misfit expected of the true parameters (Morozov's discrepancy principle).
 
         That is the least misfit, at the end of `steps`, plus the variance of the noise for each combination that the
-        data determine; the variance of the stated noise where there are no more rows than those.
+        data determine; the variance of the stated noise if there are no more rows than combinations.
         """
         rows, least, oversampling = self.problem.rows, steps[-1].misfit, self.problem.oversampling
         noise = residual_std(least * rows, rows, rank, oversampling) if rows > rank else 1.0
@@ -192,19 +188,17 @@ class _RegularizationPath:
                 break
             below, above = (between, above) if between.misfit <= target else (below, between)
         message = (
-            "estimator: with ridge 0 the misfit goes on falling while parameters that the data do not determine grow "
+            "estimator: with ridge 0 the misfit keeps decreasing while parameters that the data do not determine grow "
+            f"to {steps[-1].largest_deviation:.0f} scales; the estimate is that of the discrepancy principle, with "
+            f"ridge {below.ridge:.1g}; accepted: a ridge above 0"
         )
-        message += (
-            f"beyond belief ({self.largest_deviation(steps[-1]):.0f} scales); taken is the least prior at the misfit "
-        )
-        message += f"expected of the true parameters, as with ridge {below.ridge:.1g}; accepted: a ridge"
         warn(message, NumericalWarning)
         return below.limit
 
 
 @dataclass(frozen=True)
-class _Fixed:
-    """The prior alone, with the `rank` combinations that the `data` determine fixed at the least misfit."""
+class _EqualityProblem:
+    """The prior alone, with equalities that fix the `rank` combinations that the data determine at the least misfit."""
 
     conic: ConicProblem
     data: ConicProblem
@@ -212,7 +206,7 @@ class _Fixed:
     rank: int
 
     @classmethod
-    def of(cls, path: _RegularizationPath, rank_tolerance: float) -> _Fixed:
+    def of(cls, path: _RegularizationPath, rank_tolerance: float) -> _EqualityProblem:
         plain = build_conic_problem(path.problem, path.conditions, 0.0, "euclidean")  # whose x is in units of the scale
         start = plain.E.T @ plain.e
         U, values, right = np.linalg.svd(plain.root @ plain.null_space, full_matrices=False)
@@ -221,7 +215,9 @@ class _Fixed:
         basis = plain.null_space @ right[:rank].T
         step = basis @ (U[:, :rank].T @ (plain.target - plain.root @ start) / values[:rank])
         misfit = plain.objective(start + step)
-        alone = path.prior_alone()
+        nothing = np.zeros((0, len(path.problem.nominal)))
+        without_data = replace(path.problem, A=nothing, b=np.zeros(0), residual=0.0, rows=1)
+        alone = build_conic_problem(without_data, path.conditions, 1.0, path.prior)
         rows = basis.T @ alone.deviations
         size = np.linalg.norm(rows, axis=1)
         orthonormal, triangle = np.linalg.qr(np.vstack([alone.E, rows / size[:, None]]).T)
@@ -241,18 +237,8 @@ class _Fixed:
         return np.asarray(x - self.conic.E.T @ (self.conic.E @ x - self.conic.e))
 
     def at_feasible(self, x: Array) -> RidgeLimit | None:
-        """This problem, if from x, (n,), a strictly feasible point is soon found."""
+        """This problem, if phase I from x, (n,), finds a strictly feasible point in a few steps."""
         try:
             return self.at_nearest(find_strictly_feasible(replace(self.conic, start=self.nearest(x)), _SEARCH)[0])
         except (InputError, np.linalg.LinAlgError):
             return None
-
-
-def _change(steps: list[_Step]) -> float:
-    """The change of the misfit in the last step."""
-    return steps[-2].misfit - steps[-1].misfit
-
-
-def _prior_steady(steps: list[_Step]) -> bool:
-    """Whether the last step hardly changed the prior."""
-    return abs(steps[-1].prior - steps[-2].prior) <= _STEADY * steps[-1].prior

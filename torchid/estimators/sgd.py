@@ -1,4 +1,4 @@
-"""Mini-batch descent: its settings, its objective, its penalties, and what a saved state of it must be."""
+"""Mini-batch descent: settings, penalties, loss, and the check of a saved state."""
 
 from __future__ import annotations
 
@@ -18,6 +18,12 @@ from torchid.estimators.least_squares import Regularized
 from torchid.estimators.optimizers import try_out
 from torchid.problem import Batch, LinearProblem, MiniBatches
 from torchid.settings import BelowOne, Count, NamedClass, NotNegative, Positive, validate_settings
+
+Consistency = Literal["log_cholesky", "penalties"]
+ResidualMode = Literal["joint", "parameters_first", "alternating"]
+
+_FREE = ("residual_weight", "weight_choice")  # entries of a saved state that are None before the first epoch
+_SCHEDULED = ("lr", "momentum", "betas")  # options of optimizer groups that schedules change
 
 
 @dataclass(frozen=True)
@@ -42,8 +48,65 @@ class PenaltyWeights:
 
     @property
     def curvature(self) -> float:
-        """Bound of the squares' second derivatives, in units of the scale; what is off the diagonal is there twice."""
+        """Bound of the second derivatives, in units of the scale; off-diagonal entries of a matrix count twice."""
         return 2.0 * (2.0 * self.eigenvalue + self.mass + self.friction)
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Optimizer, learning-rate schedule and stopping rule of a descent.
+
+    Attributes:
+        epochs: passes over the logs, at most.
+        optimizer: name, one of `optimizer_names()`, and options of a class of `torch.optim`; defaults are those of
+            `OPTIMIZERS`.
+        schedule: name and options of a class of `torch.optim.lr_scheduler`, stepped once per epoch; None for none.
+        patience: epochs without a better loss on the held-out logs after which training stops; None: never.
+        clip: largest norm of a gradient.
+        damping: of the preconditioner, in units of the mean squared whitened residual per squared scale.
+    """
+
+    epochs: Count = 200
+    optimizer: NamedClass = field(default_factory=lambda: {"name": "Adam"})
+    schedule: NamedClass | None = field(default_factory=lambda: {"name": "CosineAnnealingLR"})
+    patience: Count | None = None
+    clip: Positive = 1.0
+    damping: Positive = 1.0
+
+    def try_out(self) -> None:
+        """Test optimizer and schedule on a parabola, so that invalid options fail before any work.
+
+        Raises:
+            UnknownNameError: an optimizer or a schedule that torch does not have.
+            InputError: options, or a kind of optimizer, that do not work here.
+        """
+        try_out(self.optimizer, self.schedule, self.epochs)
+
+
+@dataclass(frozen=True)
+class Sgd(TrainingSettings, Regularized):
+    """min of the mean squared whitened residual + ridge * prior + penalties, one mini-batch at a time.
+
+    The prior is that of `LeastSquares`, ||(phi - nominal) / scale||^2.
+
+    Attributes:
+        consistency: "log_cholesky", parameters are physically consistent in every step; "penalties", violations are
+            penalized.
+        margin: least eigenvalue of every body's scaled pseudo-inertia, enforced or penalized.
+        penalties: their weights, for "penalties".
+        residual: how a residual module is trained: "joint", with the parameters; "parameters_first", after them, in the
+            second half of the epochs; "alternating", in every other epoch.
+        residual_lr: learning rate of the module; None: the optimizer's.
+        residual_weight: of the mean square of the module's whitened force in the loss; None: the largest whose loss on
+            held-out samples is not significantly above the least.
+    """
+
+    consistency: Consistency = "log_cholesky"
+    margin: BelowOne = Conditions.margin
+    penalties: PenaltyWeights = field(default_factory=PenaltyWeights)
+    residual: ResidualMode = "joint"
+    residual_lr: Positive | None = None
+    residual_weight: NotNegative | None = None
 
 
 def pseudo_inertias(scaled: Tensor) -> Tensor:
@@ -56,7 +119,7 @@ def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWei
 
     Args:
         scaled: (L, 12), parameters in units of their scale.
-        bodies: (L',) int, bodies whose inertia is penalized; friction is, of all.
+        bodies: (L',) int, bodies whose inertia is penalized; friction is penalized for all.
         margin: least eigenvalue without a penalty.
         weights: of the terms.
     """
@@ -75,75 +138,14 @@ def penalties(scaled: Tensor, bodies: Tensor, margin: float, weights: PenaltyWei
 
 
 def _extended_log(x: Tensor, least: float = 1e-4) -> Tensor:
-    """The logarithm, and below `least` its tangent: the gradient of a body outside the cone points inside."""
+    """The logarithm, and below `least` its tangent, so that the gradient of an infeasible body points inside."""
     inside = x.clamp_min(least)
     return inside.log() + (x - inside) / least
 
 
-Consistency = Literal["log_cholesky", "penalties"]
-ResidualMode = Literal["joint", "parameters_first", "alternating"]
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """How a descent is trained, and when it stops.
-
-    Attributes:
-        epochs: passes over the logs, at most.
-        optimizer: the name of one of `optimizer_names()`, classes of `torch.optim`, and what it takes; what is not
-            given is as in `OPTIMIZERS`.
-        schedule: the name of a class of `torch.optim.lr_scheduler`, stepped once per epoch, and what it takes; None for
-            none.
-        patience: epochs without a better loss on the held-out logs after which to stop; None: never.
-        clip: largest norm of a gradient.
-        damping: of the preconditioner, in units of the mean squared whitened residual per squared scale.
-    """
-
-    epochs: Count = 200
-    optimizer: NamedClass = field(default_factory=lambda: {"name": "Adam"})
-    schedule: NamedClass | None = field(default_factory=lambda: {"name": "CosineAnnealingLR"})
-    patience: Count | None = None
-    clip: Positive = 1.0
-    damping: Positive = 1.0
-
-    def try_out(self) -> None:
-        """Take a few steps on a parabola: optimizer and schedule that do not work are known before any work.
-
-        Raises:
-            UnknownNameError: an optimizer or a schedule that torch does not have.
-            InputError: options, or a kind of optimizer, that do not work here.
-        """
-        try_out(self.optimizer, self.schedule, self.epochs)
-
-
-@dataclass(frozen=True)
-class Sgd(TrainingSettings, Regularized):
-    """min of the mean squared whitened residual + ridge * prior + penalties, one mini-batch at a time.
-
-    The prior is that of `LeastSquares`, ||(phi - nominal) / scale||^2.
-
-    Attributes:
-        consistency: "log_cholesky", every step's parameters are physical; "penalties", violations cost.
-        margin: least eigenvalue of every body's scaled pseudo-inertia, kept or aimed at.
-        penalties: their weights, with "penalties".
-        residual: with a residual module: train it and the parameters together, the parameters for the first half of the
-            epochs and then the module, or each in every other epoch.
-        residual_lr: learning rate of the module; None: the optimizer's.
-        residual_weight: of the mean square of the module's whitened force in the loss; None: the largest whose loss on
-            held-out samples is not significantly above the least.
-    """
-
-    consistency: Consistency = "log_cholesky"
-    margin: BelowOne = Conditions.margin
-    penalties: PenaltyWeights = field(default_factory=PenaltyWeights)
-    residual: ResidualMode = "joint"
-    residual_lr: Positive | None = None
-    residual_weight: NotNegative | None = None
-
-
 @dataclass(frozen=True)
 class LossTerms:
-    """LossTerms of the loss of a batch, and sums of squares of its projected whitened forces, both by name."""
+    """Terms of a batch's loss, and sums of squares of its projected whitened forces, both by name."""
 
     losses: dict[str, Tensor]
     squares: dict[str, Tensor]
@@ -153,18 +155,18 @@ class LossTerms:
         return torch.stack(list(self.losses.values())).sum()
 
     def plus(self, other: LossTerms, share: float) -> LossTerms:
-        """These and those of another batch, which holds this share of the samples, without their gradients."""
+        """Sum with the terms of another batch, weighted with its share of the samples, without gradients."""
         losses = {name: self.losses.get(name, 0.0) + share * x.detach() for name, x in other.losses.items()}
         return LossTerms(losses, {name: self.squares.get(name, 0.0) + x for name, x in other.squares.items()})
 
 
 class Loss(nn.Module):
-    """The loss of a batch, such that its mean over an epoch is the loss of all samples.
+    """The loss of a batch; its mean over an epoch is the loss of all samples.
 
     Attributes:
         learnable: parameters of the bodies.
         residual: module r(q, v, a) -> (B, n_rows) [N, N m] whose output adds to K phi, or None.
-        residual_weight: of the mean square of the module's whitened force; None, which counts as 0, until it is chosen.
+        residual_weight: of the mean square of the module's whitened force; None (as 0) before it is chosen.
     """
 
     def __init__(
@@ -187,7 +189,7 @@ class Loss(nn.Module):
         )
 
     def forward(self, batch: Batch) -> LossTerms:
-        """LossTerms of one batch."""
+        """Terms of the loss of one batch."""
         settings, phi = self.settings, self.learnable()
         rigid, other = self.forces(batch, phi)
         share = self._per_row / len(batch)
@@ -218,7 +220,7 @@ class Loss(nn.Module):
 
     @torch.no_grad()
     def mean_square(self, batches: MiniBatches) -> float:
-        """Mean squared whitened residual over all rows of some logs, the module evaluating."""
+        """Mean squared whitened residual over all rows of some logs, with the module in evaluation mode."""
         total, rows, phi = 0.0, 0, self.learnable()
         with self.evaluating():
             for batch in batches.chunks():
@@ -229,7 +231,7 @@ class Loss(nn.Module):
 
     @contextmanager
     def evaluating(self) -> Iterator[None]:
-        """The module evaluates, and trains again afterwards if it did before."""
+        """Evaluation mode inside the block; the previous mode afterwards."""
         training = self.training
         self.eval()
         try:
@@ -238,67 +240,63 @@ class Loss(nn.Module):
             self.train(training)
 
 
-_FREE = ("residual_weight", "weight_choice")  # None or not, whatever they are in a new state
-_SCHEDULED = ("lr", "momentum", "betas")  # of an optimizer's groups; all else is as the settings say
-
-
-def validate_state(found: Mapping[str, Any], new: Mapping[str, Any], epochs: int) -> None:
-    """Refuse a state that no descent of the same settings can have left.
+def validate_state(saved: Mapping[str, Any], new: Mapping[str, Any], epochs: int) -> None:
+    """Refuse a saved state that cannot come from a descent with the same settings.
 
     Args:
-        found: the state.
-        new: the state of a descent that has not begun.
-        epochs: after which the descent ends.
+        saved: the state.
+        new: the state of a descent before its first epoch.
+        epochs: of the whole descent.
 
     Raises:
-        ValueError: names the place, what was found and what is accepted.
+        ValueError: names the key of the state, its value and what is accepted.
     """
-    require_same_structure(found, {name: value for name, value in new.items() if name not in _FREE})
-    epoch, best_epoch, best_loss = (found[name] for name in ("epoch", "best_epoch", "best_loss"))
+    require_same_structure(saved, {name: value for name, value in new.items() if name not in _FREE})
+    epoch, best_epoch, best_loss = (saved[name] for name in ("epoch", "best_epoch", "best_loss"))
     _require_count("epoch", epoch, epochs)
     _require_count("best_epoch", best_epoch, epoch)
     if not (best_loss >= 0.0 and np.isfinite(best_loss) == (best_epoch > 0)):
-        raise ValueError(f"best_loss: found {best_loss}; accepted: at least 0, infinite before the first epoch alone")
-    for place in ("learned", "best"):
-        _require_learned(place, found[place], new[place])
+        raise ValueError(f"best_loss: found {best_loss}; accepted: at least 0, infinite only before the first epoch")
+    for key in ("learned", "best"):
+        _require_learned(key, saved[key], new[key])
     for number, (group, fresh) in enumerate(
-        zip(found["optimizer"]["param_groups"], new["optimizer"]["param_groups"], strict=True)
+        zip(saved["optimizer"]["param_groups"], new["optimizer"]["param_groups"], strict=True)
     ):
         for name, value in fresh.items():
             _require_option(f"optimizer.param_groups.{number}.{name}", group[name], value, name in _SCHEDULED)
-    if found["schedule"] is not None and found["schedule"].get("last_epoch") != epoch:
-        last = found["schedule"].get("last_epoch")
+    if saved["schedule"] is not None and saved["schedule"].get("last_epoch") != epoch:
+        last = saved["schedule"].get("last_epoch")
         raise ValueError(f"schedule.last_epoch: found {last}; accepted: {epoch}, the epoch")
-    _require_weight(found.get("residual_weight"), new["residual_weight"], epoch)
+    _require_weight(saved.get("residual_weight"), new["residual_weight"], epoch)
 
 
-def require_same_structure(found: Any, expected: Any, place: str = "state") -> None:
-    """Refuse a state whose keys, types or shapes are not those of a descent that has not begun; values may differ.
+def require_same_structure(saved: Any, expected: Any, path: str = "state") -> None:
+    """Refuse a saved state whose keys, types or shapes are not those of a new descent; values may differ.
 
-    A mapping that is empty in `expected`, an optimizer's state before its first step, may hold mappings.
+    A mapping that is empty in `expected`, an optimizer's state before its first step, may contain mappings.
 
     Raises:
-        ValueError: names the first place that differs.
+        ValueError: names the first key that differs.
     """
     if isinstance(expected, Tensor):
-        alike = isinstance(found, Tensor) and (found.shape, found.dtype) == (expected.shape, expected.dtype)
+        alike = isinstance(saved, Tensor) and (saved.shape, saved.dtype) == (expected.shape, expected.dtype)
     elif isinstance(expected, (int, float)):
-        number = isinstance(found, (int, float)) and found == found
-        alike = number and isinstance(found, bool) == isinstance(expected, bool)
+        number = isinstance(saved, (int, float)) and saved == saved
+        alike = number and isinstance(saved, bool) == isinstance(expected, bool)
     else:
-        alike = isinstance(found, type(expected))
+        alike = isinstance(saved, type(expected))
     if alike and expected == {}:
-        alike = all(isinstance(value, dict) for value in found.values())
+        alike = all(isinstance(value, dict) for value in saved.values())
     if not alike:
-        raise ValueError(f"{place} is of another kind")
+        raise ValueError(f"{path} has the wrong type or shape")
     if isinstance(expected, Mapping) and expected:
         for key in expected:
-            require_same_structure(found.get(key), expected[key], f"{place}.{key}")
+            require_same_structure(saved.get(key), expected[key], f"{path}.{key}")
     elif isinstance(expected, (list, tuple)) and expected:
-        if len(found) != len(expected):
-            raise ValueError(f"{place} is of another length")
-        for index, (one, other) in enumerate(zip(found, expected, strict=True)):
-            require_same_structure(one, other, f"{place}.{index}")
+        if len(saved) != len(expected):
+            raise ValueError(f"{path} has the wrong length")
+        for index, (one, other) in enumerate(zip(saved, expected, strict=True)):
+            require_same_structure(one, other, f"{path}.{index}")
 
 
 def _require_count(name: str, value: Any, most: int) -> None:
@@ -306,23 +304,23 @@ def _require_count(name: str, value: Any, most: int) -> None:
         raise ValueError(f"{name}: found {value}; accepted: a whole number from 0 to {most}")
 
 
-def _require_learned(place: str, found: Mapping[str, Tensor], new: Mapping[str, Tensor]) -> None:
+def _require_learned(path: str, saved: Mapping[str, Tensor], new: Mapping[str, Tensor]) -> None:
     for name, value in new.items():
-        if value.is_floating_point() and not bool(found[name].isfinite().all()):
-            raise ValueError(f"{place}.{name}: found a number that is not finite; accepted: finite numbers")
+        if value.is_floating_point() and not bool(saved[name].isfinite().all()):
+            raise ValueError(f"{path}.{name}: found a number that is not finite; accepted: finite numbers")
 
 
-def _require_option(place: str, found: Any, new: Any, changes: bool) -> None:
-    if changes and not all(np.isfinite(x) and x >= 0.0 for x in np.atleast_1d(found)):
-        raise ValueError(f"{place}: found {found}; accepted: finite numbers of at least 0")
-    if not changes and found != new:
-        raise ValueError(f"{place}: found {found}; accepted: {new}, as in the settings")
+def _require_option(path: str, saved: Any, new: Any, changes: bool) -> None:
+    if changes and not all(np.isfinite(x) and x >= 0.0 for x in np.atleast_1d(saved)):
+        raise ValueError(f"{path}: found {saved}; accepted: finite numbers of at least 0")
+    if not changes and saved != new:
+        raise ValueError(f"{path}: found {saved}; accepted: {new}, as in the settings")
 
 
-def _require_weight(found: Any, given: float | None, epoch: int) -> None:
-    """The weight of a residual module: the one that is given, or one that the first epoch chose."""
+def _require_weight(saved: Any, given: float | None, epoch: int) -> None:
+    """Check the weight of a residual module: as in the settings, or chosen in the first epoch."""
     if given is None and epoch > 0:
-        if not (isinstance(found, (int, float)) and np.isfinite(found) and found >= 0.0):
-            raise ValueError(f"residual_weight: found {found}; accepted: a finite number of at least 0")
-    elif found != given:
-        raise ValueError(f"residual_weight: found {found}; accepted: {given}")
+        if not (isinstance(saved, (int, float)) and np.isfinite(saved) and saved >= 0.0):
+            raise ValueError(f"residual_weight: found {saved}; accepted: a finite number of at least 0")
+    elif saved != given:
+        raise ValueError(f"residual_weight: found {saved}; accepted: {given}")

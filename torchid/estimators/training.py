@@ -24,11 +24,11 @@ from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
 from torchid.problem.chunks import one_thread
 
-_BLOCKS, _EVERY = 20, 4  # a quarter of the samples is held out to choose the weight of a residual module, in 5 blocks
-_FEWEST = 2  # blocks that a standard error can be had from
+_BLOCKS, _EVERY = 20, 4  # blocks of samples; one in four is held out to choose the weight of a residual module
+_FEWEST = 2  # blocks for a standard error
 _SMALLER = "a smaller lr"
-_BETTER = 1e-5  # relative: less is no improvement
-_DIVERGED = 1e6  # times the loss at the nominal parameters, or that of stated noise if more
+_BETTER = 1e-5  # least relative decrease that counts as an improvement
+_DIVERGED = 1e6  # times the loss at the nominal parameters, or that of the stated noise if that is larger
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Epoch:
         closed_form: the least objective of any parameters, from `LeastSquares`.
         distance: rms difference of the projected whitened forces from those of the closed form.
         shares: rms of the projected whitened force of the parameters, and of the residual module, over that of the
-            measured one, in the epoch.
+            measured force, in the epoch.
         learning_rate: of the parameters, in the epoch.
         samples_per_second: trained on.
     """
@@ -65,9 +65,9 @@ class SgdEstimate(ConstrainedEstimate):
     """The result of a descent; objective and distance are those of the parameters alone.
 
     Attributes:
-        epochs: that were run.
-        best_epoch: whose parameters these are.
-        residual: the share of the residual module, None without one.
+        epochs: number of epochs run.
+        best_epoch: the epoch of these parameters.
+        residual: effect of the residual module, None without one.
     """
 
     epochs: int
@@ -78,7 +78,7 @@ class SgdEstimate(ConstrainedEstimate):
 class Trainer:
     """A descent on mini-batches, preconditioned by the compressed problem, with or without a residual module.
 
-    Same settings, logs and seeds give the same numbers, also if the state is saved after any epoch and loaded into a
+    The same settings, logs and seeds give the same numbers, also if the state is saved after an epoch and loaded into a
     new trainer.
     """
 
@@ -129,10 +129,12 @@ class Trainer:
         """Whether all epochs are done or the held-out loss has stopped falling."""
         if self.epoch >= self.settings.epochs:
             return True
-        late = self.loss.residual is not None and self.settings.residual == "parameters_first"
-        since = max(self.best_epoch, self.settings.epochs // 2 if late else 0)  # the module is trained in any case
+        module_later = self.loss.residual is not None and self.settings.residual == "parameters_first"
+        last_improvement = max(
+            self.best_epoch, self.settings.epochs // 2 if module_later else 0
+        )  # before, the module has not been trained
         patience = self.settings.patience
-        return patience is not None and self.held_out is not None and self.epoch - since >= patience
+        return patience is not None and self.held_out is not None and self.epoch - last_improvement >= patience
 
     def run(self, on_epoch: Callable[[Epoch], None] | None = None) -> SgdEstimate:
         """Train until finished.
@@ -141,7 +143,7 @@ class Trainer:
             on_epoch: called after each epoch.
 
         Raises:
-            InputError: the loss has grown beyond all bounds.
+            InputError: the loss diverges.
         """
         while not self.finished:
             epoch = self.run_epoch()
@@ -153,7 +155,7 @@ class Trainer:
         """Train on all samples once.
 
         Raises:
-            InputError: the loss has grown beyond all bounds.
+            InputError: the loss diverges.
         """
         if self.loss.residual_weight is None:
             self.choose_residual_weight()
@@ -167,15 +169,15 @@ class Trainer:
             for batches, samples in self._steps():
                 terms = self._step(batches, samples)
                 weight = samples / self.batches.samples
-                for sums, found, factor in ((losses, terms.losses, weight), (squares, terms.squares, 1.0)):
-                    for name, value in found.items():
+                for sums, values, factor in ((losses, terms.losses, weight), (squares, terms.squares, 1.0)):
+                    for name, value in values.items():
                         sums[name] = sums.get(name, 0.0) + factor * float(value)
             elapsed = time.perf_counter() - start
             held_out = None if self.held_out is None else self.loss.mean_square(self.held_out)
         losses["total"] = sum(losses.values())
         phi, size = self.phi(), squares.pop("measured")
         with np.errstate(over="ignore", invalid="ignore"):
-            self._require_converging(self._objective(phi))  # after the last step, which no batch was evaluated at
+            self._require_converging(self._objective(phi))  # after the last step: losses are those before it
         self._require_converging(0.0 if held_out is None else held_out)
         if not all(bool(x.isfinite().all()) for group in self._trained for x in group):
             self._require_converging(float("nan"))  # of a module, in the last step
@@ -197,14 +199,14 @@ class Trainer:
         )
 
     def choose_residual_weight(self) -> WeightChoice:
-        """Choose the weight of the residual module by held-out samples; the first epoch does so if none is given.
+        """Choose the weight of the residual module by held-out samples, in the first epoch if the settings give none.
 
-        From the result of rigid bodies alone, a copy of the module is trained under each of `CANDIDATE_WEIGHTS` for
+        Starting from the parameters without the module, a copy of it is trained with each of `CANDIDATE_WEIGHTS` for
         half of the epochs. The held-out samples are the held-out logs or, without any, a quarter of the training
         samples, in blocks.
 
         Raises:
-            InputError: too few samples, or no weight under which the loss does not diverge.
+            InputError: too few samples, or the loss diverges with every weight.
         """
         train, blocks = self.batches, [] if self.held_out is None else self.held_out.split_blocks(_BLOCKS)
         if self.held_out is None:
@@ -213,14 +215,14 @@ class Trainer:
             found = f"{self.batches.samples} samples are too few to choose it"
             raise InputError("estimator", "residual_weight", found, "a number, or longer logs")
         with torch.random.fork_rng():
-            alone = self._trial(train, None, 0.0, self.settings.epochs)
-            alone.run()
-            start = alone.loss.learnable.state_dict()
+            without_module = self._trial(train, None, 0.0, self.settings.epochs)
+            without_module.run()
+            start = without_module.loss.learnable.state_dict()
             losses = [self._trial_losses(train, weight, start, blocks) for weight in CANDIDATE_WEIGHTS]
         if not np.isfinite(losses).any():
-            raise InputError("estimator", "training", "a loss that diverges under every residual_weight", _SMALLER)
-        without = float(np.mean([alone.loss.mean_square(block) for block in blocks]))
-        self.weight_choice = choose_weight(CANDIDATE_WEIGHTS, np.array(losses), without)
+            raise InputError("estimator", "training", "a loss that diverges with every residual_weight", _SMALLER)
+        loss_without = float(np.mean([without_module.loss.mean_square(block) for block in blocks]))
+        self.weight_choice = choose_weight(CANDIDATE_WEIGHTS, np.array(losses), loss_without)
         self.loss.residual_weight = self.weight_choice.weight
         return self.weight_choice
 
@@ -232,7 +234,7 @@ class Trainer:
     def _trial_losses(
         self, train: MiniBatches, weight: float, start: Mapping[str, Tensor], blocks: Sequence[MiniBatches]
     ) -> list[float]:
-        """Losses by block, after a descent with a copy of the module, infinite if that diverges."""
+        """Losses by block, after a descent with a copy of the module; infinite if it diverges."""
         trial = self._trial(train, copy.deepcopy(self.loss.residual), weight, max(self.settings.epochs // 2, 1))
         trial.loss.learnable.load_state_dict(start)
         try:
@@ -243,16 +245,16 @@ class Trainer:
         return [trial.loss.mean_square(block) for block in blocks]
 
     def phi(self) -> Array:
-        """The parameters as they are now, (12 L,)."""
+        """The current parameters, (12 L,)."""
         with torch.no_grad():
             return np.array(self.loss.learnable().cpu().numpy(), dtype=np.float64)
 
     def estimate(self) -> SgdEstimate:
-        """The parameters with the least held-out loss (the last without held-out logs); a residual module follows.
+        """The parameters, and residual module, of least held-out loss; without held-out logs the last ones.
 
         Statistics are those of least squares with the same ridge.
         """
-        self._restore(self._best)
+        self.loss.load_state_dict(self._best)
         plain, phi = self.closed_form, self.phi()
         return SgdEstimate(
             **(vars(plain) | {"phi": phi, "cost": self.problem.cost(phi)}),
@@ -266,11 +268,11 @@ class Trainer:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The state that a new trainer of the same settings and logs resumes from: plain types and tensors."""
+        """The state from which a new trainer with the same settings and logs resumes: plain types and tensors."""
         return {
             "learned": self._snapshot(),
             "best": self._best,
-            "optimizer": copy.deepcopy(self.optimizer.state_dict()),  # torch hands out what the next step writes to
+            "optimizer": copy.deepcopy(self.optimizer.state_dict()),  # torch returns references
             "schedule": None if self.schedule is None else copy.deepcopy(self.schedule.state_dict()),
             "random": [torch.get_rng_state(), *torch.cuda.get_rng_state_all()],
             "epoch": self.epoch,
@@ -284,11 +286,11 @@ class Trainer:
         """Resume from where `state_dict` was called.
 
         Raises:
-            ValueError: a value that no state of these settings has. Inside the states of optimizer and schedule torch
-                raises its own errors.
+            ValueError: a value that does not fit the settings. Torch raises its own errors for the states of optimizer
+                and schedule.
         """
         validate_state(state, self.state_dict(), self.settings.epochs)
-        self._restore(state["learned"])
+        self.loss.load_state_dict(state["learned"])
         self._best = state["best"]
         self._load_optimizer(copy.deepcopy(state["optimizer"]))
         if self.schedule is not None:
@@ -301,7 +303,7 @@ class Trainer:
         self.weight_choice = None if choice is None else WeightChoice(**choice)
 
     def _load_optimizer(self, state: dict[str, Any]) -> None:
-        """Load an optimizer's state, scalars in the precision they had (torch would widen those of NAdam)."""
+        """Load an optimizer's state, scalars in their saved precision (torch would widen those of NAdam)."""
         self.optimizer.load_state_dict(state)
         trained = [x for group in self.optimizer.param_groups for x in group["params"]]
         for index, saved in state["state"].items():
@@ -313,29 +315,26 @@ class Trainer:
     def _snapshot(self) -> dict[str, Tensor]:
         return {name: x.detach().clone() for name, x in self.loss.state_dict().items()}
 
-    def _restore(self, learned: Mapping[str, Tensor]) -> None:
-        self.loss.load_state_dict(learned)
-
     def _objective(self, phi: Array) -> float:
         deviation = (phi - self.problem.nominal) / self.problem.scale
         return self.problem.cost(phi) / max(self.problem.rows, 1) + self.settings.ridge * float(deviation @ deviation)
 
     def _freeze(self) -> None:
-        """Freeze the parameters or the residual module where they have no turn in this epoch."""
+        """Freeze the parameters or the residual module if they are not trained in this epoch."""
         if self.loss.residual is None:
             return
         first = self.epoch <= self.settings.epochs // 2
-        ours, theirs = {
+        trained_now = {
             "joint": (True, True),
             "parameters_first": (first, not first),
             "alternating": (self.epoch % 2 == 1, self.epoch % 2 == 0),
         }[self.settings.residual]
-        for group, trained in zip(self._trained, (ours, theirs), strict=True):
+        for group, trained in zip(self._trained, trained_now, strict=True):
             for x in group:
                 x.requires_grad_(trained)
 
     def _unfreeze(self) -> None:
-        """Unfreeze all: another trainer may train the residual module next."""
+        """Unfreeze all: another trainer may use the residual module next."""
         for group in self._trained:
             for x in group:
                 x.requires_grad_(True)
@@ -349,7 +348,7 @@ class Trainer:
             raise InputError("estimator", "training", found, _SMALLER)
 
     def _steps(self) -> Iterator[tuple[Callable[[], Iterable[Batch]], int]]:
-        """The batches that each step of an epoch is taken on, with the number of their samples."""
+        """Batches of each step of an epoch, with the number of their samples."""
         if OPTIMIZERS[self.settings.optimizer["name"]].full_batch:
             yield self.batches.chunks, self.batches.samples
         else:
@@ -357,8 +356,8 @@ class Trainer:
                 yield partial(list, [batch]), len(batch)
 
     def _step(self, batches: Callable[[], Iterable[Batch]], samples: int) -> LossTerms:
-        """One step of the optimizer; terms are those before it."""
-        found: list[LossTerms] = []
+        """Take one step of the optimizer; returns the terms before it."""
+        evaluated: list[LossTerms] = []
 
         def closure() -> Tensor:
             self.optimizer.zero_grad()
@@ -370,15 +369,15 @@ class Trainer:
             if not OPTIMIZERS[self.settings.optimizer["name"]].full_batch:
                 for group in self.optimizer.param_groups:
                     nn.utils.clip_grad_norm_(group["params"], self.settings.clip)
-            found.append(terms)
+            evaluated.append(terms)
             return terms.total()
 
         try:
             self.optimizer.step(closure)  # type: ignore[arg-type]  # torch's own documentation returns a tensor
-        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]  # eigenvalues of what is not finite
+        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]  # eigenvalues of a matrix with NaN
             self._require_converging(float("nan"))
-        self._require_converging(float(found[0].losses["data"]))
-        return found[0]
+        self._require_converging(float(evaluated[0].losses["data"]))
+        return evaluated[0]
 
 
 def _learnable(settings: Sgd, problem: LinearProblem) -> LearnableParameters:

@@ -1,1 +1,1 @@
-"""What a robot, its contacts, its sensors and its motion determine of the parameters, and how well."""
+"""Which parameters a robot, its contacts, sensors and motion determine, and how accurately."""

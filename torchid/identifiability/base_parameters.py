@@ -22,20 +22,22 @@ from torchid.problem.contact_state import ContactState, state_name
 from torchid.rounding import RANK_TOLERANCE, is_significant, numerical_rank
 from torchid.sensing.projection import base_rank, base_singular_values
 
-_ROUNDING = 1e-9  # of a coefficient, columns having norm 1; joint angles written as 1.5707963 leave 1e-11
-_LEAST_PREFERENCE = 1e-2  # between 1e-1 and 1e-4 sums are shortest, and conditioning is the same
-_CLEAR_GAP = 1e3  # a rank shows by a step of many decades (14 on exact motions), not by a slope
+_ROUNDING = 1e-9  # of a coefficient between columns of norm 1; angles rounded to 1.5707963 give 1e-11
+_LEAST_PREFERENCE = 1e-2  # between 1e-1 and 1e-4 sums are shortest; conditioning is the same
+_CLEAR_GAP = 1e3  # least ratio of singular values at a clear rank; on exact motions it is 1e14
+_CHECKED = 512  # samples per state, from all over the logs: shares are then accurate to about 2 %
+_MOST = 0.5  # share of the samples that must have the whole base: else the median of the smallest singular value is 0
 
 
 class RankGap(NamedTuple):
-    """Number of singular values that count, and how clear that is: the smallest of them over the next one."""
+    """Numerical rank, and the gap at it: the smallest singular value that counts over the next one."""
 
     rank: int
     gap: float
 
 
 class BaseParameters(nn.Module):
-    """Base parameters phi_B = G phi with `K phi = K_B phi_B` (eq. 11) for every row K of the kind they were made from.
+    """Base parameters phi_B = G phi with `K phi = K_B phi_B` (eq. 11) for all rows K like those of their problem.
 
     Attributes:
         kept: (P_B,) int, ascending; base parameter i is parameter `kept[i]` and what was regrouped into it.
@@ -57,7 +59,7 @@ class BaseParameters(nn.Module):
         singular_values: Array,
         rank_gap: RankGap,
     ) -> None:
-        """Use `base_parameters`, which finds them."""
+        """Created by `base_parameters`."""
         super().__init__()
         self.kept, self.combination, self.free, self.scale = kept, combination, free, scale
         self.singular_values = singular_values
@@ -90,7 +92,7 @@ class BaseParameters(nn.Module):
             ValueError: other parameters are free there.
         """
         if not np.array_equal(problem.free, self.free):
-            raise ValueError("free: found other parameters than these base parameters were made from; accepted: those")
+            raise ValueError("free: found others than in the problem of these base parameters; accepted: the same")
         constant = np.where(self.free, 0.0, problem.nominal)
         return replace(
             problem,
@@ -108,12 +110,12 @@ def base_parameters(
 ) -> BaseParameters:
     """Base parameters of a problem.
 
-    Columns are scaled to norm 1, so that a finger's inertia counts as much as the torso's mass; a pivoted QR
-    factorization of their null space settles which parameters are regrouped into the others. Source: Gautier,
+    Columns are scaled to norm 1, so that a finger's inertia counts as much as the torso's mass. A pivoted QR
+    factorization of their null space decides which parameters are regrouped into the others. Source: Gautier,
     "Numerical calculation of the base inertial parameters of robots", 1991.
 
     Args:
-        problem: its rows decide what is observable.
+        problem: with the rows.
         tolerance: a parameter whose column is below this share of the largest, in units of `problem.scale`, is not
             observable; a singular value of the scaled columns below this share of the largest counts as zero.
         preference: (P,), > 0, for regrouping each parameter into others; by default `regrouping_preference`.
@@ -128,8 +130,8 @@ def base_parameters(
     null_space = Vh[rank_gap.rank :].T
     weight = (regrouping_preference(count) if preference is None else preference)[free]
     _, order = scipy.linalg.qr((null_space * weight[:, None]).T, mode="r", pivoting=True)
-    hidden_count = len(free) - rank_gap.rank
-    dropped, kept = order[:hidden_count], np.sort(order[hidden_count:])
+    null_dimension = len(free) - rank_gap.rank
+    dropped, kept = order[:null_dimension], np.sort(order[null_dimension:])
     regrouped = -np.linalg.solve(null_space[dropped].T, null_space[kept].T).T
     regrouped[np.abs(regrouped) < _ROUNDING] = 0.0
 
@@ -142,7 +144,7 @@ def base_parameters(
 def regrouping_preference(count: int) -> Array:
     """Preference for regrouping each of `count` parameters into others, (count,), from 1 down to 0.01.
 
-    As textbooks do it (Gautier, Khalil): limbs into what carries them; of a body the mass first, then first moments,
+    As usual (Gautier, Khalil): bodies are regrouped into their parents; of a body the mass first, then first moments,
     then inertia.
     """
     bodies = max(count // parameters.PER_BODY, 1)
@@ -171,10 +173,10 @@ def unobservable_parameters(base: BaseParameters, body_names: Sequence[str]) -> 
         base: in the parameters of bodies.
         body_names: of the L bodies, in order.
     """
-    lost = (base.free & ~base.combination.any(axis=0)).reshape(-1, PER_BODY)
+    unobservable = (base.free & ~base.combination.any(axis=0)).reshape(-1, PER_BODY)
     return [
-        f"{body}: {', '.join(PARAMETERS[place] for place in np.flatnonzero(numbers))}"
-        for body, numbers in zip(body_names, lost, strict=True)
+        f"{body}: {', '.join(PARAMETERS[index] for index in np.flatnonzero(numbers))}"
+        for body, numbers in zip(body_names, unobservable, strict=True)
         if numbers.any()
     ]
 
@@ -184,7 +186,7 @@ def structural_rank(problem: LinearProblem, tolerance: float = RANK_TOLERANCE) -
     """Rank of a problem's free columns, scaled to norm 1.
 
     Args:
-        problem: its rows decide what is observable.
+        problem: with the rows.
         tolerance: as in `normalized_columns` and `rank_and_gap`.
 
     Warns:
@@ -204,7 +206,7 @@ def rank_and_gap(values: Array, tolerance: float = RANK_TOLERANCE) -> RankGap:
         tolerance: a value below this share of the largest counts as zero.
 
     Warns:
-        NumericalWarning: a gap below 1e3, so that another tolerance finds another rank.
+        NumericalWarning: a gap below 1e3: another tolerance gives another rank.
     """
     rank = numerical_rank(values, tolerance)
     if rank == 0:
@@ -236,9 +238,9 @@ def _null_space(kept: np.ndarray, combination: Array, free: np.ndarray, scale: A
     directions = np.zeros((len(scale), len(dropped)))
     directions[dropped, np.arange(len(dropped))] = 1.0
     directions[kept] = -combination[:, dropped]
-    hidden = np.zeros((len(dropped), len(scale)))
-    hidden[:, free] = np.linalg.qr(directions[free] / scale[free, None]).Q.T * scale[free]
-    return hidden
+    basis = np.zeros((len(dropped), len(scale)))
+    basis[:, free] = np.linalg.qr(directions[free] / scale[free, None]).Q.T * scale[free]
+    return basis
 
 
 def _term(coefficient: float, name: str) -> str:
@@ -246,13 +248,9 @@ def _term(coefficient: float, name: str) -> str:
     return f" {'-' if coefficient < 0 else '+'} {name if size == '1' else f'{size} {name}'}"
 
 
-_CHECKED = 512  # samples a state, from all over the logs: shares are then known to about 2 %
-_MOST = 0.5  # share of the samples that must have the whole base: else the median of the smallest singular value is 0
-
-
 @dataclass(frozen=True)
 class StateReport:
-    """A contact state in the logs; what concerns the base is None if it is fixed.
+    """A contact state in the logs; entries on the base are None for a fixed base.
 
     Attributes:
         name: frames in contact, joined by "+".
@@ -298,14 +296,14 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
             state_name(builder.contacts, state),
             count,
             rows[state],
-            *(_of_base(torch.cat(values[state]), torch.cat(weights[state])) if values[state] else (None, None)),
+            *(_base_statistics(torch.cat(values[state]), torch.cat(weights[state])) if values[state] else (None, None)),
         )
         for state, count in counts.most_common()
     ]
 
 
 def require_base(reports: Sequence[StateReport], on_base_lost: str = "error") -> None:
-    """Refuse logs with a contact state in which part of the base is lost, or warn.
+    """Refuse logs, or warn, with a contact state in which part of the base does not survive the projection.
 
     Args:
         reports: from `state_reports`.
@@ -320,23 +318,23 @@ def require_base(reports: Sequence[StateReport], on_base_lost: str = "error") ->
     lost = [report for report in reports if report.base_rank is not None and report.base_rank < 6]
     if not lost:
         return
-    where = "; ".join(f"{r.name} ({r.samples} samples): {_described(r)}" for r in lost[:4])
+    where = "; ".join(f"{r.name} ({r.samples} samples): {_describe_rank(r)}" for r in lost[:4])
     message = f"sensors: the base is lost, rank(S_b V_x) < 6, in contact with {where}"
     if on_base_lost == "error":
         raise BaseLostError(f"{message}; accepted: more sensors, other contacts, or sensors.on_base_lost: warn")
-    warn(f"{message}; parameters of some bodies are out of reach there", BaseLostWarning)
+    warn(f"{message}; parameters of some bodies cannot be determined there", BaseLostWarning)
 
 
-def _of_base(values: Tensor, weight: Tensor) -> tuple[int, float, float, dict[int, float]]:
-    """The entries of a report on the base, from singular values (B, 6) of samples that represent `weight` each."""
+def _base_statistics(values: Tensor, weight: Tensor) -> tuple[int, float, float, dict[int, float]]:
+    """Rank, median, share at rank 6 and shares by rank, from singular values (B, 6) of samples with weights (B,)."""
     ranks = base_rank(values)
-    share = {int(rank): float(weight[ranks == rank].sum() / weight.sum()) for rank in ranks.unique().flip(0)}
-    reached = accumulate(share.values())
-    most = next(rank for rank, so_far in zip(share, reached, strict=True) if so_far >= _MOST)
-    return most, float(values[:, -1].median()), share.get(6, 0.0), share
+    shares = {int(rank): float(weight[ranks == rank].sum() / weight.sum()) for rank in ranks.unique().flip(0)}
+    cumulative = accumulate(shares.values())
+    common_rank = next(rank for rank, so_far in zip(shares, cumulative, strict=True) if so_far >= _MOST)
+    return common_rank, float(values[:, -1].median()), shares.get(6, 0.0), shares
 
 
-def _described(report: StateReport) -> str:
-    """The rank of most samples, and the share of those that are better."""
+def _describe_rank(report: StateReport) -> str:
+    """Rank of most samples, and the share of samples with rank 6."""
     share = f", 6 in {100 * report.base_full_share:.2g} % of them" if report.base_full_share else ""
     return f"rank {report.base_rank} of 6{share}"

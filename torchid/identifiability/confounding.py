@@ -18,15 +18,15 @@ from torchid.problem.extras import Extra
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE
 
 INFLATION_LIMIT = 10.0
-"""An extra parameter whose standard error grows more than this by not knowing all others is confounded with them.
+"""An extra parameter is confounded with others if not knowing these increases its standard error by more than this.
 
 It is a variance inflation of 100, ten times what is commonly taken for serious collinearity; source: Belsley, Kuh,
 Welsch, "Regression Diagnostics", 1980.
 """
 
-_NAMED = 4  # parameters, at most, that a message names
-_CONTRADICTS = 5.0  # standard errors between readings in the air and those in contact; noise is seldom white
-_NOTICEABLE = 3.0  # standard deviations of the sensor's noise: less does not show in a single reading
+_NAMED = 4  # parameters, at most, in a message
+_CONTRADICTS = 5.0  # standard errors between readings in the air and in contact; noise is seldom white
+_NOTICEABLE = 3.0  # standard deviations of the sensor's noise: less is invisible in a single reading
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class ExtraEstimate:
     """An estimated offset, scale or actuator term.
 
     Attributes:
-        extra: which.
-        log: whose, "" of all.
+        extra: the parameter.
+        log: source of the log, "" if it is common to all.
         value: in its unit.
-        nominal_value: the one that would fit best if the bodies' parameters were the nominal ones.
-        standard_error: without regularization, infinite where the data do not determine it.
+        nominal_value: the best fit at the nominal parameters of the bodies.
+        standard_error: without regularization; infinite if the data do not determine it.
         inflation: of the standard error by not knowing all other parameters, at least 1.
         confounded_with: names of other parameters, those with most influence first; empty if it is separable.
     """
@@ -61,7 +61,7 @@ class ExtraEstimate:
 def estimate_extras(
     assembly: Assembly, estimate: Estimate, body_names: Sequence[str], rank_tolerance: float = RANK_TOLERANCE
 ) -> list[ExtraEstimate]:
-    """All extra parameters that were eliminated, at the estimated parameters of the bodies; not those that no row has.
+    """All eliminated extra parameters that some row depends on, at the estimated parameters of the bodies.
 
     Args:
         assembly: from `assemble`.
@@ -86,13 +86,13 @@ def estimate_extras(
 
 @dataclass(frozen=True)
 class Disagreement:
-    """An offset whose readings in the air contradict the rest of the data.
+    """An offset for which readings in the air and the other data disagree.
 
     Attributes:
         extra: the offset.
-        log: in which.
-        in_the_air: what the sensor reads while nothing touches, in its unit.
-        in_contact: what it would read there with the offset, and scale, that fit the rest of the data best.
+        log: source of the log.
+        in_the_air: reading of the unloaded sensor, in its unit.
+        in_contact: the same, predicted with the offset and scale that fit the other data best.
         standard_error: of the difference.
     """
 
@@ -104,21 +104,21 @@ class Disagreement:
 
     @property
     def standard_errors(self) -> float:
-        """How many of them the two are apart."""
+        """Difference of the two in standard errors."""
         return abs(self.in_the_air - self.in_contact) / self.standard_error
 
     def exceeds_noise(self, noise: Array) -> bool:
-        """Whether the two contradict each other, beside the noise (6,) of contact sensors [N, N m]."""
+        """Whether the difference is significant and exceeds the noise (6,) of contact sensors [N, N m]."""
         axis = 0 if self.extra.contact is None else self.extra.contact[1]
-        apart = abs(self.in_the_air - self.in_contact)
-        return self.standard_errors > _CONTRADICTS and apart > _NOTICEABLE * float(noise[axis])
+        difference = abs(self.in_the_air - self.in_contact)
+        return self.standard_errors > _CONTRADICTS and difference > _NOTICEABLE * float(noise[axis])
 
 
 @one_thread()
 def disagreements(
     parts: Sequence[Part], builder: RowBuilder, in_contact: Sequence[ExtraEstimate], noise: float = 1.0
 ) -> list[Disagreement]:
-    """Offsets whose readings in the air contradict all other rows, largest contradiction first.
+    """Offsets for which readings in the air and all other rows disagree, most significant first.
 
     Args:
         parts: of the logs.
@@ -128,15 +128,15 @@ def disagreements(
     """
     out = []
     for source in dict.fromkeys(part.source for part in parts if part.unloaded):
-        own = {(x.extra.what, x.extra.contact): x for x in in_contact if x.log in ("", source)}
+        estimates = {(x.extra.what, x.extra.contact): x for x in in_contact if x.log in ("", source)}
         R = merge_factors(
             (part.factor for part in parts if part.unloaded and part.source == source), builder
         ).triangle()
         for number, extra in enumerate(builder.extras, start=builder.columns.count):
-            column, offset = R[:, number].numpy(), own.get((extra.what, extra.contact))
+            column, offset = R[:, number].numpy(), estimates.get((extra.what, extra.contact))
             if extra.what == "offset" and extra.contact is not None and offset is not None and column.any():
                 weight = float(column @ column)
-                read, scale = float(column @ R[:, -1].numpy()) / weight, own.get(("scale", extra.contact))
+                read, scale = float(column @ R[:, -1].numpy()) / weight, estimates.get(("scale", extra.contact))
                 expected, variance = offset.value, offset.standard_error**2 + noise**2 / weight
                 if scale is not None:
                     expected, variance = expected / (1.0 + scale.value), variance + (read * scale.standard_error) ** 2
@@ -156,7 +156,7 @@ class TotalMass:
 
     Attributes:
         standard_error: infinite where the data do not determine it.
-        separable: whether it is not confounded with offsets and scales of sensors, as of `ExtraEstimate`.
+        separable: whether it is not confounded with offsets and scales of sensors, as in `ExtraEstimate`.
         value: the identified one.
         nominal: the URDF's.
     """
@@ -243,7 +243,7 @@ class ParameterCovariance:
     def variance_shares(self, sensitivity: Array, noise: float) -> Array:
         """Part of the variance along sensitivities (P',) due to each parameter, as a share of the largest such part.
 
-        None is taken to be off by more than its scale: else the least certain would be named, however little it weighs.
+        The prior bounds each deviation to about its scale: else the least certain parameter would dominate.
         """
         noise = max(noise, UNOBSERVABLE_SHARE**2)  # of exact data, whose variance is all due to the least certain
         rank = self.root.shape[1]
@@ -265,7 +265,7 @@ def _estimates(
     names: Sequence[str],
     shared: Elimination | None,
 ) -> list[ExtraEstimate]:
-    """The extra parameters of one elimination, at identified and nominal parameters; `shared`: those they depend on."""
+    """Estimates of one elimination at identified and nominal parameters; `shared`: that of the unknowns of all logs."""
     P = len(covariance.free)
     sensitivity, own, unobservable = (
         elimination.inverse @ elimination.C[:, :P],
@@ -279,11 +279,13 @@ def _estimates(
         unobservable.append(through @ shared.unobservable)
     G = covariance.scale_sensitivity(sensitivity)
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
-    lost = np.linalg.norm(G @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
+    undetermined_by_bodies = np.linalg.norm(G @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
     through_parameters = ((G @ covariance.root) ** 2).sum(1)
     variance = sum((x**2).sum(1) for x in own) + through_parameters
     undetermined = (
-        lost | ~elimination.determined | (np.linalg.norm(np.hstack(unobservable), axis=1) > UNOBSERVABLE_SHARE)
+        undetermined_by_bodies
+        | ~elimination.determined
+        | (np.linalg.norm(np.hstack(unobservable), axis=1) > UNOBSERVABLE_SHARE)
     )
     deviation = np.where(undetermined, np.inf, np.sqrt(variance))
     out = []
@@ -293,10 +295,10 @@ def _estimates(
         inflation = float(deviation[k] / elimination.std_if_known[k])
         confounded: tuple[str, ...] = ()
         if inflation > INFLATION_LIMIT:
-            by_bodies = lost[k] or 2.0 * through_parameters[k] > variance[k]
+            by_bodies = undetermined_by_bodies[k] or 2.0 * through_parameters[k] > variance[k]
             confounded = _largest(covariance.variance_shares(G[k], noise), names) if by_bodies else ()
-            hidden_others = np.where(np.arange(len(elimination.extras)) == k, 0.0, elimination.unobservable[k])
-            others = _largest(hidden_others, _labels(elimination))
+            unobservable_others = np.where(np.arange(len(elimination.extras)) == k, 0.0, elimination.unobservable[k])
+            others = _largest(unobservable_others, [extra.label for extra in elimination.extras])
             confounded = (*confounded, *others)
         error = noise * float(deviation[k]) if np.isfinite(deviation[k]) else np.inf
         value, nominal = (float(x[k]) for x in values)
@@ -314,12 +316,8 @@ def _estimates(
     return out
 
 
-def _labels(elimination: Elimination) -> list[str]:
-    return [extra.label for extra in elimination.extras]
-
-
 def _largest(along: Array, names: Sequence[str]) -> tuple[str, ...]:
-    """Names of the largest components of a direction, none that is small beside them."""
+    """Names of the largest components of a direction, without relatively small ones."""
     order = np.argsort(-np.abs(along))[:_NAMED]
     least = max(0.2 * np.abs(along).max(initial=0.0), UNOBSERVABLE_SHARE)
     return tuple(names[k] for k in order if np.abs(along[k]) > least)

@@ -1,4 +1,4 @@
-"""Contributions of each log, contact state and sensor: the information that is lost without it."""
+"""Contributions of each log, contact state and sensor: the information lost without it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from torchid.rounding import RANK_TOLERANCE, numerical_rank
 
 @dataclass(frozen=True)
 class Contribution:
-    """Bits and combinations, as in `InformationGain`, that are lost without a part of the data."""
+    """Bits and determined combinations, as in `InformationGain`, that are lost without a part of the data."""
 
     name: str
     bits: float
@@ -37,7 +37,7 @@ class Contribution:
 
 @dataclass(frozen=True)
 class PartContribution(Contribution):
-    """Of a log or a contact state: its samples, the rank of its rows alone, and how far that of all falls without."""
+    """Of a log or a contact state: its samples, the rank of its rows, and the rank that all lose without it."""
 
     samples: int
     rank: int
@@ -80,13 +80,15 @@ def contributions(
         parts: of the logs.
         logs: bound logs.
         builder: of their rows.
-        problem: of all parts; only its scales and what is free matter.
+        problem: of all parts, for its scales and free parameters.
         dof_names: of the robot.
         rank_tolerance: as in `LeastSquares`.
-        done: called with the number of samples worked through.
+        done: called with the number of samples processed.
     """
     directions = prior_directions(builder, problem.scale * problem.free)
-    nuisance = NuisanceColumns.of(builder, directions)
+    first = directions.shape[1] - len(builder.extras)  # nuisance parameters are last
+    of_log = [first + number for number, extra in enumerate(builder.extras) if extra.per_log]
+    nuisance = NuisanceColumns(of_log, list(range(first, directions.shape[1] - len(of_log))))
     data = ScaledParts(parts, directions, nuisance)
     by_log = leave_one_out(data, [part.source for part in parts], rank_tolerance)
     by_state = leave_one_out(data, [state_name(builder.contacts, part.state) for part in parts], rank_tolerance)
@@ -98,26 +100,17 @@ def contributions(
 
 @dataclass(frozen=True)
 class NuisanceColumns:
-    """Places of the columns of nuisance parameters: offsets, scales and actuator terms.
+    """Columns of nuisance parameters: offsets, scales and actuator terms.
 
-    Attributes:
-        of_log: among scaled columns, those that each log has anew.
-        of_all: those that all logs have in common, among the columns without `of_log`.
+    `of_log`: indices of those that differ between logs; `of_all`: of the common ones, after `of_log` are removed.
     """
 
     of_log: list[int]
     of_all: list[int]
 
-    @classmethod
-    def of(cls, builder: RowBuilder, directions: Array) -> NuisanceColumns:
-        """Of the columns `directions`, as `prior_directions` has them, the nuisance parameters last."""
-        first = directions.shape[1] - len(builder.extras)
-        own = [first + number for number, extra in enumerate(builder.extras) if extra.per_log]
-        return cls(own, list(range(first, directions.shape[1] - len(own))))
-
 
 class ScaledParts:
-    """Parts of logs, and X of each with `X^T X` its information in scaled columns, correlated noise counted."""
+    """Parts of logs with factors X: `X^T X` is a part's information in scaled columns, for correlated noise."""
 
     def __init__(self, parts: Sequence[Part], directions: Array, nuisance: NuisanceColumns) -> None:
         self.parts, self.nuisance = parts, nuisance
@@ -130,10 +123,10 @@ class ScaledParts:
         by_source: dict[str, list[Array]] = {}
         for i in chosen:
             by_source.setdefault(self.parts[i].source if self.nuisance.of_log else "", []).append(self._factors[i])
-        nothing = np.empty((0, self._factors[0].shape[1] - len(self.nuisance.of_log)))
+        empty = np.empty((0, self._factors[0].shape[1] - len(self.nuisance.of_log)))
         logs = (triangular_factor(np.concatenate(same)) for same in by_source.values())
         of_sources = (eliminate_columns(X, self.nuisance.of_log) for X in logs)
-        return triangular_factor(np.concatenate([nothing, *of_sources]))
+        return triangular_factor(np.concatenate([empty, *of_sources]))
 
     @cached_property
     def everything(self) -> Array:
@@ -142,70 +135,48 @@ class ScaledParts:
 
     def singular_values(self, X: Array) -> Array:
         """Of X of several logs with nuisance parameters eliminated, descending."""
-        return np.asarray(
-            np.linalg.svd(eliminate_columns(triangular_factor(X), self.nuisance.of_all), compute_uv=False)
-        )
+        reduced = eliminate_columns(triangular_factor(X), self.nuisance.of_all)
+        return np.asarray(np.linalg.svd(reduced, compute_uv=False))
 
 
 def leave_one_out(data: ScaledParts, names: Sequence[str], rank_tolerance: float) -> list[PartContribution]:
-    """The contribution of the parts of each name: what is lost without them.
+    """Contribution of the parts of each name, by the `names` of all parts; `rank_tolerance` as in `LeastSquares`."""
 
-    Args:
-        data: all parts.
-        names: of each.
-        rank_tolerance: as in `LeastSquares`.
-    """
+    def rank(values: Array) -> int:
+        return numerical_rank(values, rank_tolerance, values.shape)
+
     groups = {name: [i for i, other in enumerate(names) if other == name] for name in dict.fromkeys(names)}
     factors = [data.together(chosen) for chosen in groups.values()]
     everything, out = data.everything, []
-    for (name, chosen), factor, others in zip(
-        groups.items(), factors, _information_of_others(data, groups, factors), strict=True
-    ):
-        rest = data.singular_values(others)
-        lost = InformationGain.of(everything**2) - InformationGain.of(rest**2)
-        rank = _rank(data.singular_values(factor), rank_tolerance)
-        rank_lost = _rank(everything, rank_tolerance) - _rank(rest, rank_tolerance)
-        samples = sum(data.parts[i].samples for i in chosen)
-        out.append(
-            PartContribution(
-                name=name,
-                bits=lost.bits,
-                determined=lost.determined,
-                samples=samples,
-                rank=rank,
-                rank_lost=rank_lost,
-            )
-        )
+    for name, factor, others in zip(groups, factors, _factors_of_others(data, groups, factors), strict=True):
+        without = data.singular_values(others)
+        lost = InformationGain.of(everything**2) - InformationGain.of(without**2)
+        samples, own_rank = sum(data.parts[i].samples for i in groups[name]), rank(data.singular_values(factor))
+        rank_lost = rank(everything) - rank(without)
+        out.append(PartContribution(name, lost.bits, lost.determined, samples, own_rank, rank_lost))
     return out
 
 
-def _information_of_others(
-    data: ScaledParts, groups: dict[str, list[int]], factors: Sequence[Array]
-) -> Iterator[Array]:
-    """X of all parts but those of each group."""
+def _factors_of_others(data: ScaledParts, groups: dict[str, list[int]], factors: Sequence[Array]) -> Iterator[Array]:
+    """X of all parts except those of each group."""
     logs = [{data.parts[i].source for i in chosen} for chosen in groups.values()]
     if not data.nuisance.of_log or sum(map(len, logs)) == len(set().union(*logs)):
         yield from _without_each(factors)
         return
-    for chosen in groups.values():  # groups share logs, and so their nuisance parameters
+    for chosen in groups.values():  # groups share logs and their nuisance parameters
         yield data.together([i for i in range(len(data.parts)) if i not in set(chosen)])
 
 
 def _without_each(factors: Sequence[Array]) -> Iterator[Array]:
-    """For every factor, one of all others, from those of the ones before and after it: no pair is merged twice."""
-    nothing = factors[0][:0]
-    after = [nothing]
+    """For each factor one of all others, merged from those before and those after it."""
+    empty = factors[0][:0]
+    after = [empty]
     for factor in reversed(factors[1:]):
         after.append(triangular_factor(np.concatenate([factor, after[-1]])))
-    before = nothing
+    before = empty
     for factor in factors:
         yield np.concatenate([before, after.pop()])
         before = triangular_factor(np.concatenate([before, factor]))
-
-
-def _rank(values: Array, tolerance: float) -> int:
-    """As `LeastSquares` counts it."""
-    return numerical_rank(values, tolerance, values.shape)
 
 
 def _sensor_information(
@@ -215,7 +186,7 @@ def _sensor_information(
     nuisance: NuisanceColumns,
     done: ProgressCallback | None,
 ) -> SensorInformation:
-    """As `sensor_information` has it, in scaled columns, without the nuisance parameters of each log."""
+    """`sensor_information` in scaled columns, without the nuisance parameters of each log."""
 
     def scaled(H: Array) -> Array:
         return np.asarray(directions.T @ H @ directions)
@@ -229,19 +200,19 @@ def _sensor_information(
 
 
 def _sensors(information: SensorInformation, builder: RowBuilder, dof_names: Sequence[str]) -> list[SensorContribution]:
-    everything, out = _gain(information.total), []
-    frames = [contact.frame for contact in builder.contacts]
+    """Contributions of all sensors, largest first."""
+
+    def gain(H: Array) -> InformationGain:
+        return InformationGain.of(np.asarray(np.linalg.eigvalsh(H)))
+
+    everything, out = gain(information.total), []
     limbs = [name.rpartition(".")[0] for name in dof_names[builder.tree.n :: 6]]
     for kind, names, lost in (
         ("joint torque", dof_names, information.torques),
         ("wrench in a limb", limbs, information.limbs),
-        ("contact wrench", frames, information.wrenches),
+        ("contact wrench", [contact.frame for contact in builder.contacts], information.wrenches),
     ):
         for index, H in lost.items():
-            gone = everything - _gain(information.total - H)
-            out.append(SensorContribution(names[index], gone.bits, gone.determined, kind))
+            difference = everything - gain(information.total - H)
+            out.append(SensorContribution(names[index], difference.bits, difference.determined, kind))
     return sorted(out, key=lambda sensor: -sensor.bits)
-
-
-def _gain(H: Array) -> InformationGain:
-    return InformationGain.of(np.asarray(np.linalg.eigvalsh(H)))

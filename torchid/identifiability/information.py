@@ -1,4 +1,4 @@
-"""How much is known of the parameters, what of it hangs on each sensor, and what errors are to be expected."""
+"""Information about the parameters, the part due to each sensor, and expected errors of predicted forces."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 
 DEPENDENT = 1e-9
-"""A direction that moves the whitened rows by less than this share of its size does so by rounding."""
+"""A direction that changes the whitened rows by less than this share of its size does so by rounding."""
 
 SAMPLES = 2000
-"""Number of samples, about, whose rows represent those of all."""
+"""Approximate number of samples whose rows represent those of all."""
 
 _CHUNK = 256  # samples whose rows are computed together
+_ERROR_SAMPLES = 400  # per contact state, for expected errors
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ class InformationGain:
 class SensorInformation:
     """Information (columns, columns) of all sensors together, and the part of it that is lost without each.
 
-    `torques`: by place among the robot's joints; `limbs`: by place among its force/torque sensors in limbs, and
-    `wrenches`: by contact, each with all its measured components.
+    `torques`: by index of the joint; `limbs`: by index of the force/torque sensor in a limb; `wrenches`: by index of
+    the contact. Each sensor counts with all its measured components.
     """
 
     total: Array
@@ -93,7 +94,7 @@ def sensor_information(
     Args:
         logs: bound logs.
         builder: of their rows.
-        most: samples, about, that represent all.
+        most: approximate number of samples that represent all.
         done: called with the number of samples worked through.
     """
     n, base = builder.tree.n, builder.tree.base_rows
@@ -116,7 +117,7 @@ def sensor_information(
         for index, limb in enumerate(limbs, start=1 + len(joints)):
             C = units[(base + n + 6 * limb + np.flatnonzero(in_limbs[limb])).tolist()]
             total[index] += rows_information(_span(C.expand(len(samples), *C.shape), W) @ K, weight)
-        for contact, H in _air_information(builder, samples, count):
+        for contact, H in _unloaded_information(builder, samples, count):
             total[0] += weight * H
             total[first + contacts.index(contact)] += weight * H
         if any(state[contact] for contact in contacts):
@@ -137,7 +138,7 @@ def sensor_information(
 
 
 def add_information(parts: Sequence[SensorInformation]) -> SensorInformation:
-    """Of logs together that have no unknown in common but the columns."""
+    """Sum over logs whose only common unknowns are the columns."""
 
     def added(matrices: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
         return {index: np.asarray(sum(one[index] for one in matrices)) for index in matrices[0]}
@@ -161,11 +162,11 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
 
 
 def marginal_information(H: Array, unknown: Sequence[int], size: Array) -> Array:
-    """Information about the other columns where some are unknown: the Schur complement, as `elimination.without`.
+    """Information about the other columns where some are unknown: the Schur complement, as `eliminate_columns` on rows.
 
     Args:
         H: (N, N), X^T X.
-        unknown: places of M columns.
+        unknown: indices of M columns.
         size: (M,), squared norms of these; what is below the share `KINEMATIC_TOLERANCE` of them is rounding.
     """
     if not unknown:
@@ -187,8 +188,8 @@ def rows_information(rows: Tensor, weight: float) -> Tensor:
 def reading_directions(ways: Tensor, W: Tensor) -> Tensor:
     """Rows `ways W`, (B, c, nv), of norm 1, or zero where they are rounding.
 
-    A sensor that enters the generalized force of a sample by `way^T` times its reading contributes what the whitened
-    rows `W^T K` hold along `W^T way^T`: without it, `W W^T` loses that and no more.
+    A sensor that enters the generalized force of a sample by `way^T` times its reading contributes the part of the
+    whitened rows `W^T K` along `W^T way^T`: without it `W W^T` loses just that part.
 
     Args:
         ways: (B, c, n_rows) or (c, n_rows).
@@ -205,8 +206,8 @@ def triangular_factor(X: Array) -> Array:
     return np.asarray(np.linalg.qr(X, mode="r"))
 
 
-def _air_information(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
-    """Contacts, and the information (count, count) that their readings in the air hold on offsets."""
+def _unloaded_information(builder: RowBuilder, samples: Samples, count: int) -> Iterator[tuple[int, Tensor]]:
+    """Contacts, and the information (count, count) of their readings in the air about offsets."""
     for channel in unloaded_offset_equations(builder, samples):
         if not channel.gated and (index := builder.extras[channel.offset].contact):
             columns, row = channel.row(builder)
@@ -230,15 +231,12 @@ def _span(C: Tensor, W: Tensor) -> Tensor:
     return Vh * (values > least[:, None])[..., None]
 
 
-_SAMPLES = 400  # a contact state
-
-
 @dataclass(frozen=True)
 class ExpectedErrors:
-    """Rms by group of rows: of the model's own error, and of what it is compared with.
+    """Rms by group of rows, of the model's error and of the error of the measured forces.
 
-    The latter is the noise of torque and contact sensors, and on the base rows that of the differentiated motion,
-    `SensorNoise.base`.
+    The latter is the noise of torque and contact sensors and, on the base rows, that of the differentiated motion
+    (`SensorNoise.base_force`, `base_moment`).
     """
 
     model: dict[str, float | None]
@@ -262,12 +260,12 @@ def expected_errors(
         builder: of an `Evaluation`.
         logs: whose motion the forces are predicted on.
         directions: (M, 12 L), independent errors of the parameters, as `error_directions` gives them.
-        noise: of the sensors that recorded these logs, with its floors of the base rows.
+        noise: of the sensors that recorded these logs, and of the base rows.
     """
     columns = torch.from_numpy(triangular_factor(directions @ builder.columns.parameter_map().T)).to(builder.device)
     base, nv = builder.tree.base_rows, builder.tree.base_rows + len(builder.columns.joint_rows)
     model, sensors = ForceSums(nv), ForceSums(nv)
-    for samples, state, weight in subsample_states(logs, _SAMPLES):
+    for samples, state, weight in subsample_states(logs, _ERROR_SAMPLES):
         samples = samples.to(builder.device)
         terms = builder.dynamics(samples)
         predicted = torch.stack([predict_forces(builder, terms, phi).T for phi in columns])
@@ -277,9 +275,9 @@ def expected_errors(
             (model, predicted, predicted),
             (sensors, torch.cat([rows, through_contacts]), rows),
         ):
-            sums.rows.add(_together(errors), weight)
+            sums.rows.add(_root_sum_of_squares(errors), weight)
             for inside in null_space_components(builder, samples, state, without_contacts):
-                sums.projected.add(_together(inside).flatten()[:, None], weight)
+                sums.projected.add(_root_sum_of_squares(inside).flatten()[:, None], weight)
     errors_rms = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
     return ExpectedErrors(*({group: finite_or_none(rms[group]) for group in ROW_GROUPS} for rms in errors_rms))
 
@@ -295,8 +293,8 @@ def error_directions(
     """Independent errors of least squares with a ridge, (M, P): their outer products sum up to the error's covariance.
 
     Along each right singular vector of the scaled problem, with singular value s and r = ridge * rows, the noise of the
-    rows enters by s / (s^2 + r) and the error of the nominal parameters stays by r / (s^2 + r); along directions that
-    no row depends on it stays in full. This is exact for white noise and independent nominal errors of one size.
+    rows enters with s / (s^2 + r) and the error of the nominal parameters with r / (s^2 + r), or 1 along directions
+    that no row depends on. This is exact for white noise and independent nominal errors of one size.
 
     Args:
         problem: of the training logs.
@@ -319,26 +317,26 @@ def error_directions(
     return directions
 
 
-def _together(errors: Tensor) -> Tensor:
+def _root_sum_of_squares(errors: Tensor) -> Tensor:
     """Standard deviation of the sum of independent errors, (M, B, r) to (B, r)."""
     return errors.square().sum(0).sqrt()
 
 
 def _row_noise(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Tensor:
-    """Forces (n_rows, B, n_rows) of one standard deviation of each base row's floor and each torque sensor."""
+    """Generalized forces (n_rows, B, n_rows) of one standard deviation of each base row and each torque sensor."""
     n, base = builder.tree.n_dofs, builder.tree.base_rows
     std = np.append(noise.base_std[:base], noise.dof_std(builder.tree.n, n))
     rows = torch.diag(samples.time.new_tensor(std))[:, None].expand(-1, len(samples), -1)
-    axes = builder.noise_axes(samples.rotation_world_base) if noise.base_axes_differ else None
+    axes = builder.noise_axes(samples.base.rotation) if noise.base_axes_differ else None
     if axes is None:
         return rows
     force, moment, rest = rows.split([3, 3, len(std) - 6], dim=2)
-    turned = [(axes @ part.permute(1, 2, 0)).permute(2, 0, 1) for part in (force, moment)]
-    return torch.cat([*turned, rest], dim=2)
+    rotated = [(axes @ part.permute(1, 2, 0)).permute(2, 0, 1) for part in (force, moment)]
+    return torch.cat([*rotated, rest], dim=2)
 
 
 def _wrench_noise(builder: RowBuilder, samples: Samples, state: ContactState, noise: SensorNoise) -> Tensor:
-    """Generalized forces that one standard deviation of each contact sensor makes, (6 C, B, n_rows)."""
+    """Generalized forces (6 C, B, n_rows) of one standard deviation of each contact sensor."""
     std = samples.time.new_zeros(len(builder.contacts), 6)
     for contact, active in enumerate(state):
         if active:

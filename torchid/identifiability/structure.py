@@ -1,4 +1,4 @@
-"""The linear problem of all motions that contact states allow: what sensors could determine at best."""
+"""The linear problem of all motions that contact states allow: an upper bound of what sensors determine."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact, SensorSet
 
-_ANGLE, _STROKE = 1.5, 0.3  # [rad], [m] either way
-_SAMPLES_PER_COLUMN = 2  # in every state: a sample gives one row or more, and some directions are rarely excited
+_ANGLE, _STROKE = 1.5, 0.3  # largest joint position [rad], [m]
+_SAMPLES_PER_COLUMN = 2  # per state: a sample gives at least one row, and some directions are rarely excited
 _WEIGHTLESS = (0.0, 0.0, 0.0)
-_AT_REST = 1e-10  # a projected velocity below this share of what was drawn is rounding, and has no sign
+_AT_REST = 1e-10  # a projected velocity below this share of the drawn one is rounding and has no sign
 
 
 def structural_problem(
@@ -35,9 +35,9 @@ def structural_problem(
     friction: bool = True,
     samples: Sequence[Samples] | None = None,
 ) -> LinearProblem:
-    """The parameters that sensors determine if the robot may move in any way that some contact states allow.
+    """The linear problem of random motions in some contact states; its right-hand side is 0.
 
-    Its rank bounds that of any log from above. The right-hand side is 0: nothing is to be fitted.
+    Its rank is an upper bound of that of any log.
 
     Args:
         robot: the robot.
@@ -55,7 +55,7 @@ def structural_problem(
 def structural_samples(
     robot: Robot, contacts: Sequence[Contact], states: Sequence[ContactState], count: int | None = None, seed: int = 0
 ) -> list[Samples]:
-    """Random samples, see `standing_samples`, of every contact state; they serve any sensor set.
+    """Random samples, see `standing_samples`, of every contact state, for any sensor set.
 
     Args:
         robot: the robot.
@@ -72,10 +72,10 @@ def structural_samples(
 def standing_samples(
     robot: Robot, contacts: Sequence[Contact], state: ContactState, count: int, rng: np.random.Generator
 ) -> Samples:
-    """Random samples that honour a contact state; forces are zeros.
+    """Random samples that satisfy the constraints of a contact state; forces are zeros.
 
-    Positions are free: each sample stands on a ground of its own, every foot on any slope. What such samples determine
-    bounds from above what one footing does.
+    Positions are unconstrained: the ground differs between samples, with any slope under every foot. The rank is an
+    upper bound of that on one ground.
 
     Args:
         robot: the robot.
@@ -107,15 +107,15 @@ def standing_states(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Coordinates q, v, a, as `Regressor` takes them, with `J_C v = 0` and `J_C a + dJ_C/dt v = 0`.
 
-    J_C has the rows of the components that active contacts can exert: a point contact holds its frame's origin, a flat
-    one the whole frame, a line all but the rotation about itself. Twice as many states are drawn, and those nearest to
-    a singular J_C left out: there, accelerations grow without bound.
+    J_C has the rows of the components that active contacts can exert: a point contact fixes its frame's origin, a flat
+    one the whole frame, a line contact all but the rotation about itself. Twice as many states are drawn, and those
+    nearest to a singular J_C are dropped: accelerations are unbounded there.
     """
-    q, v, a = _drawn(robot, 2 * count, rng)
-    held = [contact for contact, active in zip(contacts, state, strict=True) if active]
-    rows = [FrameJacobian(robot, contact.frame)(q)[:, list(contact.components), : robot.nv] for contact in held]
+    q, v, a = _random_states(robot, 2 * count, rng)
+    constrained = [contact for contact, active in zip(contacts, state, strict=True) if active]
+    rows = [FrameJacobian(robot, contact.frame)(q)[:, list(contact.components), : robot.nv] for contact in constrained]
     J = torch.cat([q.new_zeros(len(q), 0, robot.nv), *rows], dim=1)
-    if not held:
+    if not constrained:
         return q[:count], v[:count], a[:count]
     values = torch.linalg.svdvals(J)
     regular = values > KINEMATIC_TOLERANCE * values[:, :1]
@@ -125,7 +125,7 @@ def standing_states(
     inverse = torch.linalg.pinv(J, rtol=KINEMATIC_TOLERANCE)
     v = _in_null_space(v, inverse, J)
     v = torch.where(v.abs() < _AT_REST, 0.0, v)
-    drift = _drift(robot, held, q, v)
+    drift = _drift(robot, constrained, q, v)
     return q, v, _in_null_space(a, inverse, J) - (inverse @ drift[..., None])[..., 0]
 
 
@@ -155,13 +155,13 @@ def random_postures(robot: Robot, count: int, rng: np.random.Generator) -> Array
 
 
 def _in_null_space(x: Tensor, inverse: Tensor, J: Tensor) -> Tensor:
-    """The part of x, (B, nv), in the null space of J; the second pass takes the rounding of the first."""
+    """The part of x, (B, nv), in the null space of J; the second pass removes the rounding of the first."""
     for _ in range(2):
         x = x - (inverse @ (J @ x[..., None]))[..., 0]
     return x
 
 
-def _drawn(robot: Robot, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
+def _random_states(robot: Robot, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor]:
     q = random_postures(robot, count, rng)
     v, a = rng.normal(size=(count, robot.nv)), 3.0 * rng.normal(size=(count, robot.nv))
     if not robot.fixed_base:
@@ -169,13 +169,13 @@ def _drawn(robot: Robot, count: int, rng: np.random.Generator) -> tuple[Tensor, 
     return torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(a)
 
 
-def _drift(robot: Robot, held: Sequence[Contact], q: Tensor, v: Tensor) -> Tensor:
-    """dJ_C/dt v, (B, k): what the held components would accelerate by with a = 0, in the contacts' own axes."""
+def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -> Tensor:
+    """dJ_C/dt v, (B, k): accelerations of the constrained components at a = 0, along the contacts' axes."""
     tree = KinematicTree(robot)
     motion = motion_from_state(q, v, torch.zeros_like(v), robot.n, robot.fixed_base, _WEIGHTLESS)
     states = body_states(tree, motion, joint_motion(tree, motion))
     rows = []
-    for contact in held:
+    for contact in constrained:
         node, T_joint_frame = tree.frame(robot, contact.frame)
         rows.append(_acceleration(states, node, v.new_tensor(T_joint_frame))[list(contact.components)])
     return torch.cat(rows).T

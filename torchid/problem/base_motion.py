@@ -1,4 +1,4 @@
-"""How the base moves: from its pose, or from an IMU anywhere on it."""
+"""Motion of the base: from its pose, or from an IMU anywhere on it."""
 
 from __future__ import annotations
 
@@ -51,8 +51,10 @@ class BaseMotion:
         """The base's motion in generalized coordinates as `Regressor` takes them; empty for a bolted base."""
         if fixed_base:
             return cls()
-        found = motion_from_state(q, v, a, q.shape[1] - 7)
-        return cls(q[:, 3:7], found.base_specific_force, found.base_angular_velocity, found.base_angular_acceleration)
+        motion = motion_from_state(q, v, a, q.shape[1] - 7)
+        return cls(
+            q[:, 3:7], motion.base_specific_force, motion.base_angular_velocity, motion.base_angular_acceleration
+        )
 
     def map(self, function: Callable[[Tensor], Tensor]) -> BaseMotion:
         """The same motion with a function applied to every tensor."""
@@ -67,9 +69,9 @@ class BaseMotion:
 def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
     """Axes of the levelled base in the base frame, (N, 3, 3), as columns.
 
-    The base is turned by the smallest rotation that makes vertical the axis which is nearest to it: a base that tilts
-    takes its horizontal axes along, and none of their noise into the vertical one. Which axis is nearest may change
-    where a base lies at 45 degrees; the turn is at most 55 degrees, so that it is always defined.
+    The smallest rotation makes the base axis nearest to the vertical exactly vertical, so that tilting mixes no noise
+    of the horizontal axes into the vertical one. The nearest axis may change where the base is tilted by 45 degrees;
+    the rotation is at most 55 degrees and thus always defined.
 
     Args:
         rotation_world_base: (N, 3, 3), base to world.
@@ -79,19 +81,19 @@ def levelled_base_axes(rotation_world_base: Tensor) -> Tensor:
     nearest = torch.zeros_like(up).scatter(1, index, up.gather(1, index).sign())
     x, y, z = torch.linalg.cross(nearest, up).unbind(1)
     zero = torch.zeros_like(x)
-    turn = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).unflatten(1, (3, 3))
     cosine = (nearest * up).sum(1)[:, None, None]
-    return torch.eye(3, dtype=up.dtype, device=up.device) + turn + turn @ turn / (1.0 + cosine)
+    return torch.eye(3, dtype=up.dtype, device=up.device) + cross + cross @ cross / (1.0 + cosine)
 
 
 def base_motion(log: Log, robot: Robot) -> BaseMotion:
-    """How the base moves in a preprocessed log; of a bolted base, how it is mounted.
+    """Motion of the base in a preprocessed log; for a bolted base only its orientation.
 
-    An IMU is taken where the log has one: what it reads is what the dynamics depend on, without differentiation. The
-    orientation is kept beside it, for wrenches along world axes.
+    An IMU is preferred: the dynamics depend on just what it measures, without differentiation. The orientation is kept
+    for wrenches along world axes.
 
     Raises:
-        LogError: neither the base's motion nor an IMU's readings, or an IMU that is not on the base.
+        LogError: neither the base's motion nor IMU readings, or an IMU that is not on the base.
         UnknownNameError: an IMU frame that the robot does not have.
     """
     quat = None if log.base_quat_xyzw is None else torch.from_numpy(log.base_quat_xyzw)
@@ -108,29 +110,29 @@ def base_motion(log: Log, robot: Robot) -> BaseMotion:
     return BaseMotion(quat, (rotation_matrix(quat).mT @ force[..., None])[..., 0], omega, alpha)
 
 
-def _on_base(robot: Robot) -> list[str]:
-    """Frames that do not move in the base, whatever sensors are in between."""
-    still = [0]
+def _links_on_base(robot: Robot) -> list[str]:
+    """Links fixed to the base, also through force/torque sensors."""
+    fixed = [0]
     for index, body in enumerate(robot.bodies):  # parents come first
-        if body.joint is not None and body.joint.kind == "fixed" and body.parent in still:
-            still.append(index)
-    return [name for index in still for name in robot.bodies[index].links]
+        if body.joint is not None and body.joint.kind == "fixed" and body.parent in fixed:
+            fixed.append(index)
+    return [name for index in fixed for name in robot.bodies[index].links]
 
 
 def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
-    """The base's motion from that of a frame that is rigidly on it: rigid-body kinematics with the lever arm."""
+    """Motion of the base from that of an IMU fixed to it: rigid-body kinematics with the lever arm."""
     if log.imu_frame not in robot.links:
-        raise UnknownNameError(log.source, "imu_frame", log.imu_frame, _on_base(robot))
+        raise UnknownNameError(log.source, "imu_frame", log.imu_frame, _links_on_base(robot))
     body, T_base_imu = robot.links[log.imu_frame]
     while (joint := robot.bodies[body].joint) is not None and joint.kind == "fixed":  # a sensor's weld does not move
         body, T_base_imu = joint.parent, joint.T_parent_joint @ joint.T_joint_link @ T_base_imu
     if body != 0:
         found = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
-        raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(_on_base(robot)[:8])}")
+        raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(_links_on_base(robot)[:8])}")
     for name in _IMU_FIELDS:
         if getattr(log, name) is None:
             raise LogError(log.source, name, "missing", f"{name}, or a log passed through preprocess()")
-    turn, arm = Rotation.from_matrix(T_base_imu[:3, :3]), T_base_imu[:3, 3]
-    force, omega, alpha = (turn.apply(getattr(log, name)) for name in _IMU_FIELDS)
+    rotation, arm = Rotation.from_matrix(T_base_imu[:3, :3]), T_base_imu[:3, 3]
+    force, omega, alpha = (rotation.apply(getattr(log, name)) for name in _IMU_FIELDS)
     at_origin: Array = force - np.cross(alpha, arm) - np.cross(omega, np.cross(omega, arm))
     return BaseMotion(quat, *map(torch.from_numpy, (at_origin, omega, alpha)))

@@ -14,8 +14,8 @@ from torchid.problem.predict import predict_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
-_CHUNK = 1024  # samples whose rows are computed together: a batch alone would lose to dispatch
-_MEMORY = 2**30  # bytes of rows that are kept from epoch to epoch
+_CHUNK = 1024  # samples whose rows are computed together: a single batch would lose to dispatch
+_MEMORY = 2**30  # [bytes] of rows that are cached from epoch to epoch
 
 
 @dataclass(frozen=True)
@@ -58,21 +58,21 @@ class Batch:
 class MiniBatches:
     """Mini-batches of some logs.
 
-    Samples are dealt out at random, once, to chunks whose rows are computed together and kept if there is memory. An
-    epoch takes the chunks, and the samples within each, in a new order that depends on the seed and its number alone.
+    Samples are assigned at random, once, to chunks whose rows are computed together and cached if memory allows. Every
+    epoch shuffles the chunks and the samples within each; the order depends only on the seed and the epoch's number.
     """
 
     def __init__(
         self, logs: Sequence[Samples], builder: RowBuilder, batch_size: int = 256, seed: int = 0, memory: int = _MEMORY
     ) -> None:
-        """Deal the samples out.
+        """Assign the samples to chunks.
 
         Args:
             logs: bound logs.
-            builder: of the rows; where it is, the batches are.
+            builder: of the rows; batches are on its device.
             batch_size: samples per batch; the last of a chunk may hold fewer.
             seed: of all random orders.
-            memory: bytes of rows to keep; what does not fit is computed anew each epoch.
+            memory: bytes of rows to cache; the others are computed again in each epoch.
         """
         if batch_size < 1:
             raise ValueError(f"batch_size: found {batch_size}; accepted: at least 1")
@@ -85,8 +85,8 @@ class MiniBatches:
         self._starts = torch.tensor([0, *(len(log) for log in logs)]).cumsum(0).tolist()
         chunk = max(_CHUNK // batch_size, 1) * batch_size
         self._chunks = torch.randperm(self.samples, generator=self._generator(0)).split(chunk)
-        self._kept: dict[int, Batch] = {}
-        self._left = memory
+        self._cache: dict[int, Batch] = {}
+        self._memory_left = memory
 
     def split_blocks(self, count: int) -> list[MiniBatches]:
         """Mini-batches of about `count` blocks of successive samples, each of one log, at least one of every log."""
@@ -121,7 +121,7 @@ class MiniBatches:
                 yield rows[part]
 
     def chunks(self) -> Iterator[Batch]:
-        """All samples, chunk by chunk, always the same."""
+        """All samples, chunk by chunk, always in the same order."""
         return (self._rows(chunk) for chunk in range(len(self._chunks)))
 
     @torch.no_grad()
@@ -137,16 +137,16 @@ class MiniBatches:
         return torch.Generator().manual_seed((self.seed * 1_000_003 + number) % 2**63)
 
     def _rows(self, chunk: int) -> Batch:
-        if chunk in self._kept:
-            return self._kept[chunk]
-        batch = self._computed(self._chunks[chunk])
-        if batch.nbytes <= self._left:
-            self._left -= batch.nbytes
-            self._kept[chunk] = batch
+        if chunk in self._cache:
+            return self._cache[chunk]
+        batch = self._compute_rows(self._chunks[chunk])
+        if batch.nbytes <= self._memory_left:
+            self._memory_left -= batch.nbytes
+            self._cache[chunk] = batch
         return batch
 
     @torch.no_grad()
-    def _computed(self, index: Tensor) -> Batch:
+    def _compute_rows(self, index: Tensor) -> Batch:
         parts = []
         with one_thread():
             for log, start, end in zip(self._logs, self._starts, self._starts[1:], strict=False):

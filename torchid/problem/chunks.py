@@ -1,4 +1,4 @@
-"""Logs in chunks of samples that share a contact state, and workers of one thread each that go over them."""
+"""Logs in chunks of samples that share a contact state, and single-threaded workers that process them."""
 
 from __future__ import annotations
 
@@ -51,9 +51,6 @@ def map_chunks(
         builder.layout(state)
     lock = threading.Lock()
 
-    def run(part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]]) -> Result:
-        return reduce(pieces(part))
-
     def pieces(
         part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]],
     ) -> Iterator[tuple[Samples, ContactState]]:
@@ -64,7 +61,7 @@ def map_chunks(
                 with lock:
                     progress(len(piece))
 
-    return run_in_workers(tasks, run, threads or worker_count(builder.device))
+    return run_in_workers(tasks, lambda part: reduce(pieces(part)), threads or worker_count(builder.device))
 
 
 def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[ContactState, slice | torch.Tensor]]:
@@ -72,24 +69,24 @@ def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[Cont
     active = samples.active.cpu().numpy()
     packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
     keys = packed.view(f"V{packed.shape[1]}")[:, 0]
-    found, first = np.unique(keys, return_index=True)
-    for key, example in zip(found, first, strict=True):
-        if len(found) == 1:
+    unique_keys, first = np.unique(keys, return_index=True)
+    for key, sample in zip(unique_keys, first, strict=True):
+        if len(unique_keys) == 1:
             pieces: Iterable[slice | torch.Tensor] = (slice(i, i + chunk) for i in range(0, len(active), chunk))
         else:
             pieces = torch.from_numpy(np.flatnonzero(keys == key)).split(chunk)
         for piece in pieces:
-            yield tuple(active[example].tolist()), piece
+            yield tuple(active[sample].tolist()), piece
 
 
 def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samples, ContactState, float]]:
-    """About `count` samples of every contact state, evenly spread over the logs, and how many each represents."""
-    found: dict[ContactState, list[tuple[Samples, torch.Tensor]]] = {}
+    """About `count` evenly spaced samples of every contact state, and the number of samples that each represents."""
+    pieces_by_state: dict[ContactState, list[tuple[Samples, torch.Tensor]]] = {}
     for samples in logs:
         every = torch.arange(len(samples))
         for state, index in chunks_by_state(samples):
-            found.setdefault(state, []).append((samples, every[index]))
-    for state, pieces in found.items():
+            pieces_by_state.setdefault(state, []).append((samples, every[index]))
+    for state, pieces in pieces_by_state.items():
         total = sum(len(index) for _, index in pieces)
         for samples, index in pieces:
             share = min(len(index), max(1, round(count * len(index) / total)))
@@ -103,7 +100,7 @@ def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result
     """
     stop = threading.Event()
 
-    def alone(first: int) -> Result:
+    def work(first: int) -> Result:
         torch.set_num_threads(1)
         with torch.no_grad(), stopping():
             return run(task for task in tasks[first::workers] if not stop.is_set())
@@ -118,13 +115,13 @@ def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result
 
     with one_thread():
         if workers == 1:
-            return [alone(0)]
+            return [work(0)]
         with ThreadPoolExecutor(workers) as pool, stopping():
-            return list(pool.map(alone, range(workers)))
+            return list(pool.map(work, range(workers)))
 
 
 def worker_count(device: torch.device) -> int:
-    """Workers that suit a device: one per thread torch would use on a CPU, one for a GPU."""
+    """Default number of workers: on a CPU one per thread that torch would use, on a GPU one."""
     return torch.get_num_threads() if device.type == "cpu" else 1
 
 

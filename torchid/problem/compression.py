@@ -21,27 +21,28 @@ from torchid.problem.samples import Samples
 from torchid.robot import Robot
 
 FOLDS = 5
-"""Blocks that all training samples are cut into: each fit takes four fifths, and five fits are cheap."""
+"""Number of cross-validation folds of the training samples."""
 
-_LEAST = 20  # independent samples a block: what neighbours share through a filter is a small part of that
-_MEMORY = 2**30  # bytes of factors
-_FEWEST, _BATCHES = 16, 8  # readings that make an equation, and in how many their slow changes show
-_ZEROS = 0.01  # share of readings that are exactly 0 from which on something else than a sensor has written them,
-_ONE_SIDED = 0.05  # unless both signs are at least this frequent: then 0 is one step of a coarse sensor among others
+_LEAST_PER_FOLD = 20  # independent samples per fold: the filter correlates only a small part of these with neighbours
+_MEMORY = 2**30  # [bytes] of factors
+_LEAST_READINGS = 16  # readings for one equation
+_BATCHES = 8  # batches of successive readings, whose means show drift
+_MASKED_SHARE = 0.01  # readings are masked or clamped, not measured, if more than this share is exactly 0 ...
+_ONE_SIDED = 0.05  # ... and less than this share has one of the signs (else 0 is one step of a coarse sensor)
 _OUTLYING = 4.0  # standard deviations; of Gaussian readings 6e-5 are dropped
 _NORMAL = 0.6745  # median of |x| of standard normal x
 RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
-"""Weighted rows from the samples that they come from, their columns, and themselves."""
+"""Weighted rows, from samples, columns and rows."""
 
 _Key = tuple[str, ContactState, int, bool]
 
 
 @dataclass
 class Part:
-    """What is kept of the samples of one log, by its source, in one contact state and one fold.
+    """Compressed rows of one log (named by `source`) in one contact state and one fold.
 
-    Equations of sensors whose contact is in the air are in a part of their own, `unloaded`, which counts no samples;
-    `gated`: numbers, among the extras, of the offsets that have none because the readings there are exactly 0.
+    Equations of unloaded contact sensors are in parts of their own, `unloaded`, which count no samples. `gated`:
+    indices of extras that are offsets without such an equation, because their readings in the air are masked.
     """
 
     source: str
@@ -75,8 +76,8 @@ def compress_by_state(
     progress: ProgressCallback | None = None,
 ) -> dict[ContactState, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
-    found = map_chunks(logs, builder, partial(_fold, builder, by_log=False), chunk, threads, progress)
-    return {part.state: part.factor for part in _merge_parts(found)}
+    parts = map_chunks(logs, builder, partial(_compress_chunks, builder, by_log=False), chunk, threads, progress)
+    return {part.state: part.factor for part in _merge_parts(parts)}
 
 
 def compress_parts(
@@ -89,22 +90,22 @@ def compress_parts(
 ) -> list[Part]:
     """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
 
-    Logs of one source count as one. Unknown offsets of contact sensors have further parts: readings in the air.
+    Logs of one source count as one. Unknown offsets of contact sensors have further parts, of readings in the air.
     `weight_rows` weights all other rows before they are added.
     """
-    fold = partial(_fold, builder, by_log=True, weight_rows=weight_rows)
-    parts = _merge_parts(map_chunks(logs, builder, fold, chunk, threads, progress))
+    reduce = partial(_compress_chunks, builder, by_log=True, weight_rows=weight_rows)
+    parts = _merge_parts(map_chunks(logs, builder, reduce, chunk, threads, progress))
     order = list(dict.fromkeys(samples.source for samples in logs))
     return sorted(parts, key=lambda part: order.index(part.source))
 
 
-def _fold(
+def _compress_chunks(
     builder: RowBuilder,
     chunks: Iterator[tuple[Samples, ContactState]],
     by_log: bool,
     weight_rows: RowWeighting | None = None,
 ) -> list[Part]:
-    """Compress some chunks into parts, of all logs together unless `by_log`."""
+    """Compress chunks into parts: one per log, contact state and fold, or one per contact state unless `by_log`."""
     parts: dict[_Key, Part] = {}
     workspace = Workspace()
 
@@ -113,17 +114,17 @@ def _fold(
         return parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
 
     for samples, state in chunks:
-        own = part(samples, state, False)
-        own.samples += len(samples)
+        loaded = part(samples, state, False)
+        loaded.samples += len(samples)
         for support, rows in builder.rows(samples, state, workspace):
             weighted = rows if weight_rows is None else weight_rows(samples, support, rows)
-            own.factor.add(support, weighted, samples.oversampling)
+            loaded.factor.add(support, weighted, samples.oversampling)
         for channel in unloaded_offset_equations(builder, samples):
-            of_air = part(samples, state, True)
+            unloaded = part(samples, state, True)
             if channel.gated:
-                of_air.gated.add(channel.offset)
+                unloaded.gated.add(channel.offset)
             else:
-                of_air.factor.add(*channel.row(builder), samples.oversampling)
+                unloaded.factor.add(*channel.row(builder), samples.oversampling)
     return list(parts.values())
 
 
@@ -156,7 +157,7 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     Which parameters are free is decided by `free_parameters`.
 
     Raises:
-        ValueError: the builder has unknowns beside these parameters, which take `assemble`.
+        ValueError: the builder has extra parameters; `assemble` eliminates them.
     """
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
@@ -192,7 +193,7 @@ def problem_from_triangle(
 def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
     """Parameters that can be fitted, (12 L,) bool.
 
-    Not among them: inertial parameters of massless bodies, friction of welds, and any friction if not `friction`.
+    All but inertial parameters of massless bodies, friction of welds, and any friction if not `friction`.
     """
     free = np.ones(robot.nominal.shape, dtype=bool)
     free[[body.massless for body in robot.bodies], parameters.INERTIAL] = False
@@ -202,50 +203,50 @@ def free_parameters(robot: Robot, friction: bool = True) -> np.ndarray:
 
 
 def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
-    """The logs in order, cut into blocks contiguous in time, with the fold of each.
+    """The logs, in order, cut into blocks contiguous in time, with the fold of each.
 
-    Errors of successive samples are correlated, so that samples drawn at random would test a fit on its training data.
-    A log is cut in proportion to its share of all samples; where there are many, whole logs are held out. There are
-    fewer folds, or a single one, if the samples or the memory for their factors are too few.
+    Errors of successive samples are correlated: samples drawn at random would test a fit on its training data. A log is
+    cut in proportion to its share of all samples; where there are many, whole logs are held out. Folds are fewer, down
+    to a single one, if there are too few samples or too little memory for their factors.
 
     Args:
         logs: bound logs.
         builder: of their rows.
     """
-    total, count = sum(map(len, logs)), _count(logs, builder)
-    out, before = [], 0
+    total, count = sum(map(len, logs)), _fold_count(logs, builder)
+    out, preceding = [], 0
     for log in logs:
         blocks = max(1, round(count * len(log) / max(total, 1)))
         ends = [len(log) * k // blocks for k in range(blocks + 1)]
         for start, end in zip(ends, ends[1:], strict=False):
-            middle = before + (start + end) / 2
+            middle = preceding + (start + end) / 2
             fold = min(int(count * middle / max(total, 1)), count - 1)
             out.append(replace(log if blocks == 1 else log[start:end], fold=fold))
-        before += len(log)
-    found = sorted({block.fold for block in out})  # rounding may have left one empty
-    return [replace(block, fold=found.index(block.fold)) for block in out]
+        preceding += len(log)
+    used = sorted({block.fold for block in out})  # rounding may leave a fold empty
+    return [replace(block, fold=used.index(block.fold)) for block in out]
 
 
-def _count(logs: Sequence[Samples], builder: RowBuilder) -> int:
+def _fold_count(logs: Sequence[Samples], builder: RowBuilder) -> int:
     independent = sum(len(log) / log.oversampling for log in logs)
     states: set[tuple[str, ContactState]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
     size = 8 * (builder.width + 1) ** 2 * max(len(states), 1) * worker_count(builder.device)
-    return max(1, min(FOLDS, int(independent / _LEAST), _MEMORY // size))
+    return max(1, min(FOLDS, int(independent / _LEAST_PER_FOLD), _MEMORY // size))
 
 
 @one_thread()
 def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
     """Parts with the contact states of each log and fold merged; offset equations of unloaded sensors stay apart."""
-    return _folded(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
+    return _merge_by_key(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
 
 
 @one_thread()
 def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
     """Parts with the folds of each log and contact state merged; offset equations of unloaded sensors stay apart."""
-    return _folded(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
+    return _merge_by_key(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
 
 
-def _folded(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
+def _merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
     """One part for each key, with the contact state and fold of the first."""
     out: dict[tuple[object, ...], Part] = {}
     for part, key in zip(parts, keys, strict=True):
@@ -259,17 +260,17 @@ def _folded(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: 
 
 @dataclass(frozen=True)
 class UnloadedOffsetEquation:
-    """The equation that readings of an unloaded contact sensor give for its unknown offset.
+    """The equation for a contact sensor's unknown offset from its readings while the contact is in the air.
 
-    A sensor whose contact is in the air reads its offset and the weight of what hangs on it.
+    The sensor then reads its offset and the weight of the parts beyond it.
 
     Attributes:
         offset: its number among the extras.
         scale: number of the channel's unknown scale, None if that is known.
-        gated: whether readings in the air are exactly 0, as masked, clamped or missing ones are: no equation.
+        gated: whether the readings are masked, clamped or missing (exactly 0), so that there is no equation.
         mean: of the readings, without outliers [N, N m].
-        deviation: standard deviation of the mean, that of independent readings with the stated noise, or more if they
-            scatter more, one by one or over longer spans of time.
+        deviation: standard deviation of the mean [N, N m]: that of independent readings with the stated noise, or more
+            if they or their means over longer spans of time scatter more.
     """
 
     offset: int
@@ -281,7 +282,7 @@ class UnloadedOffsetEquation:
     def row(self, builder: RowBuilder) -> tuple[tuple[int, ...], Tensor]:
         """The whitened equation `o - (s - 1) mean = mean` as a block of one row: its columns, and (1, columns + 1).
 
-        The scale's column holds the mean, for the noise of single readings would bias the scale towards 0.
+        The scale's column holds the mean: the noise of single readings would bias the scale towards 0.
         """
         first, row = builder.columns.count, [1.0, self.mean]
         columns: tuple[int, ...] = (first + self.offset,)
@@ -303,24 +304,24 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
         contact, axis = extra.contact
         y = samples.unloaded[:, contact, axis]
         y = y[torch.isfinite(y)]
-        if len(y) < _FEWEST:
+        if len(y) < _LEAST_READINGS:
             continue
-        if _gated(y):
+        if _is_masked(y):
             yield UnloadedOffsetEquation(number, None, gated=True)
         else:
-            mean, deviation = _mean(y, noise[axis], samples.oversampling)
+            mean, deviation = _robust_mean(y, noise[axis], samples.oversampling)
             yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)
 
 
-def _gated(y: Tensor) -> bool:
+def _is_masked(y: Tensor) -> bool:
     above, below = ((y > 0.0).double().mean(), (y < 0.0).double().mean())
-    return bool(1.0 - above - below > _ZEROS and min(above, below) < _ONE_SIDED)
+    return bool(1.0 - above - below > _MASKED_SHARE and min(above, below) < _ONE_SIDED)
 
 
-def _mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
-    """Mean of readings (M,) in their order, without outliers, and its standard deviation before oversampling."""
-    away = (y - y.median()).abs()
-    y = y[away <= _OUTLYING * max(float(away.median()) / _NORMAL, noise)]
+def _robust_mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
+    """Mean of successive readings (M,) without outliers, and its standard deviation without oversampling."""
+    deviation = (y - y.median()).abs()
+    y = y[deviation <= _OUTLYING * max(float(deviation.median()) / _NORMAL, noise)]
     batches = y[: len(y) // _BATCHES * _BATCHES].view(_BATCHES, -1).mean(1)
     scatter = max(float(y.var()) / len(y), float(batches.var()) / _BATCHES) / oversampling
     return float(y.mean()), max(noise**2 / len(y), scatter) ** 0.5

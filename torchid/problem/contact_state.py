@@ -1,4 +1,4 @@
-"""Columns of the rows, and what is constant in a contact state: which of them, which joints and wrenches take part."""
+"""Columns of the rows, and the layout of a contact state: its columns, coupled joints and wrench directions."""
 
 from __future__ import annotations
 
@@ -30,18 +30,17 @@ def state_name(contacts: Sequence[Contact], state: ContactState) -> str:
 
 
 class Columns:
-    """Columns of the rows: those of `reduced_layout`, then two friction columns for each of the L - 1 joints."""
+    """Columns of the rows: those of `reduced_layout`, then two friction columns for each of the L - 1 joints.
+
+    `count`: their number, without the right-hand side.
+    """
 
     def __init__(self, tree: KinematicTree) -> None:
         """Lay out the columns of a robot."""
         self.tree = tree
         self.layout = reduced_layout(tree)
         self.joint_rows: list[JointRow] = joint_rows(tree, self.layout)
-
-    @property
-    def count(self) -> int:
-        """Number of columns, without the right-hand side."""
-        return self.layout.count + 2 * (self.tree.n_nodes - 1)
+        self.count = self.layout.count + 2 * (tree.n_nodes - 1)
 
     def friction(self, body: int) -> int:
         """The first of the two friction columns of a body's joint."""
@@ -86,20 +85,20 @@ class ContactBody:
 
 @dataclass(frozen=True)
 class ContactStateLayout:
-    """What is constant in a contact state: which bodies, joints and columns take part in its rows.
+    """The bodies, joints and columns of a contact state's rows, which are the same for all its samples.
 
     Measured joints between the base and a contact are coupled: the projection combines their rows with those of the
-    base. All others are uncoupled: each of them is an equation of its own.
+    base. All others are uncoupled: each is an equation of its own.
 
     Attributes:
         contact_bodies: bodies in contact.
         coupled_joints, uncoupled_joints: indices of independent joints.
         moved: nodes that coupled joints move directly, ascending, with the joint's index among the coupled ones and the
             ratio of its motion.
-        nodes: on whose parameters coupled rows depend, by the columns `inertial` and `friction`.
+        nodes: whose parameters coupled rows depend on, in the columns `inertial` and `friction`.
         row_std: noise of the base rows and coupled joints [N, N m].
         wrench_std: noise of the measured components, body by body [N, N m].
-        extras: columns of unknowns beside the bodies' parameters.
+        extras: columns of extra parameters.
     """
 
     contact_bodies: tuple[ContactBody, ...]
@@ -120,7 +119,7 @@ class ContactStateLayout:
 
 
 class ContactStateLayouts:
-    """Makes the layouts of one robot with its contacts and sensors."""
+    """Layouts of a robot's contact states, with its contacts and sensors."""
 
     def __init__(
         self,
@@ -138,19 +137,12 @@ class ContactStateLayouts:
         self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
-        self._made: dict[ContactState, ContactStateLayout] = {}
+        self._cache: dict[ContactState, ContactStateLayout] = {}
 
     def layout(self, state: ContactState) -> ContactStateLayout:
-        """The layout of a contact state, worked out when it is first needed."""
-        if state not in self._made:
-            self._made[state] = self._lay_out(state)
-        return self._made[state]
-
-    def forget(self) -> None:
-        """Drop all layouts: the robot's constants have moved to another device or precision."""
-        self._made.clear()
-
-    def _lay_out(self, state: ContactState) -> ContactStateLayout:
+        """The layout of a contact state, cached."""
+        if state in self._cache:
+            return self._cache[state]
         touching: dict[int, list[int]] = {}
         for contact, active in enumerate(state):
             if active:
@@ -166,7 +158,7 @@ class ContactStateLayouts:
         )
         nodes_below, starts = self._nodes_below([body for body, _, _ in moved]), self.columns.layout.starts
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
-        return ContactStateLayout(
+        self._cache[state] = ContactStateLayout(
             bodies,
             coupled,
             tuple(joint for joint in measured if joint not in moving),
@@ -182,6 +174,11 @@ class ContactStateLayouts:
                 if extra.dof in coupled or (extra.contact is not None and state[extra.contact[0]])
             ),
         )
+        return self._cache[state]
+
+    def clear(self) -> None:
+        """Drop all layouts, when the robot's constants move to another device or precision."""
+        self._cache.clear()
 
     def _nodes_below(self, moved: list[int]) -> range:
         """Hull of the subtrees of some nodes; with a floating base, all nodes."""
@@ -212,7 +209,7 @@ class ContactStateLayouts:
 
 
 def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
-    """What one unit of an unknown of a degree of freedom adds to its row, (B,)."""
+    """Column of a degree of freedom's extra parameter in its row, (B,)."""
     if extra.dof is None:
         raise ValueError(f"extra: found {extra.label}; accepted: one of a degree of freedom")
     if extra.what == "scale":
@@ -226,7 +223,7 @@ def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Ten
 
 
 def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
-    """What one unit of a contact sensor's unknown subtracts from its reading along a recorded axis, (B,)."""
+    """Column of a contact sensor's extra parameter, subtracted from its reading along a recorded axis, (B,)."""
     if extra.what == "offset":
         return samples.active[:, contact].to(samples.time) if samples.share is None else samples.share[:, contact]
     reading = samples.wrench
@@ -242,10 +239,10 @@ def extra_columns(
     W: Tensor,
     rotations: dict[int, Tensor],
 ) -> Iterator[Tensor]:
-    """Columns of some unknowns in coupled rows, (r, B) each.
+    """Columns of extra parameters in coupled rows, (r, B) each.
 
     Args:
-        extras: which.
+        extras: the parameters.
         samples: B of one contact state and rank.
         layout: of that state.
         tree: of the robot.
@@ -253,7 +250,7 @@ def extra_columns(
         W: (B, base rows + coupled joints, r), the basis.
         rotations: by contact, (B, 3, 3) from its frame to the recorded axes where these are the world's.
     """
-    through = (measured @ W).permute(1, 2, 0)  # how each measured component enters the rows
+    projected = (measured @ W).permute(1, 2, 0)  # rows per unit of each measured component
     components = [component for body in layout.contact_bodies for component in body.components]
     for extra in extras:
         if extra.dof is not None:
@@ -265,6 +262,6 @@ def extra_columns(
         vector = range(3) if axis < 3 else range(3, 6)
         for k in vector if contact in rotations else [axis]:
             if (contact, k) in components:
-                turned = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
-                column = column + through[components.index((contact, k))] * turned
+                along = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
+                column = column + projected[components.index((contact, k))] * along
         yield column

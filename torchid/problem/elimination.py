@@ -1,4 +1,4 @@
-"""Problems with unknowns beside the bodies' parameters, which are eliminated before estimators get the problem."""
+"""Elimination of extra parameters (sensor offsets and scales, actuator terms) from the linear problem."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ class Elimination:
 
 @dataclass(frozen=True)
 class Assembly:
-    """The problem for estimators, and what has been eliminated from it: log by log, the unknowns of all logs last.
+    """The problem in the bodies' parameters, and the eliminations: log by log, then of the unknowns of all logs.
 
-    `if_known`: the problem there would be if all that has been eliminated were known to be 0.
+    `if_known`: the same problem if all eliminated unknowns were known to be 0.
     """
 
     problem: LinearProblem
@@ -59,20 +59,21 @@ class Assembly:
     if_known: LinearProblem
 
     def extras_at(self, phi: Array) -> list[Array]:
-        """Values of the eliminated unknowns that fit the rows best at parameters (12 L,), for each elimination."""
-        of_all = [found.inverse @ (found.z - found.C @ phi) for found in self.eliminations if not found.log]
+        """Values of the eliminated unknowns, for each elimination, that fit the rows best at parameters (12 L,)."""
+        of_all = [x.inverse @ (x.z - x.C @ phi) for x in self.eliminations if not x.log]
         remaining = np.concatenate([phi, *of_all])
         return [x.inverse @ (x.z - x.C @ (remaining if x.log else phi)) for x in self.eliminations]
 
 
 @one_thread()
 def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction: bool = True) -> Assembly:
-    """The problem that parts of logs pose together in the bodies' parameters.
+    """The linear problem of all parts in the bodies' parameters.
 
-    Unknowns of a log, then those of all logs, are eliminated by orthogonal projection, which leaves the least-squares
-    solution, and the noise of the rows, as they are.
+    Orthogonal projection eliminates first the unknowns of each log, then those of all logs. It changes neither the
+    least-squares solution nor the noise of the rows.
     """
-    factors = {source: [part.factor for part in parts if part.source == source] for source in _sources(parts)}
+    sources = dict.fromkeys(part.source for part in parts)
+    factors = {source: [part.factor for part in parts if part.source == source] for source in sources}
     everything = merge_factors((part.factor for part in parts), builder)
     if not builder.extras:
         problem = linear_problem(everything, builder, robot, friction)
@@ -106,41 +107,37 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     return Assembly(problem, tuple(eliminations), if_known)
 
 
-def _sources(parts: Sequence[Part]) -> list[str]:
-    return list(dict.fromkeys(part.source for part in parts))
-
-
 def _eliminate(
     log: str, extras: tuple[Extra, ...], columns: Array, rest: Array, builder: RowBuilder, sizes: Array
 ) -> tuple[Elimination, Array]:
-    """The unknowns of some columns, (R, M), and the rows of the rest, (R, ...), right-hand side last, without them.
+    """Eliminate the unknowns of some columns, (R, M), from the rows of the others, (R, ...), right-hand side last.
 
     `sizes`: (M,), norms of the columns before anything was eliminated.
     """
     present = is_significant(sizes)
     scale = np.where(present, sizes, 1.0)
-    U, values, V, remaining = _split(np.where(present, columns / scale, 0.0), rest)
+    U, values, V, remaining = _project_off(np.where(present, columns / scale, 0.0), rest)
     top, count = U.T @ rest, builder.columns.count
     C = np.hstack([top[:, :count] @ builder.columns.parameter_map(), top[:, count:-1]])
     std_if_known = np.where(present, 1.0 / scale, np.inf)
     unobservable = np.eye(len(extras)) - V @ V.T
-    found = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], std_if_known, unobservable)
-    return found, remaining
+    elimination = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], std_if_known, unobservable)
+    return elimination, remaining
 
 
 def eliminate_columns(X: Array, unknown: Sequence[int]) -> Array:
-    """Rows of the other columns of X, (R, N), from which the unknowns of some columns are eliminated."""
+    """Rows of X, (R, N), in its other columns, after the unknowns of some columns have been eliminated."""
     if not unknown:
         return X
     columns = X[:, list(unknown)]
     size = np.linalg.norm(columns, axis=0)
-    return _split(columns / np.where(size > 0.0, size, 1.0), np.delete(X, unknown, axis=1))[-1]
+    return _project_off(columns / np.where(size > 0.0, size, 1.0), np.delete(X, unknown, axis=1))[-1]
 
 
-def _split(columns: Array, rest: Array) -> tuple[Array, Array, Array, Array]:
-    """U, singular values and V of what columns of norm 1 or 0 span, and the rows of the rest that they do not reach."""
+def _project_off(columns: Array, rest: Array) -> tuple[Array, Array, Array, Array]:
+    """U, singular values and V of columns of norm 1 or 0, and the other columns projected off their span."""
     U, values, Vt = np.linalg.svd(columns, full_matrices=True)
     rank = int((values > RANK_TOLERANCE).sum())
-    left = U[:, rank:].T @ rest
-    left[:, np.linalg.norm(left, axis=0) < RANK_TOLERANCE * np.linalg.norm(rest, axis=0)] = 0.0  # nothing but rounding
-    return U[:, :rank], values[:rank], Vt[:rank].T, left
+    projected = U[:, rank:].T @ rest
+    projected[:, np.linalg.norm(projected, axis=0) < RANK_TOLERANCE * np.linalg.norm(rest, axis=0)] = 0.0  # rounding
+    return U[:, :rank], values[:rank], Vt[:rank].T, projected

@@ -1,4 +1,4 @@
-"""Unknowns beside the bodies' parameters: offsets and scales of the measured components, and what actuators add."""
+"""Extra parameters beside those of the bodies: offsets and scales of sensors, and actuator terms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_m
 """Kinds of sensor channels, as `SensorNoise` has them."""
 
 ACTUATORS = ("armature", "torque_offset", "asymmetric_coulomb")
-"""What belongs to the joints rather than to the sensors."""
+"""Extra parameters of joints rather than sensors."""
 
 _UNITS = dict(zip(CHANNELS, ("N m", "N", "N m", "N", "N m"), strict=True))
 _SIZES = dict(zip(CHANNELS, (5.0, 50.0, 5.0, 50.0, 5.0), strict=True))
@@ -23,7 +23,7 @@ _SIZES = dict(zip(CHANNELS, (5.0, 50.0, 5.0, 50.0, 5.0), strict=True))
 
 @dataclass(frozen=True)
 class ExtraTerms:
-    """Which unknowns there are, none by default.
+    """Which extra parameters are fitted; none by default.
 
     A reading y of a sensor with an offset o and a scale s means the force s y - o. `offsets` and `scales` say for
     some of `CHANNELS` whether they are constant over a "log" or over "all" logs.
@@ -43,7 +43,7 @@ class ExtraTerms:
 
 @dataclass(frozen=True)
 class Extra:
-    """One unknown.
+    """One extra parameter.
 
     Attributes:
         what: "offset", "scale" (less 1), "armature", "torque_offset" or "asymmetric_coulomb".
@@ -66,29 +66,29 @@ class Extra:
 
     @property
     def label(self) -> str:
-        """In words, and no two alike: "offset of l_sole fz", "offset of limb sensor l_ankle fz"."""
+        """A unique name: "offset of l_sole fz", "offset of limb sensor l_ankle fz"."""
         limb = "limb sensor " if self.component and self.dof is not None else ""  # a link may have its joint's name
         channel = f"{limb}{self.name} {self.component}".strip()
         return f"{self.what.replace('_', ' ').replace('coulomb', 'Coulomb friction')} of {channel}"
 
 
 def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, terms: ExtraTerms) -> tuple[Extra, ...]:
-    """All unknowns of a robot with its sensors, those of sensors first.
+    """All extra parameters of a robot with its sensors, those of sensors first.
 
     Where a log has wrenches along world axes, an offset is constant along these, so that every axis has one as soon as
     one component of the vector is measured.
     """
-    found: list[Extra] = []
+    extras: list[Extra] = []
     for what, scopes in (("offset", terms.offsets), ("scale", terms.scales)):
         for channel, name, component, dof, contact in _channels(robot, contacts, sensors):
             if channel in scopes:
                 unit, size = (_UNITS[channel], _SIZES[channel]) if what == "offset" else ("1", 0.1)
-                found.append(Extra(what, name, component, unit, size, scopes[channel] == "log", dof, contact))
+                extras.append(Extra(what, name, component, unit, size, scopes[channel] == "log", dof, contact))
     measured = np.flatnonzero(sensors.torque[: robot.n]).tolist()
     for what, unit, size in zip(ACTUATORS, ("kg m^2", "N m", "N m"), (0.1, 5.0, 1.0), strict=True):
         if getattr(terms, what):
-            found += [Extra(what, robot.joint_names[dof], "", unit, size, False, dof) for dof in measured]
-    return tuple(found)
+            extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, dof) for dof in measured]
+    return tuple(extras)
 
 
 def measured_channels(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ def measured_channels(robot: Robot, contacts: Sequence[Contact], sensors: Sensor
 def _channels(
     robot: Robot, contacts: Sequence[Contact], sensors: SensorSet
 ) -> Iterator[tuple[str, str, str, int | None, tuple[int, int] | None]]:
-    """Kind, name, component and index of every channel that is read."""
+    """Kind, name, component and index of every measured channel."""
     for dof in np.flatnonzero(sensors.torque).tolist():
         name, _, component = (
             robot.dof_names[dof].rpartition(".") if dof >= robot.n else (robot.joint_names[dof], "", "")
@@ -121,7 +121,7 @@ def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.n
 
 
 def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
-    """Recorded components (C, 6) that the measured ones are computed from: along world axes, whole vectors."""
+    """Recorded components (C, 6) from which the measured ones are computed: whole vectors if along world axes."""
     measured = measured_components(contacts, sensors)
     if not in_world:
         return measured

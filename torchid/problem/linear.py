@@ -18,7 +18,7 @@ class LinearProblem:
 
     Attributes:
         A: (R, P) with R at most the number of independent columns; b: (R,).
-        residual: what no phi can explain, the squared norm left of the right-hand side.
+        residual: squared norm of the part of the right-hand side that no phi can explain.
         rows: number of scalar equations that went in.
         nominal: (P,), the prior parameters.
         scale: (P,), > 0, the size a deviation of each parameter is measured in.
@@ -37,7 +37,7 @@ class LinearProblem:
     oversampling: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check that the shapes belong together and that every number is one."""
+        """Check shapes, and that all numbers are finite."""
         rows, columns = self.A.shape
         shapes = (self.b.shape, self.nominal.shape, self.scale.shape, self.free.shape)
         if shapes != ((rows,), (columns,), (columns,), (columns,)):
@@ -56,7 +56,7 @@ class LinearProblem:
         """Bodies whose inertial parameters are free, (L',) int, where the parameters are those of bodies.
 
         Raises:
-            ValueError: of some body only a part is free.
+            ValueError: a body has both free and fixed inertial parameters.
         """
         inertial = self.free.reshape(-1, parameters.PER_BODY)[:, parameters.INERTIAL]
         if (inertial.any(axis=1) != inertial.all(axis=1)).any():
@@ -69,19 +69,19 @@ class LinearProblem:
         return float(misfit @ misfit + self.residual)
 
     def fraction(self, share: float) -> LinearProblem:
-        """An estimate of the problem of a share of the rows, whose information is that share of all rows'."""
+        """The problem scaled to a share of its rows: that share of its information."""
         root = float(np.sqrt(share))
         rows = max(round(share * self.rows), 1)
         return replace(self, A=root * self.A, b=root * self.b, residual=share * self.residual, rows=rows)
 
     def prediction_distance(self, phi: Array, other: Array) -> float:
         """Rms difference of the projected whitened forces that two parameter vectors, (P,), predict."""
-        away = self.A @ (phi - other)
-        return float(np.sqrt(away @ away / max(self.rows, 1)))
+        difference = self.A @ (phi - other)
+        return float(np.sqrt(difference @ difference / max(self.rows, 1)))
 
 
 def parameter_scale(nominal: Array) -> Array:
-    """Size of a plausible deviation of each parameter, (L, 12): the unit of regularization towards nominal parameters.
+    """Size of a plausible deviation of each parameter, (L, 12): its unit in the prior.
 
     Mass m of the body; first moments m r; inertias m r^2, with r the body's radius of gyration about its link origin;
     friction 1 N m and 1 N m s/rad.
@@ -101,10 +101,9 @@ def parameter_scale(nominal: Array) -> Array:
 class TriangularFactor:
     """R with `R^T R = X^T X` for all rows X added so far, right-hand side as the last column.
 
-    Rows that are zero outside a few columns are kept in a block of their own with just these columns. Memory is of the
-    order of the columns squared, whatever the number of rows, and Householder factorizations keep the full accuracy of
-    the rows (a Gram matrix would square the condition number). Factors of parts of the data merge into the factor of
-    all of it.
+    Rows that are zero outside a few columns are factorized in a block with just these columns. Memory grows with the
+    square of the columns, not with the rows. Householder factorizations keep the full accuracy of the rows (a Gram
+    matrix would square the condition number). Factors of parts of the data merge into the factor of all of it.
     """
 
     def __init__(self, columns: int) -> None:
@@ -126,7 +125,7 @@ class TriangularFactor:
         Args:
             support: the columns in which they are not zero.
             rows: (M, len(support) + 1), right-hand side last.
-            oversampling: of them that noise makes one independent row, at least 1.
+            oversampling: rows per independent row, at least 1.
         """
         self.rows += rows.shape[0]
         self.independent_rows += rows.shape[0] / oversampling
@@ -146,7 +145,7 @@ class TriangularFactor:
             self._absorb(support, block)
 
     def scaled(self, factor: float) -> TriangularFactor:
-        """The factor of the same rows, larger by a factor."""
+        """The factor of the same rows times a number."""
         out = TriangularFactor(self.columns)
         out.rows, out.independent_rows = self.rows, self.independent_rows
         out._blocks = {support: factor * block for support, block in self._blocks.items()}

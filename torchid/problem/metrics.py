@@ -31,10 +31,10 @@ ROW_GROUPS = {
 """Groups of rows that errors are given for, with a name and unit to show."""
 
 ERROR_GROUPS = ROW_GROUPS | {WHITENED: "whitened [x noise]"}
-"""Those, and the whitened projected residual of a fit's own rows, which there is with any sensors."""
+"""Those, and the whitened projected residual of a fit's rows, which every sensor set has."""
 
 LIMB_GROUPS = {"ft_force": "force in limbs [N]", "ft_moment": "moment in limbs [N m]"}
-"""Readings of force/torque sensors in limbs, of robots that have some."""
+"""Groups of readings of force/torque sensors in limbs."""
 
 SETS = ("train", "test")
 """Sets of logs that errors are given for."""
@@ -43,16 +43,16 @@ BASE_ROWS = tuple(f"base {kind} {axis}" for kind in ("force", "moment") for axis
 """Names of the six base rows."""
 
 DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", WHITENED)
-"""Groups of rows that decide; what is projected without whitening repeats them."""
+"""Groups of rows by which parameters are compared with the nominal ones."""
 
 ADVICE = (
     "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge (auto "
     "chooses one), or record more and other motion"
 )
-"""What to do about it."""
+"""Advice for parameters that predict worse than the nominal ones."""
 
-_CLEARLY = 1.05  # ratio of errors: what is closer is as good
-_MATTERS = 1e-3  # share of the measured: two models that leave less, as on data without noise, are equally good
+_CLEARLY = 1.05  # ratio of errors above which one is worse
+_MATTERS = 1e-3  # of the measured rms: smaller differences, as on data without noise, do not count
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Evaluation:
     def __init__(
         self, robot: Robot, contacts: Sequence[Contact], device: str = "cpu", terms: ExtraTerms | None = None
     ) -> None:
-        """Fix robot, contacts and what actuators add; sensors do not matter, whatever a log has is used."""
+        """Set robot, contacts and actuator terms; all recorded sensors of a log are used."""
         actuators = replace(terms or ExtraTerms(), offsets={}, scales={})
         self.robot = robot
         sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
@@ -112,23 +112,23 @@ class Evaluation:
     def force_sums(
         self, logs: Sequence[Samples], phi: Array, progress: ProgressCallback | None = None
     ) -> list[ForceSums]:
-        """Of the measured forces, then of the errors of each row of `phi`."""
+        """Sums of squares of the measured forces, then of the errors of each row of `phi`."""
         builder = self.builder
         columns = builder.to_columns(phi)
 
-        def fold(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
+        def sum_chunks(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
-                found = measured_and_predicted_forces(builder, samples, state, columns)
-                for total, predicted in zip(sums, (torch.zeros_like(found.torque), *found.predicted), strict=True):
-                    total.rows.add(predicted - found.measured)
-                vectors = torch.cat([found.torque[None], found.predicted - found.torque])
+                forces = measured_and_predicted_forces(builder, samples, state, columns)
+                for total, predicted in zip(sums, (torch.zeros_like(forces.torque), *forces.predicted), strict=True):
+                    total.rows.add(predicted - forces.measured)
+                vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])
                 for group in null_space_components(builder, samples, state, vectors):
                     for total, inside in zip(sums, group, strict=True):
                         total.projected.add(inside.flatten()[:, None])
             return sums
 
-        parts = map_chunks(logs, builder, fold, progress=progress)
+        parts = map_chunks(logs, builder, sum_chunks, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
     def summarize(self, measured: ForceSums, errors: ForceSums) -> Metrics:
@@ -156,7 +156,7 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
     Args:
         sets: nominal and identified metrics by name of the logs.
     """
-    found = []
+    worse = []
     for logs, (nominal, identified) in sets.items():
         for group in DECISIVE_GROUPS:
             before, after = nominal.rms.get(group), identified.rms.get(group)
@@ -165,8 +165,8 @@ def worse_than_nominal(sets: Mapping[str, tuple[Metrics, Metrics]]) -> list[Wors
             share = identified.relative.get(group)
             measured = after / share if share else 0.0
             if after > _CLEARLY * before and after - before > _MATTERS * measured:
-                found.append(WorseThanNominal(logs, group, before, after))
-    return found
+                worse.append(WorseThanNominal(logs, group, before, after))
+    return worse
 
 
 @dataclass(frozen=True)
@@ -182,11 +182,11 @@ class WorseThanNominal:
         return describe_errors(self.group, self.identified, self.nominal) or self.group
 
 
-def describe_worse(found: list[WorseThanNominal]) -> str | None:
-    """One line of what is worse, None if nothing is."""
-    if not found:
+def describe_worse(groups: list[WorseThanNominal]) -> str | None:
+    """One line that lists the groups, None if there are none."""
+    if not groups:
         return None
-    by_logs = {one.logs: [str(other) for other in found if other.logs == one.logs] for one in found}
+    by_logs = {group.logs: [str(other) for other in groups if other.logs == group.logs] for group in groups}
     texts_by_logs = "; ".join(f"on {logs}: {join_names(texts)}" for logs, texts in by_logs.items())
     return f"the identified parameters predict worse than the URDF's, {texts_by_logs}"
 
@@ -216,12 +216,12 @@ def null_space_components(
     coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
     uncoupled = [base + joint for joint in layout.uncoupled_joints]
     for index, V in builder.null_space_bases(samples, state):
-        these = vectors[:, index]
-        yield torch.cat([(V.mT @ these[..., coupled, None])[..., 0], these[..., uncoupled]], dim=2)
+        forces = vectors[:, index]
+        yield torch.cat([(V.mT @ forces[..., coupled, None])[..., 0], forces[..., uncoupled]], dim=2)
 
 
 class ForceSums:
-    """Of generalized forces (or their errors): rows as they are, and inside the contacts' null space.
+    """Sums of squares of generalized forces or their errors: of rows, and inside the contacts' null space.
 
     `whitened`: of the rows of a fit, V_x^T f of its sensors in units of their noise.
     """
@@ -232,8 +232,8 @@ class ForceSums:
 
     @classmethod
     def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
-        """Of all parts together."""
-        out = cls(len(parts[0].rows.sum))
+        """Sums over all parts."""
+        out = cls(len(parts[0].rows.squares))
         for part in parts:
             out.rows.merge(part.rows)
             out.projected.merge(part.projected)
@@ -241,7 +241,7 @@ class ForceSums:
         return out
 
     def rms(self, base_rows: int, n: int) -> dict[str, float]:
-        """By group of rows, NaN where there are none, of a robot with so many base rows and joints."""
+        """Rms by group of rows, NaN for an empty group, of a robot with `base_rows` and n joints."""
         joints = self.rows.rms(slice(base_rows, base_rows + n))
         force, moment = self._in_limbs(base_rows + n)
         return {
@@ -255,56 +255,56 @@ class ForceSums:
         }
 
     def _in_limbs(self, first: int) -> tuple[float, float]:
-        """Of forces and of moments of the sensors in limbs."""
-        squares, count = (x[first:].reshape(-1, 2, 3).sum((0, 2)) for x in (self.rows.sum, self.rows.count))
+        """Rms of forces and of moments of force/torque sensors in limbs."""
+        squares, count = (x[first:].reshape(-1, 2, 3).sum((0, 2)) for x in (self.rows.squares, self.rows.count))
         with np.errstate(invalid="ignore", divide="ignore"):
             force, moment = np.sqrt(squares / count)
         return float(force), float(moment)
 
 
 class SumsOfSquares:
-    """Sums and sums of squares by row, over the samples where the row is known."""
+    """Sums and sums of squares by row, over the samples in which the row is finite."""
 
     def __init__(self, rows: int) -> None:
         """Start empty."""
-        self.plain, self.sum, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
+        self.sum, self.squares, self.count = np.zeros(rows), np.zeros(rows), np.zeros(rows)
 
     def add(self, x: torch.Tensor, weight: float = 1.0) -> None:
         """Add samples (N, rows), NaN where unknown, each of which counts as `weight` samples."""
         values = x.cpu().numpy()
         known = np.isfinite(values)
         values = np.where(known, values, 0.0)
-        self.plain += weight * values.sum(0)
-        self.sum += weight * np.square(values).sum(0)
+        self.sum += weight * values.sum(0)
+        self.squares += weight * np.square(values).sum(0)
         self.count += weight * known.sum(0)
 
     def add_squares(self, squares: float, count: int) -> None:
-        """Add one row's sum of squares over so many samples, of whose mean nothing is known."""
-        self.sum += squares
+        """Add the sum of squares of one row over `count` samples; their sum stays unknown."""
+        self.squares += squares
         self.count += count
 
     def rms(self, rows: slice = slice(None)) -> Array:
-        """Row by row."""
+        """Rms row by row."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.sqrt(self.sum[rows] / self.count[rows])
+            return np.sqrt(self.squares[rows] / self.count[rows])
 
     def pooled(self, rows: slice) -> float:
         """Rms over all components of some rows."""
         count = self.count[rows].sum()
-        return float(np.sqrt(self.sum[rows].sum() / count)) if count else np.nan
+        return float(np.sqrt(self.squares[rows].sum() / count)) if count else np.nan
 
     def deviation(self, rows: slice) -> float:
         """Rms about the mean of each row, over all of them."""
         known = self.count[rows] > 0
-        count, plain = self.count[rows][known], self.plain[rows][known]
+        count, total = self.count[rows][known], self.sum[rows][known]
         if not len(count):
             return np.nan
-        return float(np.sqrt(max((self.sum[rows][known] - plain**2 / count).sum(), 0.0) / count.sum()))
+        return float(np.sqrt(max((self.squares[rows][known] - total**2 / count).sum(), 0.0) / count.sum()))
 
     def merge(self, other: SumsOfSquares) -> None:
         """Add the sums of another."""
-        self.plain += other.plain
         self.sum += other.sum
+        self.squares += other.squares
         self.count += other.count
 
 

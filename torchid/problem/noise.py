@@ -1,9 +1,9 @@
 """Noise of the sensors and of the base rows from the residuals of a fit: variance components.
 
-A whitened, projected row mixes the noise of several sensors, so that no row shows that of one alone. But every sensor
-enters the rows of a sample along known directions, and differently in every posture and contact state: the variances
-are what makes the covariance of the residuals the one that was found (Rao's MINQUE, iterated, which is restricted
-maximum likelihood; Searle, Casella and McCulloch, "Variance Components", 1992, chapters 6 and 11).
+Every whitened, projected row mixes the noise of several sensors. But each sensor enters the rows of a sample along
+known directions, which differ between postures and contact states. The variances are those at which the expected
+covariance of the residuals equals the observed one (Rao's MINQUE, iterated, which is restricted maximum likelihood;
+Searle, Casella and McCulloch, "Variance Components", 1992, chapters 6 and 11).
 """
 
 from __future__ import annotations
@@ -32,31 +32,31 @@ BASE_GROUPS = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for ax
 NOISE_GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE_GROUPS, "ft_force", "ft_moment")
 """Groups of one standard deviation each; base rows along the axes of the levelled base."""
 
-_SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # whose rows are kept: 1000 show a standard deviation to 2 to 3 %
-_THINNED = 4  # one in so many of these shows the leverage
+_SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # rows in memory: 1000 samples give a standard deviation to 2 to 3 %
+_THINNED = 4  # leverage is computed from one in so many of these
 _NORMAL = 0.6745  # median of |x| of standard normal x
-_CLIP = 3.0  # residuals are clipped at three robust standard deviations: impacts count as no more
+_CLIP = 3.0  # residuals, of impacts for instance, are clipped at three robust standard deviations
 _CLIPPED = 0.99501  # E[min(x^2, 9)] of standard normal x
-_HELD = 0.005  # weight of the variances so far against what residuals say: settles what these leave confounded
-_LEAST_STEP = 0.05  # of a variance, by which factor it may fall in one step
+_HELD = 0.005  # weight of the previous variances against the residuals: determines confounded ones
+_LEAST_STEP = 0.05  # least factor of a variance in one step
 _SHARE = 0.01  # least share of a group in the variance along its own directions: a tenth of the deviation there
-_SMALLEST = 1e-3  # of the stated noise, least standard deviation: exact logs leave nothing but rounding
-_LEFT = 0.1  # least share of the residual's degrees of freedom that a group is taken to have
-_FEW = 20.0  # independent readings, fewer of which are too few: a standard deviation to 16 %
+_SMALLEST = 1e-3  # of the stated noise, least standard deviation: exact logs leave only rounding
+_LEFT = 0.1  # least share of the residual's degrees of freedom that a group is assigned
+_FEW = 20.0  # least number of independent readings: a standard deviation to 16 %
 _NEGLIGIBLE = 1e-9  # share of a source's variance in the rows below which it is projected out
-_STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions of any group, most steps
+_STEADY, _STEPS = 0.01, 40  # relative change of the noise along the directions of any group; most steps
 _CONFOUNDED = 0.5  # relative standard error of a standard deviation
 
 
 def std_by_group(noise: SensorNoise) -> dict[str, float]:
-    """Standard deviation of every group."""
+    """Standard deviation of every group, by name [N, N m]."""
     limb = noise.limb_std
     sensors = (noise.joint_torque, noise.contact_force, noise.contact_moment)
     return dict(zip(NOISE_GROUPS, [*sensors, *noise.base_std.tolist(), *limb], strict=True))
 
 
 def noise_of_groups(values: Mapping[str, float]) -> SensorNoise:
-    """The noise of standard deviations by group."""
+    """Sensor noise from standard deviations by group."""
     force, moment = (
         (values[names[0]], values[names[1]], values[names[2]]) for names in (BASE_GROUPS[:3], BASE_GROUPS[3:])
     )
@@ -80,7 +80,7 @@ class _Chunk:
 
 
 class SampledRows:
-    """Rows of some thousand samples of the logs, kept to be whitened again with other noise.
+    """Rows of about a thousand samples of the logs, in memory, to be whitened again with other noise.
 
     Attributes:
         builder: of the rows; its sensors' noise is the stated one, which variances are relative to.
@@ -91,7 +91,7 @@ class SampledRows:
     @one_thread()
     @torch.no_grad()
     def __init__(self, logs: Sequence[Samples], builder: RowBuilder) -> None:
-        """Compute the rows, of samples at random but always the same."""
+        """Compute the rows of random samples, always the same ones."""
         self.builder = builder
         names = _source_names(builder)
         self.groups = tuple(name for name in NOISE_GROUPS if name in names)
@@ -100,7 +100,7 @@ class SampledRows:
         self._std = torch.tensor([stated[name] for name in names], dtype=torch.float64)
         n_rows = builder.tree.n_rows
         most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
-        self.chunks = [self._chunk(part, state) for part, state in _some(logs, max(most, 1))]
+        self.chunks = [self._chunk(part, state) for part, state in _random_chunks(logs, max(most, 1))]
 
     @property
     def reference_std(self) -> Array:
@@ -116,25 +116,25 @@ class SampledRows:
 
     def _chunk(self, samples: Samples, state: ContactState) -> _Chunk:
         rows, W = self.builder.rows_by_sample(samples.to(self.builder.device), state)
-        sources = (self._ways(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
+        sources = (self._unit_forces(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
         return _Chunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
 
-    def _ways(self, samples: Samples) -> Tensor:
-        """Generalized force that a unit of each source makes, (B, E, n_rows)."""
+    def _unit_forces(self, samples: Samples) -> Tensor:
+        """Generalized force of a unit of each noise source, (B, E, n_rows)."""
         builder, base = self.builder, self.builder.tree.base_rows
         n_rows = builder.tree.n_rows
         unit = torch.eye(n_rows, dtype=samples.time.dtype, device=samples.time.device)
-        ways = [unit[:base].expand(len(samples), -1, -1)]
-        if base and (axes := builder.noise_axes(samples.rotation_world_base)) is not None:
-            turned = ways[0].clone()
-            turned[:, :3, :3] = turned[:, 3:6, 3:6] = axes.mT
-            ways = [turned]
-        ways.append(unit[(base + np.flatnonzero(builder.sensors.torque)).tolist()].expand(len(samples), -1, -1))
+        forces = [unit[:base].expand(len(samples), -1, -1)]
+        if base and (axes := builder.noise_axes(samples.base.rotation)) is not None:
+            rotated = forces[0].clone()
+            rotated[:, :3, :3] = rotated[:, 3:6, 3:6] = axes.mT
+            forces = [rotated]
+        forces.append(unit[(base + np.flatnonzero(builder.sensors.torque)).tolist()].expand(len(samples), -1, -1))
         components = measured_components(builder.contacts, builder.sensors)
         if components.any():
             J = builder.contact_jacobian(samples) * samples.active[..., None, None]
-            ways.append(J[:, torch.from_numpy(components)])
-        return torch.cat(ways, dim=1)
+            forces.append(J[:, torch.from_numpy(components)])
+        return torch.cat(forces, dim=1)
 
     def whitened(self, variance: Array) -> Iterator[_Chunk]:
         """The chunks, whitened with variances of the groups relative to the stated ones, (G,)."""
@@ -145,7 +145,7 @@ class SampledRows:
         for chunk in self.chunks:
             sources = chunk.sources * scale
             S = sources.mT @ sources
-            empty = S.diagonal(dim1=1, dim2=2) == 0.0  # rows that are none
+            empty = S.diagonal(dim1=1, dim2=2) == 0.0  # rows of zeros
             L = torch.linalg.cholesky(S + torch.diag_embed(empty.to(S)))
             rows = torch.linalg.solve_triangular(L, chunk.rows, upper=False)
             sources = torch.linalg.solve_triangular(L, sources.mT, upper=False).mT
@@ -153,10 +153,10 @@ class SampledRows:
 
     @one_thread()
     def compress(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
-        """The rows, whitened anew and compressed.
+        """The rows, whitened with these variances and compressed.
 
-        With parameters of an earlier fit in the builder's columns, by log, rows that are far off count less, as in
-        Huber's loss: what impacts do to the parameters would look like noise of all rows.
+        With parameters of an earlier fit in the builder's columns, by log, rows with large residuals count less, as in
+        Huber's loss: otherwise the effect of impacts on the parameters would look like noise of all rows.
         """
         parts: dict[tuple[str, ContactState], Part] = {}
         every = tuple(range(self.builder.width))
@@ -166,14 +166,14 @@ class SampledRows:
             part.samples += len(chunk.rows)
             some = chunk.rows[chunk.sources.abs().sum(1) > 0.0]
             if columns is not None:
-                off = (some[:, :-1] @ columns[chunk.log] - some[:, -1]).abs()
-                some = some * (_CLIP / off).clamp_max(1.0).sqrt()[:, None]
+                residual = (some[:, :-1] @ columns[chunk.log] - some[:, -1]).abs()
+                some = some * (_CLIP / residual).clamp_max(1.0).sqrt()[:, None]
             part.factor.add(every, some, chunk.oversampling)
         return list(parts.values())
 
 
 def _source_names(builder: RowBuilder) -> list[str]:
-    """The group of every source of noise, in the order of `SampledRows._ways`."""
+    """The group of every source of noise, in the order of `SampledRows._unit_forces`."""
     n = builder.tree.n
     limbs = ["ft_force"] * 3 + ["ft_moment"] * 3
     dofs = ["joint_torque" if dof < n else limbs[(dof - n) % 6] for dof in np.flatnonzero(builder.sensors.torque)]
@@ -182,18 +182,18 @@ def _source_names(builder: RowBuilder) -> list[str]:
     return [*BASE_GROUPS[: builder.tree.base_rows], *dofs, *contacts]
 
 
-def _some(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, ContactState]]:
-    """About so many samples, at random so that no gait is in step with them, log by log and state by state.
+def _random_chunks(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, ContactState]]:
+    """About `most` random samples (regular ones could be in phase with a gait), log by log and state by state.
 
-    Of filtered logs, four for every independent one: more would add little.
+    Of filtered logs at most four for every independent sample: more would add little.
     """
     rng, share = np.random.default_rng(0), min(1.0, most / max(sum(map(len, logs)), 1))
     for log in logs:
         count = min(len(log), max(round(min(share, 4.0 / log.oversampling) * len(log)), 1))
         index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
-        some = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
-        for state, where in chunks_by_state(some, _CHUNK):
-            yield some[where], state
+        chosen = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
+        for state, where in chunks_by_state(chosen, _CHUNK):
+            yield chosen[where], state
 
 
 @dataclass(frozen=True)
@@ -202,10 +202,10 @@ class GroupVariances:
 
     Attributes:
         variance: (G,).
-        share: (G,), of the variance along a group's own directions that is its own, between 0 and 1.
-        estimated: (G,) bool, whether there are readings enough; where not, the variance stays what it was.
+        share: (G,), the group's own share of the variance along its directions, between 0 and 1.
+        estimated: (G,) bool, whether there were enough readings; if not, the variance is unchanged.
         error: (G,), relative standard error of the standard deviation, large where groups are confounded.
-        change: largest relative change, since the start, of the noise along the directions of a group, whosever it is.
+        change: largest relative change of the noise of all groups along the directions of any group since the start.
     """
 
     variance: Array
@@ -216,21 +216,21 @@ class GroupVariances:
 
     @property
     def upper_bound(self) -> np.ndarray:
-        """Groups whose noise drowns in that of others, of which only an upper bound is known, (G,) bool."""
+        """Groups whose noise is far below that of others: only an upper bound is known, (G,) bool."""
         return self.estimated & (self.share <= 1.5 * _SHARE)
 
     @property
     def confounded(self) -> np.ndarray:
-        """Groups of which residuals show little but their sum with others, (G,) bool."""
+        """Groups that are confounded with others: residuals determine little but their sum, (G,) bool."""
         return self.estimated & ~self.upper_bound & (self.error > _CONFOUNDED)
 
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Rows' residuals r and sources U of the stated noise, by chunk, and what the fit took of each group.
+    """Residuals and noise sources of the rows, by chunk, and the degrees of freedom that the fit leaves.
 
-    `r`: (B, n_rows), `U`: (B, E, n_rows); `left`, (G,), share of the degrees of freedom that the fit left;
-    `independent`, (G,), number of independent readings.
+    `r`: (B, n_rows), residuals; `U`: (B, E, n_rows), sources of the stated noise; `left`, (G,), share of each group's
+    degrees of freedom that remain after the fit; `independent`, (G,), number of independent readings.
     """
 
     r: list[Tensor]
@@ -243,7 +243,7 @@ class VarianceComponentEstimator:
     """Estimates variances of groups from residuals at fitted parameters."""
 
     def __init__(self, rows: SampledRows, tied: Collection[str] = ()) -> None:
-        """Tie the variances of some groups together: one factor for all of them."""
+        """Estimate one common factor for the variances of the `tied` groups."""
         self.rows = rows
         count = len(rows.groups)
         kept = [index for index, name in enumerate(rows.groups) if name in tied]
@@ -256,57 +256,57 @@ class VarianceComponentEstimator:
     @one_thread()
     @torch.no_grad()
     def estimate(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> GroupVariances:
-        """Variances that make the covariance of the residuals the one found.
+        """Variances at which the expected covariance of the residuals equals the observed one.
 
-        Residuals are clipped; those of fitted parameters are small, for which each group is corrected by the leverage
-        of its own directions. A group is never less than a tenth of the standard deviation along these, nor than a
-        thousandth of the stated noise.
+        Residuals are clipped. A fit makes them smaller; each group is corrected by the leverage of its own directions.
+        Its standard deviation is at least a tenth of that along its directions, and a thousandth of the stated noise.
 
         Args:
-            variance: (G,), to start from, with which the parameters were fitted.
+            variance: (G,), initial values, with which the parameters were fitted.
             columns: parameters in the builder's columns, (width,), by log.
             problem: of the fit.
         """
-        found, start = self._residuals(variance, columns, problem), variance
-        estimated = (found.independent > _FEW) @ self._blocks > 0.0
-        first, *_ = M, q, t, count = self._moments(found, variance)
+        residuals, start = self._residuals(variance, columns, problem), variance
+        estimated = (residuals.independent > _FEW) @ self._blocks > 0.0
+        first, *_ = M, q, t, count = self._moments(residuals, variance)
         for _ in range(_STEPS):
             share = np.divide(t, count, out=np.ones_like(t), where=count > 0.0)
             step = self._step(M, q, estimated)
             least = np.maximum(_SHARE / np.maximum(share, 1e-12), _SMALLEST**2 / variance)
-            step = np.where(estimated, np.maximum(step, _block_max(least, self._blocks)), 1.0)
+            least_of_block = np.where(self._blocks > 0.0, least[:, None], 0.0).max(axis=0, initial=0.0)
+            step = np.where(estimated, np.maximum(step, least_of_block), 1.0)
             factor = self._blocks @ step
             variance = variance * factor
             if _change(M, factor) < _STEADY:
                 break
-            M, q, t, count = self._moments(found, variance)
-        error = _relative_errors(M * np.sqrt(np.outer(found.left, found.left)) / self.rows.oversampling)
+            M, q, t, count = self._moments(residuals, variance)
+        error = _relative_errors(M * np.sqrt(np.outer(residuals.left, residuals.left)) / self.rows.oversampling)
         return GroupVariances(variance, share, self._blocks @ estimated > 0.0, error, _change(first, variance / start))
 
     def _step(self, M: Array, q: Array, estimated: np.ndarray) -> Array:
-        """Factors of the unknown variances, so that the squares are those expected; undetermined ones stay near 1."""
+        """Factors of the unknown variances at which the squares are the expected ones; confounded ones stay near 1."""
         B = self._blocks
         M, q = B.T @ M @ B, B.T @ q
         free, held = np.flatnonzero(estimated), _HELD * np.diag(M)
         if not len(free):
             return np.ones(len(q))
-        rest = (q - M[:, ~estimated].sum(1) + held)[free]
+        rhs = (q - M[:, ~estimated].sum(1) + held)[free]
         kept = M[np.ix_(free, free)] + np.diag(held[free])
         size = 1.0 / np.sqrt(np.diag(kept))
         L = np.linalg.cholesky(kept * size * size[:, None])
-        target = scipy.linalg.solve_triangular(L, size * (rest - _LEAST_STEP * kept.sum(1)), lower=True)
+        target = scipy.linalg.solve_triangular(L, size * (rhs - _LEAST_STEP * kept.sum(1)), lower=True)
         out = np.ones(len(q))
         out[free] = _LEAST_STEP + size * scipy.optimize.nnls(L.T, target)[0]
         return out
 
-    def _moments(self, found: _Residuals, variance: Array) -> tuple[Array, Array, Array, Array]:
-        """M (G, G) and q (G,) of the equations M x = q; variance of the groups in the rows and number of readings."""
-        of, count = self.rows.group_of, len(variance)
-        member = torch.zeros(len(of), count, dtype=torch.float64)
-        member[torch.arange(len(of)), torch.from_numpy(of)] = 1.0
-        scale = torch.from_numpy(np.sqrt(variance)[of])[:, None]
+    def _moments(self, residuals: _Residuals, variance: Array) -> tuple[Array, Array, Array, Array]:
+        """M (G, G), q (G,) of the equations M x = q; variance in the rows and number of readings by group, (G,)."""
+        group_of, count = self.rows.group_of, len(variance)
+        member = torch.zeros(len(group_of), count, dtype=torch.float64)
+        member[torch.arange(len(group_of)), torch.from_numpy(group_of)] = 1.0
+        scale = torch.from_numpy(np.sqrt(variance)[group_of])[:, None]
         M, z, sizes = torch.zeros(count, count, dtype=torch.float64), [], []
-        for r, U in zip(found.r, found.U, strict=True):
+        for r, U in zip(residuals.r, residuals.U, strict=True):
             sources = U * scale
             S = sources.mT @ sources
             S = S + torch.diag_embed((S.diagonal(dim1=1, dim2=2) == 0.0).to(S))
@@ -319,31 +319,31 @@ class VarianceComponentEstimator:
         size, score = torch.cat(sizes).numpy(), torch.cat(z).numpy()
         q, t, n = (np.zeros(count) for _ in range(3))
         for group in range(count):
-            own, scores = size[:, of == group], score[:, of == group]
+            own, scores = size[:, group_of == group], score[:, group_of == group]
             present = own > _NEGLIGIBLE
             t[group], n[group] = own.sum(), present.sum()
             if present.any():
                 q[group] = t[group] * _clipped_variance(scores[present] / np.sqrt(own[present]), own[present])
-        return M.numpy(), q / found.left, t, n
+        return M.numpy(), q / residuals.left, t, n
 
     def _residuals(self, variance: Array, columns: Mapping[str, Tensor], problem: LinearProblem) -> _Residuals:
-        rows, of, directions = self.rows, self.rows.group_of, _fitted_directions(problem, self.rows.builder)
-        taken, size, readings = (np.zeros(len(variance)) for _ in range(3))
+        rows, group_of, directions = self.rows, self.rows.group_of, _fitted_directions(problem, self.rows.builder)
+        leverages, size, readings = (np.zeros(len(variance)) for _ in range(3))
         for chunk in rows.whitened(variance):
             own = chunk.sources.square().sum(2)
-            some = slice(None, None, _THINNED)
-            leverage = (chunk.sources[some] @ (chunk.rows[some, :, :-1] @ directions)).square().sum((0, 2))
-            np.add.at(taken, of, chunk.oversampling * leverage.numpy())
-            np.add.at(size, of, own[some].sum(0).numpy())
-            np.add.at(readings, of, (own > _NEGLIGIBLE).sum(0).numpy() / chunk.oversampling)
-        left = 1.0 - np.divide(taken, size, out=np.zeros_like(size), where=size > 0.0)
+            thinned = slice(None, None, _THINNED)
+            leverage = (chunk.sources[thinned] @ (chunk.rows[thinned, :, :-1] @ directions)).square().sum((0, 2))
+            np.add.at(leverages, group_of, chunk.oversampling * leverage.numpy())
+            np.add.at(size, group_of, own[thinned].sum(0).numpy())
+            np.add.at(readings, group_of, (own > _NEGLIGIBLE).sum(0).numpy() / chunk.oversampling)
+        remaining = 1.0 - np.divide(leverages, size, out=np.zeros_like(size), where=size > 0.0)
         r = [chunk.rows[..., :-1] @ columns[chunk.log] - chunk.rows[..., -1] for chunk in rows.chunks]
         U = [chunk.sources for chunk in rows.chunks]
-        return _Residuals(r, U, np.maximum(left, _LEFT), readings * np.maximum(left, 0.0))
+        return _Residuals(r, U, np.maximum(remaining, _LEFT), readings * np.maximum(remaining, 0.0))
 
 
 def _relative_errors(M: Array) -> Array:
-    """Of the standard deviations, (G,), of normal noise whose variances are determined by the equations of M / 2."""
+    """Relative standard errors, (G,), of the standard deviations of Gaussian noise with Fisher information M / 2."""
     present = np.diag(M) > 0.0
     size = np.where(present, np.diag(M), 1.0) ** -0.5
     values, V = np.linalg.eigh(M * size * size[:, None])
@@ -351,19 +351,14 @@ def _relative_errors(M: Array) -> Array:
 
 
 def _change(M: Array, factor: Array) -> float:
-    """Largest relative change of the standard deviation along a group's directions, if variances change by factors."""
+    """Largest relative change of the standard deviation along a group's directions, with variances times factors."""
     before = M.sum(1)
     after = np.divide(M @ factor, before, out=np.ones_like(before), where=before > 0.0)
     return float(np.abs(np.sqrt(after) - 1.0).max(initial=0.0))
 
 
-def _block_max(values: Array, blocks: Array) -> Array:
-    """The largest value of each block."""
-    return np.where(blocks > 0.0, values[:, None], 0.0).max(axis=0, initial=0.0)
-
-
 def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
-    """G, (width, rank), so that `|x G|^2` is the leverage of a whitened row x; offsets and the like are few."""
+    """G, (width, rank), with `|x G|^2` the leverage of a whitened row x; that of the few extras is neglected."""
     scale = problem.scale[problem.free]
     _, values, Vh = scipy.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=False, lapack_driver="gesvd")
     kept = is_significant(values)
@@ -374,7 +369,7 @@ def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
 
 
 def _clipped_variance(z: Array, weights: Array) -> float:
-    """Variance of readings with outliers clipped, the same as without clipping for normal ones."""
+    """Variance of readings with outliers clipped; for Gaussian ones the same as without clipping."""
     limit = _CLIP * float(np.median(np.abs(z))) / _NORMAL
     if limit == 0.0:
         limit = np.inf

@@ -1,4 +1,4 @@
-"""Measured and predicted generalized forces, sample by sample, and readings with their offsets and scales taken out."""
+"""Measured and predicted generalized forces, sample by sample, and readings corrected by offsets and scales."""
 
 from __future__ import annotations
 
@@ -22,38 +22,40 @@ from torchid.problem.samples import Samples
 from torchid.regressor.regressor import generalized_forces, wrench_transform, wrenches_at_base
 from torchid.regressor.tree import KinematicTree
 
-_ROWS = 2**16  # of a log on the disk that are in memory at a time
+_ROWS = 2**16  # of a log on disk that are in memory at a time
 
 
 def calibrate_readings(samples: Samples, extras: Sequence[Extra], values: Array, tree: KinematicTree) -> Samples:
-    """Samples whose readings are the forces themselves: s y - o for an offset o and a scale s of the reading y.
+    """Samples with calibrated readings, s y - o for an offset o and a scale s of the reading y.
 
-    Readings without unknowns are shared with `samples`; those that change lie on the disk if `samples` do.
+    Readings without extra parameters are shared with `samples`; the others are on disk if `samples` are.
 
     Args:
         samples: as recorded.
-        extras: unknowns; those of actuators do not matter here.
+        extras: of sensors; those of actuators are ignored.
         values: of each, (E,).
         tree: of the robot.
 
     Raises:
         SpillError: the disk is full.
     """
-    known = [(x, value) for x, value in zip(extras, values.tolist(), strict=True) if x.what in ("offset", "scale")]
+    calibration = [
+        (x, value) for x, value in zip(extras, values.tolist(), strict=True) if x.what in ("offset", "scale")
+    ]
     if samples.folder is None:
-        return replace(samples, **_readings(samples, known, tree))
+        return replace(samples, **_readings(samples, calibration, tree))
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, samples.source, samples.folder))
     for start in range(0, len(samples), _ROWS):
-        for name, rows in _readings(samples[start : start + _ROWS], known, tree).items():
+        for name, rows in _readings(samples[start : start + _ROWS], calibration, tree).items():
             spills[name].append(rows.numpy())
     stored: dict[str, Any] = {name: torch.from_numpy(spill.array()) for name, spill in spills.items()}
     return replace(samples, **stored)
 
 
-def _readings(samples: Samples, known: Sequence[tuple[Extra, float]], tree: KinematicTree) -> dict[str, Any]:
-    """Calibrated copies of the fields of readings that have unknowns."""
+def _readings(samples: Samples, calibration: Sequence[tuple[Extra, float]], tree: KinematicTree) -> dict[str, Any]:
+    """Calibrated copies of the readings with extra parameters, by field."""
     copies: dict[str, Tensor] = {}
-    for extra, value in known:
+    for extra, value in calibration:
         name = "torque" if extra.contact is None else "wrench"
         recorded: Tensor | None = getattr(samples, name)
         if recorded is None:
@@ -84,7 +86,7 @@ class GeneralizedForces:
 def predict_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
     """K phi, (n_rows, B), for parameters in the builder's columns, (columns,), without extras.
 
-    Bodies' wrenches, summed over subtrees, work along screw axes: the rows of K are never formed.
+    Joint forces are products of screw axes with wrenches summed over subtrees; the rows of K are never formed.
     """
     tree, layout = builder.tree, builder.columns.layout
     by_body = phi.new_zeros(tree.n_nodes, layout.count)
@@ -112,7 +114,7 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, d
             units = total.new_tensor(wrench_transform(T_joint_frame).T[possible])
             components = builder.recorded_wrench(samples, contact, dynamics)[:, possible].T
             wrench = (wrenches_at_base(dynamics.states, body, units) * components).sum(1, keepdim=True)
-            joints = builder.columns.joints_above(body)  # and no others, where an unmeasured force would be NaN
+            joints = builder.columns.joints_above(body)  # other rows must not become NaN by an unmeasured force
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
             total[rows] += generalized_forces(tree, dynamics.screw_axes, body, wrench, joints)[0]
     return total
@@ -123,7 +125,7 @@ def measured_and_predicted_forces(
 ) -> GeneralizedForces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
 
-    Sensors count as calibrated: of the extras, those of actuators alone enter.
+    Sensors are taken as calibrated: of the extras only those of actuators enter.
     """
     dynamics = builder.dynamics(samples)
     base_rows = builder.tree.base_rows
@@ -144,10 +146,10 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
     measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
     with torch.no_grad(), one_thread():
         for state, index in chunks_by_state(samples):
-            found = measured_and_predicted_forces(builder, samples[index].to(builder.device), state, columns)
+            forces = measured_and_predicted_forces(builder, samples[index].to(builder.device), state, columns)
             where = index if isinstance(index, slice) else index.numpy()
-            measured[where] = found.measured.cpu().numpy()
-            predicted[:, where] = found.predicted.cpu().numpy()
+            measured[where] = forces.measured.cpu().numpy()
+            predicted[:, where] = forces.predicted.cpu().numpy()
     return measured, predicted
 
 

@@ -22,13 +22,12 @@ from torchid.problem.contact_state import (
 )
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.samples import Samples
-from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion
+from torchid.regressor.columns import all_wrench_columns
+from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import (
-    all_wrench_columns,
     friction_columns,
     generalized_forces,
     joint_row,
-    joint_screw_axes,
     wrench_transform,
     wrenches_at_base,
 )
@@ -39,7 +38,7 @@ from torchid.sensing.projection import null_space, whitened_null_space
 
 
 class Workspace:
-    """Named buffers, one worker's alone. Keeps the latest of each name only."""
+    """Named buffers of one worker; of each name only the latest is stored."""
 
     def __init__(self) -> None:
         """Start empty."""
@@ -47,15 +46,15 @@ class Workspace:
 
     def zeros(self, name: str, like: Tensor, *shape: int) -> Tensor:
         """A buffer that is zero wherever callers with the same name and shape never write."""
-        found = self._buffers.get(name)
-        if found is None or (found.shape, found.dtype, found.device) != (shape, like.dtype, like.device):
-            found = self._buffers[name] = torch.zeros(shape, dtype=like.dtype, device=like.device)
-        return found
+        buffer = self._buffers.get(name)
+        if buffer is None or (buffer.shape, buffer.dtype, buffer.device) != (shape, like.dtype, like.device):
+            buffer = self._buffers[name] = torch.zeros(shape, dtype=like.dtype, device=like.device)
+        return buffer
 
 
 @dataclass(frozen=True)
 class ChunkDynamics:
-    """Dynamics of B samples: everything that rows and predictions are made of.
+    """Dynamics of B samples, from which rows and predictions are computed.
 
     Attributes:
         joints: motion of all joints.
@@ -91,11 +90,14 @@ class ChunkDynamics:
 class RowBuilder(nn.Module):
     """Rows of `W^T [K_columns | f]`: W a basis of V_x's span under which the projected sensor noise is white.
 
-    The fast path to the equations that `torchid.Projection` makes of `torchid.Regressor` and `torchid.FrameJacobian`:
-    the same but for a rotation of each sample's rows, in fewer columns (see `Columns`). It shares their kernels, the
-    functions of `torchid.regressor` and the null spaces of `torchid.sensing.projection`, but takes samples one contact
-    state at a time, where all shapes are constant, and multiplies W^T into the bodies' wrenches without forming K.
-    `tests/problem/test_rows_two_ways.py` compares both ways; read the other first.
+    The fast implementation of the equations that `torchid.Projection` computes from `torchid.Regressor` and
+    `torchid.FrameJacobian`, up to a rotation of each sample's rows, in fewer columns (see `Columns`). It shares their
+    functions in `torchid.regressor` and `torchid.sensing.projection`, but processes samples one contact state at a
+    time, where all shapes are constant, and multiplies W^T with the bodies' wrenches without forming K.
+    `tests/problem/test_rows_two_ways.py` compares both; read the reference implementation first.
+
+    `frames`: node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]. `width`:
+    number of columns, those of the bodies' parameters and one for each of `extras`.
     """
 
     def __init__(
@@ -107,7 +109,7 @@ class RowBuilder(nn.Module):
             robot: the robot.
             contacts: all contacts, by the columns of the samples' `active`.
             sensors: which forces are measured, with their noise.
-            terms: unknowns beside the bodies' parameters; by default none.
+            terms: extra parameters; none by default.
         """
         super().__init__()
         terms = terms or ExtraTerms()
@@ -117,21 +119,13 @@ class RowBuilder(nn.Module):
         self.contacts = tuple(contacts)
         self.sensors = sensors
         self._layouts = ContactStateLayouts(robot, self.columns, contacts, sensors, self.extras)
+        self.frames = self._layouts.frames
+        self.width = self.columns.count + len(self.extras)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RowBuilder:
-        self._layouts.forget()  # their tensors are where the module was
+        self._layouts.clear()  # their tensors are not buffers of the module
         super()._apply(fn, recurse)
         return self
-
-    @property
-    def frames(self) -> list[tuple[int, Array]]:
-        """Node of each contact, and the pose of the contact frame in the node's joint frame, (4, 4) [m]."""
-        return self._layouts.frames
-
-    @property
-    def width(self) -> int:
-        """Number of all columns: those of the bodies' parameters, then one for each of `extras`."""
-        return self.columns.count + len(self.extras)
 
     def to_columns(self, phi: Array) -> Tensor:
         """Parameters (M, 12 L), or (M, 12 L + E) with values of the `extras`, in these columns: (M, width)."""
@@ -145,7 +139,7 @@ class RowBuilder(nn.Module):
         return self.tree.ancestors.device
 
     def layout(self, state: ContactState) -> ContactStateLayout:
-        """What is constant in a contact state: columns, joints and wrenches that take part."""
+        """Layout of a contact state: its columns, coupled joints and wrench directions."""
         return self._layouts.layout(state)
 
     def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
@@ -189,16 +183,16 @@ class RowBuilder(nn.Module):
         n_rows = self.tree.n_rows
         rows = samples.time.new_zeros(len(samples), n_rows, self.width + 1)
         W = samples.time.new_zeros(len(samples), n_rows, n_rows)
-        moved = self._index([*range(base), *(base + joint for joint in layout.coupled_joints)])
+        dofs = self._index([*range(base), *(base + joint for joint in layout.coupled_joints)])
         support = self._index([*layout.support, self.width])
-        for index, basis, found in self._coupled_rows(samples, layout, dynamics, Workspace()):
-            here = torch.arange(len(samples), device=self.device)[index][:, None, None]
-            slots = torch.arange(found.shape[1], device=self.device)
-            rows[here, slots[:, None], support] = found.permute(2, 1, 0)
-            W[here, moved[:, None], slots] = basis
+        for index, basis, block in self._coupled_rows(samples, layout, dynamics, Workspace()):
+            sample = torch.arange(len(samples), device=self.device)[index][:, None, None]
+            slots = torch.arange(block.shape[1], device=self.device)
+            rows[sample, slots[:, None], support] = block.permute(2, 1, 0)
+            W[sample, dofs[:, None], slots] = basis
         for slot, joint in enumerate(layout.uncoupled_joints, start=coupled):
-            columns, found = self._uncoupled_row(joint, samples, dynamics)
-            rows[:, slot, self._index([*columns, self.width])] = found.T
+            columns, block = self._uncoupled_row(joint, samples, dynamics)
+            rows[:, slot, self._index([*columns, self.width])] = block.T
             W[:, base + joint, slot] = 1.0 / self._layouts.dof_std[joint]
         return rows, W
 
@@ -220,7 +214,7 @@ class RowBuilder(nn.Module):
         return J
 
     def noise_axes(self, rotation_world_base: Tensor | None) -> Tensor | None:
-        """Axes that the noise of the base rows is stated along, (B, 3, 3); None, the base's own, without attitude."""
+        """Axes of the stated noise of the base rows, (B, 3, 3); None for the base's own, if its attitude is unknown."""
         return (
             None if rotation_world_base is None or not self.tree.base_rows else levelled_base_axes(rotation_world_base)
         )
@@ -235,7 +229,7 @@ class RowBuilder(nn.Module):
         return (self._rotation(contact, dynamics).mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
 
     def _rotation(self, contact: int, dynamics: ChunkDynamics) -> Tensor:
-        """Rotation contact frame to world, (B, 3, 3); to a bolted base whose mounting is not known."""
+        """Rotation contact frame to world, (B, 3, 3), or to a bolted base whose orientation is unknown."""
         body, T_joint_frame = self.frames[contact]
         in_body = dynamics.wrenches.new_tensor(T_joint_frame[:3, :3])
         rotation = dynamics.states.rotation[:, :, body].permute(2, 0, 1) @ in_body
@@ -251,10 +245,12 @@ class RowBuilder(nn.Module):
         row = self.columns.joint_rows[joint]
         inertial = joint_row(row, self.tree, self.columns.layout, dynamics.screw_axes, dynamics.wrenches)
         friction = [x for _, *pair in friction_columns(row, self.tree, dynamics.joints) for x in pair]
-        own = {self.columns.count + number: extra for number, extra in enumerate(self.extras) if extra.dof == joint}
-        extra = [dof_extra_column(extra, samples, self.tree) for extra in own.values()]
+        own_extras = {
+            self.columns.count + number: extra for number, extra in enumerate(self.extras) if extra.dof == joint
+        }
+        extra = [dof_extra_column(extra, samples, self.tree) for extra in own_extras.values()]
         block = torch.cat([inertial, torch.stack([*friction, *extra, self.recorded_torque(samples)[:, joint]])])
-        columns = (*range(row.start, row.end), *self.columns.friction_of(joint), *own)
+        columns = (*range(row.start, row.end), *self.columns.friction_of(joint), *own_extras)
         return columns, block / self._layouts.dof_std[joint]
 
     def _coupled_rows(
@@ -271,7 +267,7 @@ class RowBuilder(nn.Module):
         axes = self.noise_axes(dynamics.rotation_world_base) if self.sensors.noise.base_axes_differ else None
         for index, W in whitened_null_space(unmeasured, layout.row_std, measured, layout.wrench_std, axes):
             chosen = dynamics.select(index)
-            rows = self._projected(W.permute(1, 2, 0).contiguous(), f[index].T, layout, chosen, workspace)
+            rows = self._projected_rows(W.permute(1, 2, 0).contiguous(), f[index].T, layout, chosen, workspace)
             if layout.extras:
                 rows[-1 - len(layout.extras) : -1] = self._extra_columns(
                     samples[index], layout, chosen, measured[index], W
@@ -281,20 +277,20 @@ class RowBuilder(nn.Module):
     def _extra_columns(
         self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, measured: Tensor, W: Tensor
     ) -> Tensor:
-        """Columns of the unknowns beside the bodies' parameters, (extras of the layout, r, B)."""
+        """Columns of the extra parameters, (extras of the layout, r, B)."""
         extras = [self.extras[column - self.columns.count] for column in layout.extras]
         touching = {extra.contact[0] for extra in extras if extra.contact is not None}
         rotations = {k: self._rotation(k, dynamics) for k in touching} if samples.wrench_in_world else {}
         return torch.stack(list(extra_columns(extras, samples, layout, self.tree, measured, W, rotations)))
 
-    def _projected(
+    def _projected_rows(
         self, W: Tensor, f: Tensor, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
     ) -> Tensor:
         """Rows W^T [K | f], (columns + 1, r, B), for a basis W, (base rows + coupled joints, r, B), and f, (..., B).
 
-        A wrench on body i does work on the base and on the joints above it only, so that body i's columns of W^T K are
-        A_i^T times its wrench columns, with A_i the sum of W's rows along i's path, each carried by its screw axis. No
-        joint row is ever formed. Columns are contiguous, as the factorization wants them.
+        A wrench on body i does work on the base and on the joints above it only. Body i's columns of W^T K are thus
+        A_i^T times its wrench columns, with A_i the sum over its path of the rows of W times the joints' screw axes.
+        No joint row is ever formed. Columns are contiguous, as the factorization needs them.
         """
         tree, column_layout, inertial = self.tree, self.columns.layout, layout.inertial
         X = workspace.zeros("projected", W, len(layout.support) + 1, *W.shape[1:])
@@ -307,15 +303,15 @@ class RowBuilder(nn.Module):
         torch.mul(own, tree.coulomb_sign(velocity), out=friction[:, 0])
         torch.mul(own, velocity, out=friction[:, 1])
 
-        carried = workspace.zeros("carried", W, 6, tree.n_nodes, *W.shape[1:])
+        path_sums = workspace.zeros("path_sums", W, 6, tree.n_nodes, *W.shape[1:])
         if tree.base_rows:
-            carried[:, 0] = W[:6]
+            path_sums[:, 0] = W[:6]
         for body in range(1, tree.n_nodes):
-            above = carried[:, tree.parents[body]]
+            parent = path_sums[:, tree.parents[body]]
             if body in moved:
-                torch.addcmul(above, dynamics.screw_axes[:, body, None], own[moved[body]], out=carried[:, body])
+                torch.addcmul(parent, dynamics.screw_axes[:, body, None], own[moved[body]], out=path_sums[:, body])
             else:
-                carried[:, body] = above
+                path_sums[:, body] = parent
         for kept, bodies in column_layout.runs(layout.nodes):
             if kept:
                 start, end = column_layout.starts[bodies.start], column_layout.starts[bodies.stop]
@@ -323,17 +319,17 @@ class RowBuilder(nn.Module):
                 n_with_force = sum(column < parameters.INERTIA.start for column in kept)
                 columns = X[start - inertial.start : end - inertial.start].unflatten(0, shape)
                 wrenches = dynamics.wrenches[:, start:end].unflatten(1, shape)
-                self._carry(wrenches, carried[:, bodies.start : bodies.stop], n_with_force, columns)
+                self._multiply_wrenches(wrenches, path_sums[:, bodies.start : bodies.stop], n_with_force, columns)
         return X
 
     @staticmethod
-    def _carry(wrenches: Tensor, carried: Tensor, n_with_force: int, out: Tensor) -> None:
+    def _multiply_wrenches(wrenches: Tensor, path_sums: Tensor, n_with_force: int, out: Tensor) -> None:
         """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `n_with_force` c have forces."""
-        torch.mul(wrenches[3].unsqueeze(2), carried[3].unsqueeze(1), out=out)
+        torch.mul(wrenches[3].unsqueeze(2), path_sums[3].unsqueeze(1), out=out)
         for k in (4, 5):
-            out.addcmul_(wrenches[k].unsqueeze(2), carried[k].unsqueeze(1))
+            out.addcmul_(wrenches[k].unsqueeze(2), path_sums[k].unsqueeze(1))
         for k in (0, 1, 2):
-            out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), carried[k].unsqueeze(1))
+            out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), path_sums[k].unsqueeze(1))
 
     def _contact_rows(self, layout: ContactStateLayout, dynamics: ChunkDynamics) -> tuple[Tensor, Tensor]:
         """Rows of J_C, unmeasured and measured, in base and coupled joints, (B, k, base rows + coupled joints)."""

@@ -1,4 +1,4 @@
-"""A log bound to a robot and its contacts: tensors in the robot's order, checked for what the run needs."""
+"""A log bound to a robot and its contacts: tensors in the robot's order, checked for completeness."""
 
 from __future__ import annotations
 
@@ -34,18 +34,19 @@ class Samples:
         source: the log's file, for messages and tables.
         time: (N,) [s].
         joint_position, joint_velocity, joint_acceleration: (N, n).
-        base: how the base moves and, if known, its orientation; None for a bolted base.
+        base: motion of the base and, if known, its orientation; empty for a bolted base.
         torque: (N, n + 6 F) [N m, N, N m] by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs;
             NaN where not measured, or None.
         wrench: (N, C, 6), NaN where not measured, or None; along world axes if `wrench_in_world`, else the frames'.
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
-        share: (N, C), filtered share of a constant contact reading, as `Log.contact_share`; None where it is `active`.
-        unloaded: (N, C, 6), what the contacts' sensors read in the air, NaN elsewhere, as `Log.contact_unloaded`; None
-            where there is no such reading.
-        folder: on whose disk the tensors of a log larger than memory lie, None for one in memory.
-        fold: number of the block of all logs that these samples are in, see `split_into_folds`.
+        share: (N, C), share of a constant contact reading that the filter leaves, as `Log.contact_share`; None if it is
+            `active`.
+        unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
+            `Log.contact_unloaded`; None without such readings.
+        folder: where the tensors of a log larger than memory are stored; None for one in memory.
+        fold: number of the cross-validation fold of these samples, see `split_into_folds`.
     """
 
     source: str
@@ -86,45 +87,36 @@ class Samples:
         """The samples on another device."""
         return self._each(lambda x: x.to(device))
 
-    @property
-    def rotation_world_base(self) -> Tensor | None:
-        """Rotation base to world, (N, 3, 3), None where it was not recorded."""
-        return self.base.rotation
-
     def motion(self) -> Motion:
-        """The motion of these samples, as the regressor takes it."""
-        base, still = self.base, self.time.new_zeros(len(self), 3)
+        """The motion of these samples, for the regressor."""
+        base, zero = self.base, self.time.new_zeros(len(self), 3)
         force = base.specific_force
         if force is None:  # of a bolted base
-            force = still - still.new_tensor(GRAVITY_WORLD)
+            force = zero - zero.new_tensor(GRAVITY_WORLD)
             if (rotation := base.rotation) is not None:
                 force = (rotation.mT @ force[..., None])[..., 0]
-        omega = still if base.angular_velocity is None else base.angular_velocity
-        alpha = still if base.angular_acceleration is None else base.angular_acceleration
+        omega = zero if base.angular_velocity is None else base.angular_velocity
+        alpha = zero if base.angular_acceleration is None else base.angular_acceleration
         return Motion(self.joint_position, self.joint_velocity, self.joint_acceleration, omega, alpha, force)
 
     def coordinates(self) -> tuple[Tensor, Tensor, Tensor]:
         """Generalized coordinates q, v, a as `Regressor` takes them.
 
-        Base position and base linear velocity are 0: the dynamics do not depend on them, and logs need not hold them.
-        Nor do they depend on the orientation beside the specific force: where it was not measured it is the identity.
-        A bolted base has joints only.
+        Base position and base linear velocity are 0: the dynamics do not depend on them, and logs need not have them.
+        An orientation that was not measured is the identity: given the specific force, the dynamics do not depend on it
+        either. A bolted base has joints only.
         """
-        joints = (self.joint_position, self.joint_velocity, self.joint_acceleration)
-        found, still = self.base, self.time.new_zeros(len(self), 3)
-        if found.specific_force is None or found.angular_velocity is None or found.angular_acceleration is None:
-            return joints
-        quat = (
-            still.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(self), 4) if found.quat_xyzw is None else found.quat_xyzw
+        q, v, a = self.joint_position, self.joint_velocity, self.joint_acceleration
+        base, zero = self.base, self.time.new_zeros(len(self), 3)
+        if base.specific_force is None or base.angular_velocity is None or base.angular_acceleration is None:
+            return q, v, a
+        quat = zero.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(self), 4) if base.quat_xyzw is None else base.quat_xyzw
+        g_base = (rotation_matrix(quat).mT @ zero.new_tensor(GRAVITY_WORLD)[:, None])[..., 0]
+        return (
+            torch.cat([zero, quat, q], dim=1),
+            torch.cat([zero, base.angular_velocity, v], dim=1),
+            torch.cat([base.specific_force + g_base, base.angular_acceleration, a], dim=1),
         )
-        g_base = (rotation_matrix(quat).mT @ still.new_tensor(GRAVITY_WORLD)[:, None])[..., 0]
-        base = (
-            torch.cat([still, quat], dim=1),
-            torch.cat([still, found.angular_velocity], dim=1),
-            torch.cat([found.specific_force + g_base, found.angular_acceleration], dim=1),
-        )
-        q, v, a = (torch.cat(pair, dim=1) for pair in zip(base, joints, strict=True))
-        return q, v, a
 
 
 def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSet | None = None) -> Samples:
@@ -134,11 +126,11 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         log: with velocities and accelerations filled in (see `torchid.logs.preprocess`).
         robot: the robot.
         contacts: the contacts in use.
-        required: sensors whose every value must be there; None if gaps are allowed.
+        required: sensors whose values must all have been recorded; None if gaps are allowed.
 
     Raises:
         UnknownNameError: a joint or contact that the robot does not have.
-        LogError: a joint, contact, motion or force that is missing.
+        LogError: a missing joint, contact, motion or force.
     """
     order = _joint_order(log, robot)
     position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
@@ -148,7 +140,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
         raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
     wrench = log.contact_wrench
-    in_the_air = unloaded_readings(log) if contacts else None
+    unloaded = unloaded_readings(log) if contacts else None
     samples = Samples(
         log.source,
         torch.from_numpy(log.time),
@@ -162,16 +154,16 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         torch.from_numpy(active),
         oversampling(log.time, log.noise_bandwidth_hz),
         None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
-        None if in_the_air is None else torch.from_numpy(_columns(in_the_air, chosen)),
+        None if unloaded is None else torch.from_numpy(_columns(unloaded, chosen)),
     )
     if required is not None:
-        _check_limbs(log, robot, required)
+        _require_limb_sensors(log, robot, required)
         require_forces(samples, robot, contacts, required)
     return samples
 
 
 def oversampling(time: FloatArray, noise_bandwidth_hz: float | None) -> float:
-    """Half the sample rate of stamps (N,) [s] over the bandwidth of the noise behind a filter, at least 1."""
+    """Half the sample rate of stamps (N,) [s] over the bandwidth of filtered noise, at least 1."""
     if noise_bandwidth_hz is None or len(time) < 2:
         return 1.0
     rate = 1.0 / float(np.median(np.diff(time)))
@@ -189,8 +181,8 @@ def _torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
     """Joint torques and wrenches in limbs, (N, n + 6 F); None if neither was recorded."""
     if log.joint_torque is None and not (robot.ft_names and log.ft_wrench is not None):
         return None
-    nothing = np.full((len(log), robot.n), np.nan)
-    parts = [nothing if log.joint_torque is None else _columns(log.joint_torque, order)]
+    not_recorded = np.full((len(log), robot.n), np.nan)
+    parts = [not_recorded if log.joint_torque is None else _columns(log.joint_torque, order)]
     for name in robot.ft_names:
         if log.ft_wrench is None or name not in log.ft_names:
             parts.append(np.full((len(log), 6), np.nan))
@@ -199,15 +191,15 @@ def _torques(log: Log, robot: Robot, order: list[int]) -> Tensor | None:
     return torch.from_numpy(parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1))
 
 
-def _check_limbs(log: Log, robot: Robot, required: SensorSet) -> None:
-    """Make sure that the log has the required sensors in limbs at all."""
+def _require_limb_sensors(log: Log, robot: Robot, required: SensorSet) -> None:
+    """Refuse a log without the required force/torque sensors in limbs."""
     needed = required.torque[robot.n :].reshape(-1, 6)
-    names = [name for name, here in zip(robot.ft_names, needed, strict=True) if here.any()]
+    names = [name for name, axes in zip(robot.ft_names, needed, strict=True) if axes.any()]
     if names and log.ft_wrench is None:
         raise LogError(log.source, "ft_wrench", "missing", "the field, or sensors without ft_sensors")
-    if lost := [name for name in names if name not in log.ft_names]:
+    if missing := [name for name in names if name not in log.ft_names]:
         accepted = f"every name in sensors.ft_sensors; the log has {', '.join(log.ft_names)}"
-        raise LogError(log.source, "ft_names", f"{', '.join(lost)} missing", accepted)
+        raise LogError(log.source, "ft_names", f"{', '.join(missing)} missing", accepted)
 
 
 def _columns(x: np.ndarray, order: list[int]) -> np.ndarray:
@@ -247,10 +239,10 @@ def _contacts(log: Log, robot: Robot, contacts: Sequence[Contact]) -> tuple[list
 
 
 def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], required: SensorSet) -> None:
-    """Make sure that every value of some sensors was recorded.
+    """Refuse samples in which a value of the required sensors was not recorded.
 
     Raises:
-        LogError: one that is missing.
+        LogError: names the sensor and the sample.
     """
     if required.torque.any():
         torques = required.torque[: robot.n].any()

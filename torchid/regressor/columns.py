@@ -1,4 +1,4 @@
-"""Wrench that each inertial parameter of each body demands, and which columns the fast path computes of them."""
+"""Wrench per unit of each inertial parameter of each body, and the columns that remain after regrouping."""
 
 from __future__ import annotations
 
@@ -71,19 +71,36 @@ def reduction_matrix(tree: KinematicTree) -> Array:
         effective[body][:, own] = parameters.change_of_frame(tree.T_joint_link[body])
     rows = np.zeros((layout.count, width * tree.n_nodes))
     for body in reversed(range(tree.n_nodes)):
-        kept, gone = np.zeros((width, width)), np.eye(width)
+        kept, regrouped = np.zeros((width, width)), np.eye(width)
         for column in layout.kept[body]:
             kept[column, column] = 1.0
-        gone -= kept
+        regrouped -= kept
         if tree.kinds[body] == "revolute":
             kept[_IXX, _IYY] = -1.0
-            gone[_IXX, _IYY] = 1.0
+            regrouped[_IXX, _IYY] = 1.0
         rows[layout.starts[body] : layout.starts[body + 1]] = (kept @ effective[body])[list(layout.kept[body])]
         if body > 0:
             X = parameters.change_of_frame(tree.T_parent_joint[body])
-            effective[tree.parents[body]] += X @ gone @ effective[body]
+            effective[tree.parents[body]] += X @ regrouped @ effective[body]
     own_columns = rows.reshape(layout.count, tree.n_nodes, width)[:, tree.node_of]
     return np.asarray(own_columns.reshape(layout.count, -1))
+
+
+def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | None = None) -> Tensor:
+    """Wrench columns (6, columns, B) of all bodies.
+
+    Args:
+        states: of the frames that `layout`'s parameters are expressed in.
+        layout: which columns to compute.
+        out: a buffer of the result's shape to write to, unchanged since an earlier call with the same layout, or zero.
+    """
+    if out is None:
+        out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
+    for kept, bodies in layout.runs():
+        if kept:
+            columns = out[:, layout.starts[bodies.start] : layout.starts[bodies.stop]]
+            wrench_columns(states.slice_bodies(bodies.start, bodies.stop), kept, columns.unflatten(1, (-1, len(kept))))
+    return out
 
 
 def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) -> None:
@@ -102,27 +119,29 @@ def wrench_columns(states: BodyStates, columns: tuple[int, ...], out: Tensor) ->
         rotate_vectors(inverse, x)
         for x in (states.angular_velocity, states.angular_acceleration, states.specific_force)
     )
-    with_moment_only = [column for column in columns if column >= parameters.INERTIA.start]
-    n_with_force = len(columns) - len(with_moment_only)
+    inertia_columns = [column for column in columns if column >= parameters.INERTIA.start]
+    n_with_force = len(columns) - len(inertia_columns)
     if n_with_force:
         axes = [
             column - parameters.FIRST_MOMENT.start for column in columns[:n_with_force] if column != parameters.MASS
         ]
-        pushes, twists = _first_moment_wrenches(omega, alpha, force)
-        forces = _to_base(states.rotation, [pushes[k] for k in axes])
-        moments = _to_base(states.rotation, [twists[k] for k in axes])
+        unit_forces, unit_moments = _first_moment_wrenches(omega, alpha, force)
+        forces = _rotate_to_base(states.rotation, [unit_forces[k] for k in axes])
+        moments = _rotate_to_base(states.rotation, [unit_moments[k] for k in axes])
         if parameters.MASS in columns:
             forces = torch.cat([states.specific_force[:, :, None], forces], 2)
             moments = torch.nn.functional.pad(moments, (0, 0, 1, 0))
         out[:3, :, :n_with_force] = forces
         out[3:, :, :n_with_force] = moments + cross_product(states.position[:, :, None], forces)
-    if with_moment_only:
-        by_axes = _inertia_moments(omega, alpha)
-        spins = [by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in with_moment_only]
-        out[3:, :, n_with_force:] = _to_base(states.rotation, spins)
+    if inertia_columns:
+        moments_by_axes = _inertia_moments(omega, alpha)
+        inertia_moments = [
+            moments_by_axes[parameters.INERTIA_AXES[column - parameters.INERTIA.start]] for column in inertia_columns
+        ]
+        out[3:, :, n_with_force:] = _rotate_to_base(states.rotation, inertia_moments)
 
 
-def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
+def _rotate_to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
     """Rotate c vectors given by components (k, B) into base axes: (3, k, c, B)."""
     components = torch.stack([torch.stack([vector[axis] for vector in vectors], dim=1) for axis in range(3)])
     return rotate_vectors(rotation.unsqueeze(3), components)
@@ -131,7 +150,7 @@ def _to_base(rotation: Tensor, vectors: list[list[Tensor]] | list[tuple[Tensor, 
 def _first_moment_wrenches(
     omega: Tensor, alpha: Tensor, force: Tensor
 ) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-    """Force ([alpha]x + [omega]x^2) e_k and moment e_k x specific force, for k = x, y, z, in the frame."""
+    """Force ([alpha]x + [omega]x^2) e_k and moment e_k x specific force, for k = x, y, z, in the body frame."""
     x, y, z = omega
     ax, ay, az = alpha
     xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z
@@ -143,7 +162,7 @@ def _first_moment_wrenches(
 
 
 def _inertia_moments(omega: Tensor, alpha: Tensor) -> dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]]:
-    """Moment E alpha + omega x (E omega) of a unit of each inertia number, about and in the frame; by inertia axes."""
+    """Moment E alpha + omega x (E omega) per unit of each inertia entry, about and in the body frame, by its axes."""
     x, y, z = omega
     ax, ay, az = alpha
     xy, xz, yz, xx, yy, zz = x * y, x * z, y * z, x * x, y * y, z * z

@@ -14,7 +14,7 @@ GRAVITY_WORLD = (0.0, 0.0, -9.81)
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of B samples, batch first. K depends on nothing else: neither position nor heading matters.
+    """Motion of B samples, batch first. K depends on nothing else: not on the base's position or heading.
 
     Attributes:
         joint_position, joint_velocity, joint_acceleration: (B, n) by the robot's `joint_names` [rad or m, /s, /s^2].
@@ -62,7 +62,7 @@ def motion_from_state(
         gravity: (3,), in the world [m/s^2].
 
     Raises:
-        ValueError: the shapes of `q`, `v` and `a` are others.
+        ValueError: wrong shapes of `q`, `v` or `a`.
     """
     width_q, width_v = (n, n) if fixed_base else (n + 7, n + 6)
     if q.ndim != 2 or q.shape[1] != width_q or v.shape != (q.shape[0], width_v) or a.shape != v.shape:
@@ -93,9 +93,9 @@ def joint_motion(tree: KinematicTree, motion: Motion) -> JointMotion:
     Raises:
         TypeError: the motion's precision is not the module's.
     """
-    found, own = motion.joint_position.dtype, tree.joint_map.dtype
-    if found != own:
-        raise TypeError(f"motion: found {found}; accepted: {own}, or the module moved with .to({found})")
+    dtype, expected = motion.joint_position.dtype, tree.joint_map.dtype
+    if dtype != expected:
+        raise TypeError(f"motion: found {dtype}; accepted: {expected}, or the module moved with .to({dtype})")
     moving = tree.joint_map[:, : tree.n]
     position = moving @ motion.joint_position.T + tree.joint_constant
     return JointMotion(position, moving @ motion.joint_velocity.T, moving @ motion.joint_acceleration.T)
@@ -124,7 +124,8 @@ class BodyStates:
 def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> BodyStates:
     """States of all joint frames.
 
-    Twists and accelerations are sums over ancestors, taken with one product each by the 0/1 ancestor matrix.
+    Twists and accelerations are sums over ancestors of what each joint adds (`..._joint`), with one product each by the
+    0/1 ancestor matrix.
     """
     rotation, position = joint_frame_poses(tree, joints.position)
     axis = rotation[:, 2]
@@ -132,17 +133,21 @@ def body_states(tree: KinematicTree, motion: Motion, joints: JointMotion) -> Bod
     def of_parent(x: Tensor) -> Tensor:
         return x.index_select(1, tree.parent)
 
-    spin = axis * (joints.velocity * tree.revolute)
-    omega = motion.base_angular_velocity.T[:, None] + tree.ancestors @ spin
+    omega_joint = axis * (joints.velocity * tree.revolute)
+    omega = motion.base_angular_velocity.T[:, None] + tree.ancestors @ omega_joint
     parent_omega = of_parent(omega)
-    own = torch.addcmul(cross_product(parent_omega, spin), axis, joints.acceleration * tree.revolute)
-    alpha = motion.base_angular_acceleration.T[:, None] + tree.ancestors @ own
+    alpha_joint = torch.addcmul(cross_product(parent_omega, omega_joint), axis, joints.acceleration * tree.revolute)
+    alpha = motion.base_angular_acceleration.T[:, None] + tree.ancestors @ alpha_joint
     step = position - of_parent(position)
-    carried = cross_product(of_parent(alpha), step) + cross_product(parent_omega, cross_product(parent_omega, step))
+    linear_joint = cross_product(of_parent(alpha), step) + cross_product(
+        parent_omega, cross_product(parent_omega, step)
+    )
     if any(tree.slides):
         slide = axis * tree.prismatic
-        carried = carried + slide * joints.acceleration + 2.0 * cross_product(parent_omega, slide * joints.velocity)
-    force = motion.base_specific_force.T[:, None] + tree.ancestors @ carried
+        linear_joint = (
+            linear_joint + slide * joints.acceleration + 2.0 * cross_product(parent_omega, slide * joints.velocity)
+        )
+    force = motion.base_specific_force.T[:, None] + tree.ancestors @ linear_joint
     return BodyStates(rotation, position, omega, alpha, force)
 
 
@@ -164,22 +169,29 @@ def joint_frame_poses(tree: KinematicTree, position: Tensor) -> tuple[Tensor, Te
     slide = position * tree.prismatic.index_select(0, tree.by_depth) if any(tree.slides) else None
     cosine, sine = torch.cos(angle), torch.sin(angle)
     identity = torch.eye(3, 4, dtype=position.dtype, device=position.device)[..., None, None]
-    above = identity.expand(3, 4, 1, position.shape[-1])
-    levels, start = [above], 1
+    parent_poses = identity.expand(3, 4, 1, position.shape[-1])
+    levels, start = [parent_poses], 1
     for size in tree.level_sizes[1:]:
         level = slice(start, start + size)
-        above = above.index_select(2, tree.place_above[level])
-        unmoved = rotate_vectors(above[:, :, None], tree.pose[:, None, :, level])
+        parent_poses = parent_poses.index_select(2, tree.parent_in_level[level])
+        unmoved = rotate_vectors(parent_poses[:, :, None], tree.pose[:, None, :, level])
         c, s = cosine[level], sine[level]
         x, y, z, origin = unmoved.unbind(1)
-        origin = origin + above[:, 3]
+        origin = origin + parent_poses[:, 3]
         if slide is not None:
             origin = torch.addcmul(origin, z, slide[level])
-        above = torch.stack([torch.addcmul(c * x, s, y), torch.addcmul(c * y, s, x, value=-1), z, origin], dim=1)
-        levels.append(above)
+        parent_poses = torch.stack([torch.addcmul(c * x, s, y), torch.addcmul(c * y, s, x, value=-1), z, origin], dim=1)
+        levels.append(parent_poses)
         start += size
     pose = torch.cat(levels, 2).index_select(2, tree.depth_first)
     return pose[:, :3], pose[:, 3]
+
+
+def joint_screw_axes(tree: KinematicTree, states: BodyStates) -> Tensor:
+    """Screw axes of all joints, (6, L, B): `screw_axis . wrench at the base origin` is the torque about the joint."""
+    axis = states.rotation[:, 2]
+    linear = cross_product(states.position, axis) * tree.revolute + axis * tree.prismatic
+    return torch.cat([linear, axis * tree.revolute])
 
 
 def rotation_matrix(quat_xyzw: Tensor) -> Tensor:

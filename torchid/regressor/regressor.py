@@ -1,4 +1,4 @@
-"""The regressor K(q, v, a) and contact Jacobians J: rows, batch-last, and modules for anybody's training loop."""
+"""The regressor K(q, v, a) and frame Jacobians J as modules, and the functions that compute their rows, batch-last."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchid import parameters
 from torchid.parameters import Array
-from torchid.regressor.columns import ColumnLayout, full_layout, wrench_columns
+from torchid.regressor.columns import ColumnLayout, all_wrench_columns, full_layout
 from torchid.regressor.kinematics import (
     GRAVITY_WORLD,
     BodyStates,
@@ -20,6 +20,7 @@ from torchid.regressor.kinematics import (
     body_states,
     cross_product,
     joint_motion,
+    joint_screw_axes,
     link_states,
     motion_from_state,
 )
@@ -34,7 +35,7 @@ class Regressor(nn.Module):
     parameters in `torchid.parameters`' order. Rows: base force, base moment (base frame, about the base origin), then
     `robot.dof_names`: joints, and the wrenches of force/torque sensors in limbs; a fixed base has no base rows.
 
-    With `FrameJacobian` and `torchid.Projection`, the plain way to the equations of a fit. Fits take
+    With `FrameJacobian` and `torchid.Projection`, the reference implementation of the equations of a fit. Fits use
     `torchid.RowBuilder`, which shares the functions of this package but never forms K, for speed
     (`tests/problem/test_rows_two_ways.py` compares both).
     """
@@ -47,7 +48,7 @@ class Regressor(nn.Module):
         Args:
             robot: the robot.
             gravity: (3,), in the world (in the base frame if the base is fixed) [m/s^2].
-            sign_width: Coulomb friction goes with tanh(velocity / width) instead of the sign [rad/s or m/s].
+            sign_width: Coulomb friction is tanh(velocity / width) instead of the sign [rad/s or m/s].
         """
         super().__init__()
         self.gravity = gravity
@@ -68,7 +69,7 @@ class Regressor(nn.Module):
             `.contiguous()` where layout matters.
 
         Raises:
-            ValueError: the shapes do not belong together.
+            ValueError: wrong shapes.
         """
         return self.from_motion(motion_from_state(q, v, a, self.tree.n, not self.tree.base_rows, self.gravity))
 
@@ -135,37 +136,13 @@ def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, screw_ax
 def friction_columns(row: JointRow, tree: KinematicTree, joints: JointMotion) -> list[tuple[int, Tensor, Tensor]]:
     """Friction entries of one joint's row: body, column of fc, column of fv, each (B,).
 
-    Friction resists: it adds `fc sign(v) + fv v` to the torque the actuator must give.
+    Friction adds `fc sign(v) + fv v` to the actuator's torque.
     """
     entries = []
     for body, ratio in row.moved:
         velocity = joints.velocity[body]
         entries.append((body, ratio * tree.coulomb_sign(velocity), ratio * velocity))
     return entries
-
-
-def joint_screw_axes(tree: KinematicTree, states: BodyStates) -> Tensor:
-    """Screw axes of all joints, (6, L, B): `screw_axis . wrench at the base origin` is the torque about the joint."""
-    axis = states.rotation[:, 2]
-    linear = cross_product(states.position, axis) * tree.revolute + axis * tree.prismatic
-    return torch.cat([linear, axis * tree.revolute])
-
-
-def all_wrench_columns(states: BodyStates, layout: ColumnLayout, out: Tensor | None = None) -> Tensor:
-    """Wrench columns (6, columns, B) of all bodies.
-
-    Args:
-        states: of the frames that `layout`'s parameters are expressed in.
-        layout: which columns to compute.
-        out: a buffer of the result's shape to write to, unchanged since an earlier call with the same layout, or zero.
-    """
-    if out is None:
-        out = states.position.new_zeros(6, layout.count, states.position.shape[-1])
-    for kept, bodies in layout.runs():
-        if kept:
-            columns = out[:, layout.starts[bodies.start] : layout.starts[bodies.stop]]
-            wrench_columns(states.slice_bodies(bodies.start, bodies.stop), kept, columns.unflatten(1, (-1, len(kept))))
-    return out
 
 
 def _torque(screw_axis: Tensor, wrenches: Tensor) -> Tensor:
@@ -185,7 +162,7 @@ def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor) -> Tensor:
 def generalized_forces(
     tree: KinematicTree, screw_axes: Tensor, body: int, wrenches: Tensor, joints: Sequence[int]
 ) -> Tensor:
-    """Work of wrenches on a body, per unit of base twist and joint velocity.
+    """Generalized forces of wrenches on a body: their power per unit of base twist and joint velocity.
 
     Args:
         tree: the robot's constants.
@@ -235,8 +212,8 @@ class FrameJacobian(nn.Module):
         n_rows = nv + 6 F: force/torque sensors in limbs add six columns each, after those of the joints.
         """
         tree = self.tree
-        still = q.new_zeros(q.shape[0], tree.n + tree.base_rows)
-        motion = motion_from_state(q, still, still, tree.n, not tree.base_rows, GRAVITY_WORLD)
+        zero = q.new_zeros(q.shape[0], tree.n + tree.base_rows)
+        motion = motion_from_state(q, zero, zero, tree.n, not tree.base_rows, GRAVITY_WORLD)
         states = body_states(tree, motion, joint_motion(tree, motion))
         wrenches = wrenches_at_base(states, self._body, self.get_buffer("unit_wrenches"))
         J = generalized_forces(tree, joint_screw_axes(tree, states), self._body, wrenches, self._joints)

@@ -1,4 +1,4 @@
-"""Constants of a robot's tree: a node for each body, and five more for every weld that is measured."""
+"""Constants of the kinematic tree: a node per body, and five massless ones per weld with a force/torque sensor."""
 
 from __future__ import annotations
 
@@ -82,8 +82,9 @@ class KinematicTree(nn.Module):
         joint_map, (L, n + 6 F), joint_constant: positions of the base (0) and all L - 1 joints from the robot's degrees
             of freedom, of which the first n move.
 
-    `sign_width`: as in `Regressor`. `node_of`: node of each of the robot's bodies. `body_of`: body of each node, that
-    beyond the weld if it is massless.
+    `n_nodes`: one for each body, and five more for every force/torque sensor in a limb. `sign_width`: as in
+    `Regressor`. `node_of`: node of each of the robot's bodies. `body_of`: body of each node; for a
+    massless node the body beyond the weld.
     """
 
     pose: Tensor
@@ -97,7 +98,7 @@ class KinematicTree(nn.Module):
     ancestors: Tensor
     joint_map: Tensor
     joint_constant: Tensor
-    place_above: Tensor
+    parent_in_level: Tensor
 
     def __init__(self, robot: Robot, sign_width: float | None = None) -> None:
         super().__init__()
@@ -109,7 +110,7 @@ class KinematicTree(nn.Module):
         self.slides = [node.slides for node in nodes]
         self.kinds = [node.kind for node in nodes]
         self.base_rows, self.n, self.n_dofs, self.n_rows = robot.base_rows, robot.n, robot.n_dofs, robot.n_rows
-        count = len(nodes)
+        count = self.n_nodes = len(nodes)
         joint_frame = np.tile(np.eye(4), (count, 1, 1))
         for index, node in enumerate(nodes[1:], start=1):
             joint_frame[index, :3, :3] = _rotation_to_z(node.axis)
@@ -145,16 +146,11 @@ class KinematicTree(nn.Module):
         self._register("parent", parent)
         self._register("by_depth", by_depth)
         self._register("depth_first", position)
-        self._register("place_above", position[parent[by_depth]] - level_start)
+        self._register("parent_in_level", position[parent[by_depth]] - level_start)
 
     def _register(self, name: str, value: np.ndarray) -> None:
         dtype = torch.int64 if value.dtype.kind == "i" else torch.float64
         self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)
-
-    @property
-    def n_nodes(self) -> int:
-        """Number of nodes: one for each body, and five more for every force/torque sensor in a limb."""
-        return len(self.parents)
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:
         """Sign of velocities [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""
@@ -171,7 +167,7 @@ class KinematicTree(nn.Module):
         return node, self.T_joint_link[node] @ T_body_link
 
     def path(self, body: int) -> list[int]:
-        """Nodes whose joints move node `body`, from the base outward, itself included, the base not."""
+        """Nodes whose joints move node `body`, from the base outward, including itself, without the base."""
         path: list[int] = []
         while body > 0:
             path.insert(0, body)

@@ -10,28 +10,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from yourdfpy.urdf import Inertial, Link
 
 from torchid import parameters
-from torchid.errors import (
-    MasslessBodyWarning,
-    UnknownNameError,
-    UnphysicalInertiaWarning,
-    UrdfError,
-    current_file,
-    during,
-    warn,
-)
+from torchid.errors import MasslessBodyWarning, UnknownNameError, UrdfError, current_file, during, warn
 from torchid.parameters import WRENCH_COMPONENTS, Array
-from torchid.robot.tree import BodyJoint, BodyTree, JointGeometry, build_chain, build_tree, joint_geometry, link_poses
+from torchid.robot.tree import (
+    BodyJoint,
+    JointGeometry,
+    build_chain,
+    build_tree,
+    joint_geometry,
+    link_poses,
+    nominal_parameters,
+)
 from torchid.robot.urdf import read_urdf
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Chain
-
-_TRIANGLE_TOLERANCE = 1e-3  # URDFs carry few digits: thin plates break the inequality by rounding alone
-_ROUNDING = 1e-6  # of the largest principal inertia
-_POINT = 1e-12  # [m^2]: below it a point mass is meant
 
 
 @dataclass(frozen=True)
@@ -112,7 +107,7 @@ class Robot:
 
     @cached_property
     def children(self) -> tuple[tuple[int, ...], ...]:
-        """Bodies that hang on each of the L bodies, depth first."""
+        """Child bodies of each of the L bodies, depth first."""
         return tuple(
             tuple(child for child, body in enumerate(self.bodies) if child and body.parent == parent)
             for parent in range(len(self.bodies))
@@ -120,7 +115,7 @@ class Robot:
 
     @property
     def massless(self) -> tuple[str, ...]:
-        """Bodies without mass or inertia: their inertial parameters stay out of the fit."""
+        """Bodies without mass or inertia: their inertial parameters are not fitted."""
         return tuple(body.name for body in self.bodies if body.massless)
 
     @cached_property
@@ -161,7 +156,7 @@ class Robot:
 
         Args:
             name: the link.
-            field: what named it, for the error: in `current_file`, or else the URDF.
+            field: the setting or log field that names it, for the error: in `current_file`, or else the URDF.
 
         Raises:
             UnknownNameError: the URDF has no such link.
@@ -178,9 +173,9 @@ def load_robot(
 
     Args:
         path: the URDF file; meshes are never opened.
-        base_link: the link that becomes the floating (or bolted) base, by default the URDF's root.
+        base_link: the link that becomes the floating (or bolted) base, by default the root of the URDF.
         fixed_base: True if the base does not move.
-        ft_joints: fixed joints with a force/torque sensor: what lies beyond is a body of its own.
+        ft_joints: fixed joints with a force/torque sensor: the links beyond form a body of their own.
 
     Raises:
         UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass.
@@ -211,45 +206,9 @@ def load_robot(
         return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, build_chain(tree))
 
 
-def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Array:
-    """Parameters (L, 12) of the bodies, each in its link frame.
-
-    Warns:
-        UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
-    """
-    nominal = np.zeros((len(tree.names), parameters.PER_BODY))
-    for name, (body, T_body_link) in tree.links.items():
-        inertial = links[name].inertial
-        if inertial is None:
-            continue
-        _warn_if_unphysical(path, name, inertial)
-        T_link_com = np.eye(4) if inertial.origin is None else inertial.origin
-        at_com = parameters.inertial_vector(inertial.mass, np.zeros(3), inertial.inertia)
-        nominal[body, parameters.INERTIAL] += parameters.change_of_frame(T_body_link @ T_link_com) @ at_com
-    for body, joint in enumerate(tree.joints):
-        if joint is not None:
-            nominal[body, parameters.FRICTION] = joint.friction, joint.damping
-    return nominal
-
-
-def _warn_if_unphysical(path: Path, link: str, inertial: Inertial) -> None:
-    small, middle, large = np.linalg.eigvalsh(inertial.inertia)
-    if large == small == inertial.mass == 0.0:
-        return
-    if inertial.mass == 0.0:
-        what = "mass 0 kg with an inertia that is not 0"
-    elif small < -_ROUNDING * large - _POINT * inertial.mass:
-        what = f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m^2 are not all positive"
-    elif large > (small + middle) * (1.0 + _TRIANGLE_TOLERANCE) + _POINT * inertial.mass:
-        what = f"largest principal inertia {large:.3g} exceeds the sum of the others, {small + middle:.3g} kg m^2"
-    else:
-        return
-    warn(f"{path}: link '{link}': {what}; used as written", UnphysicalInertiaWarning)
-
-
 def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:
     parents = {body.parent for body in bodies}
     for index, body in enumerate(bodies):
         if body.massless and index not in parents:
-            message = f"{path}: link '{body.name}': no inertia at the end of a limb; its inertia stays out of the fit"
+            message = f"{path}: link '{body.name}': no inertia at the end of a limb; its inertia is not fitted"
             warn(message, MasslessBodyWarning)

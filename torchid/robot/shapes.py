@@ -1,4 +1,4 @@
-"""Where the matter of a body can be: the box and the ellipsoid around its shapes (the only module with trimesh)."""
+"""Extent of a body: the box and the ellipsoid around its shapes (the only module that imports trimesh)."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from torchid.robot.urdf import MeshError, mesh_content, parse_xml, read_urdf
 ShapeKind = Literal["collision", "visual"]
 SHAPE_TAGS = ("box", "sphere", "cylinder", "capsule", "mesh")
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-_STL_HEAD, _FACE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_CORNER = re.compile(rb"\bvertex\s+(\S{1,40})\s+(\S{1,40})\s+(\S{1,40})", re.IGNORECASE)
-_SAMPLE, _FEW = 20_000, 0.1  # points whose hull is tried first, and the share of corners that makes a hull worth it
-_PART = 2**16  # points that are turned at a time
-_THINNEST = 1e-3  # of the longest edge: a plate or a flat mesh keeps an interior
+_STL_HEAD, _STL_FACE = 84, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_VERTEX = re.compile(rb"\bvertex\s+(\S{1,40})\s+(\S{1,40})\s+(\S{1,40})", re.IGNORECASE)
+_SAMPLE = 20_000  # points whose convex hull is computed first
+_FEW = 0.1  # largest share of hull vertices among all points at which a mesh is replaced by its hull
+_PART = 2**16  # points that are rotated at a time
+_THINNEST = 1e-3  # least edge over the longest one: a plate or a flat mesh keeps an interior
 
 
 @dataclass(frozen=True)
@@ -65,10 +66,11 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
     """Extents of bodies, by index, each around all shapes of all links that the body is made of.
 
     A link without shapes of the preferred kind counts with those of the other kind. A link that has mass and neither
-    counts as the uniform box of its inertia, provided that another link of the body has shapes. The box has the axes,
-    of the body's link and of every shape, in which its volume is least; of shapes of very many points, the first few
-    are tried. The ellipsoid's semi-axes are the box's half edges times the least factor that encloses all: sqrt(3)
-    around a box (the smallest ellipsoid there is), sqrt(2) around a cylinder, 1 around a sphere.
+    counts as the uniform box of its inertia, provided that another link of the body has shapes. The axes of the box are
+    those of the body's link or of one of its shapes, whichever give the least volume; for shapes of very many points
+    only the first few are tried. The ellipsoid's semi-axes are the box's half edges times the least factor that
+    encloses all shapes: sqrt(3) around a box (the smallest ellipsoid there is), sqrt(2) around a cylinder, 1 around a
+    sphere.
 
     Args:
         robot: any; meshes are looked for in its URDF's package and, by `package://`, in those beside it.
@@ -76,45 +78,45 @@ def body_extents(robot: Robot, prefer: ShapeKind = "visual", bodies: Iterable[in
         bodies: indices; all that have mass if None.
 
     Raises:
-        UrdfError: a shape is not described by numbers, or of no known kind.
+        UrdfError: a shape of an unknown kind, or one whose numbers cannot be read.
 
     Warns:
-        TorchidWarning: bodies that get no extent, because they have no shapes, or because a mesh cannot be read: the
-            box around the rest would be too small.
+        TorchidWarning: bodies without an extent, because they have no shapes or a mesh cannot be read (the box around
+            their other shapes would be too small).
     """
     elements = {link.get("name"): link for link in parse_xml(robot.path).getroot().findall("link")}
     inertials = {link.name: link.inertial for link in read_urdf(robot.path)[0]}
     chosen = [i for i, body in enumerate(robot.bodies) if not body.massless] if bodies is None else bodies
-    found: dict[int, Extent] = {}
+    extents: dict[int, Extent] = {}
     shapeless, unreadable, reasons = [], [], []
     meshes = _Meshes(robot.path)
     for index in chosen:
-        body, shapes, unseen = robot.bodies[index], [], []
+        body, shapes, inertia_boxes = robot.bodies[index], [], []
         try:
             for name in body.links:
                 T_body_link = robot.links[name][1]
-                of_link = _link_shapes(meshes, elements[name], prefer)
-                shapes += [shape.moved(T_body_link) for shape in of_link]
-                if not of_link and inertials[name] is not None and inertials[name].mass > 0.0:
-                    unseen.append(_inertia_box(inertials[name]).moved(T_body_link))
+                link_shapes = _link_shapes(meshes, elements[name], prefer)
+                shapes += [shape.moved(T_body_link) for shape in link_shapes]
+                if not link_shapes and inertials[name] is not None and inertials[name].mass > 0.0:
+                    inertia_boxes.append(_inertia_box(inertials[name]).moved(T_body_link))
         except MeshError as error:
             unreadable.append(body.name)
             reasons.append(str(error))
             continue
-        extent = _extent(shapes + unseen) if shapes else None
+        extent = _extent(shapes + inertia_boxes) if shapes else None
         if extent is None:
             shapeless.append(body.name)
         else:
-            found[index] = extent
-    _warn(robot.path, "no shapes", shapeless, [])
-    _warn(robot.path, "a mesh that cannot be read", unreadable, reasons)
-    return found
+            extents[index] = extent
+    _warn_without_extent(robot.path, "no shapes", shapeless, [])
+    _warn_without_extent(robot.path, "a mesh that cannot be read", unreadable, reasons)
+    return extents
 
 
-def _warn(path: Path, what: str, bodies: list[str], reasons: list[str]) -> None:
+def _warn_without_extent(path: Path, what: str, bodies: list[str], reasons: list[str]) -> None:
     if bodies:
         reason = f" ({reasons[0]}{', ...' if len(reasons) > 1 else ''})" if reasons else ""
-        message = f"{path}: {what} at {', '.join(bodies)}{reason}: where their matter lies is not known"
+        message = f"{path}: {what} at {', '.join(bodies)}{reason}: their extent is unknown"
         warn(message)
 
 
@@ -138,7 +140,7 @@ def _shape(meshes: _Meshes, field: str, element: etree._Element) -> _Shape:
     if len(tags) != 1 or tags[0].tag not in SHAPE_TAGS:
         found = ", ".join(f"<{child.tag!s}>" for child in tags) or "no shape"
         raise UrdfError(path, f"{field} <geometry>", found, f"one of {', '.join(SHAPE_TAGS)}")
-    points, spread = _of_kind(meshes, f"{field} <{tags[0].tag!s}", tags[0])
+    points, spread = _points_and_spread(meshes, f"{field} <{tags[0].tag!s}", tags[0])
     origin, T = element.find("origin"), np.eye(4)
     if origin is not None:
         rpy, xyz = (_numbers(path, f"{field} <origin", origin, name, 3, "0 0 0") for name in ("rpy", "xyz"))
@@ -146,7 +148,7 @@ def _shape(meshes: _Meshes, field: str, element: etree._Element) -> _Shape:
     return _Shape(points, spread, np.eye(3)).moved(T)
 
 
-def _of_kind(meshes: _Meshes, field: str, shape: etree._Element) -> tuple[Array, Array]:
+def _points_and_spread(meshes: _Meshes, field: str, shape: etree._Element) -> tuple[Array, Array]:
     """Points (N, 3) and spread (3, 3) of a shape in its own frame."""
     path = meshes.urdf
     if shape.tag == "box":
@@ -180,30 +182,30 @@ def _numbers(path: Path, field: str, element: etree._Element, name: str, count: 
 
 
 class _Meshes:
-    """The meshes that a URDF names, each read once, however often it is named."""
+    """The meshes that a URDF names, each read once."""
 
     def __init__(self, urdf: Path) -> None:
-        """None is read yet."""
+        """Start without any mesh; `urdf` is the file that names them."""
         self.urdf, self._read, self._left = urdf, dict[str, Array | MeshError](), MAX_POINTS
 
     def vertices(self, filename: str) -> Array:
         """The corners (N, 3) [m] of a mesh; MeshError where it cannot be read, or all shapes have too many."""
         if filename not in self._read:
             try:
-                self._read[filename] = _corners(_vertices(self.urdf, filename))
+                self._read[filename] = _hull_vertices(_mesh_vertices(self.urdf, filename))
             except MeshError as error:
                 self._read[filename] = error
-        found = self._read[filename]
-        if isinstance(found, MeshError):
-            raise found
-        self._left -= len(found)
+        vertices = self._read[filename]
+        if isinstance(vertices, MeshError):
+            raise vertices
+        self._left -= len(vertices)
         if self._left < 0:
             raise MeshError(f"{excerpt(filename)}: shapes of more than {MAX_POINTS} points in all")
-        return found
+        return vertices
 
 
-def _corners(points: Array) -> Array:
-    """The points of a mesh that reach furthest in some direction, (K, 3), where they are much fewer than all."""
+def _hull_vertices(points: Array) -> Array:
+    """Vertices of a mesh's convex hull, (K, 3), if they are much fewer than all its points; else all."""
     try:
         for sample in (points[:: max(1, len(points) // _SAMPLE)], points):
             hull = ConvexHull(sample).vertices
@@ -214,34 +216,34 @@ def _corners(points: Array) -> Array:
     return np.asarray(points[hull])
 
 
-def _vertices(urdf: Path, filename: str) -> Array:
+def _mesh_vertices(urdf: Path, filename: str) -> Array:
     """Vertices (N, 3) [m] of a mesh, in the unit that the file states, if any; other files it names are not read."""
     kind, content = mesh_content(urdf, filename)
     if kind == "stl":
-        return _checked(filename, _of_stl(filename, content))
+        return _require_vertices(filename, _stl_vertices(filename, content))
     try:
         with np.errstate(all="ignore"):
             mesh = trimesh.load(io.BytesIO(content), kind, force="mesh", process=False, skip_materials=True)
-    except Exception as error:  # noqa: B902 - readers of several formats raise what they like
+    except Exception as error:  # noqa: B902 - readers of different formats raise different errors
         raise MeshError(f"{excerpt(filename)}: {type(error).__name__}: {excerpt(str(error))}") from error
     units = getattr(mesh, "units", None)
-    with np.errstate(all="ignore"):  # of units that no mesh has, which the check that follows refuses
+    with np.errstate(all="ignore"):  # overflow, which the check that follows refuses
         unit = trimesh.units.unit_conversion(units, "meters") if units else 1.0
-        return _checked(filename, np.asarray(getattr(mesh, "vertices", ())) * unit)
+        return _require_vertices(filename, np.asarray(getattr(mesh, "vertices", ())) * unit)
 
 
-def _of_stl(filename: str, content: bytes) -> np.ndarray:
+def _stl_vertices(filename: str, content: bytes) -> np.ndarray:
     """Corners (3 faces, 3) of an STL file, binary if its size says so, or else of text."""
-    if len(content) == _STL_HEAD + _FACE.itemsize * int.from_bytes(content[80:_STL_HEAD], "little"):
-        return np.frombuffer(content, _FACE, offset=_STL_HEAD)["corners"].reshape(-1, 3)
+    if len(content) == _STL_HEAD + _STL_FACE.itemsize * int.from_bytes(content[80:_STL_HEAD], "little"):
+        return np.frombuffer(content, _STL_FACE, offset=_STL_HEAD)["corners"].reshape(-1, 3)
     try:
-        return np.array(_CORNER.findall(content)).astype(np.float64).reshape(-1, 3)
+        return np.array(_STL_VERTEX.findall(content)).astype(np.float64).reshape(-1, 3)
     except ValueError as error:
         raise MeshError(f"{excerpt(filename)}: ValueError: {excerpt(str(error))}") from error
 
 
-def _checked(filename: str, vertices: object) -> Array:
-    with np.errstate(invalid="ignore"):  # of NaN of a kind that float64 has not
+def _require_vertices(filename: str, vertices: object) -> Array:
+    with np.errstate(invalid="ignore"):  # signalling NaN
         points = np.asarray(vertices, dtype=np.float64)
     if not len(points) or points.shape[1:] != (3,) or not np.isfinite(points).all():
         raise MeshError(f"{excerpt(filename)}: no vertices")
@@ -260,24 +262,27 @@ def _inertia_box(inertial: Inertial) -> _Shape:
 
 
 def _extent(shapes: list[_Shape]) -> Extent | None:
-    """Of one body's shapes, None if they are a point."""
+    """Extent of one body's shapes; None if they are a single point."""
     points, spreads = np.concatenate([shape.points for shape in shapes]), np.stack([shape.spread for shape in shapes])
     of_point = np.repeat(np.arange(len(shapes)), [len(shape.points) for shape in shapes])
     tried = 1 + min(len(shapes), max(1, MAX_AXES // len(points)))
-    boxes = [_box(points, spreads, of_point, axes) for axes in (np.eye(3), *(shape.axes for shape in shapes))[:tried]]
-    volumes = [float(np.prod(half)) for _, _, half in boxes]
-    best = next(i for i, volume in enumerate(volumes) if volume <= min(volumes) * (1.0 + 1e-9))  # the link's if as good
-    centre, axes, half = boxes[best]
+    candidates = (np.eye(3), *(shape.axes for shape in shapes))[:tried]
+    boxes = [_box(points, spreads, of_point, axes) for axes in candidates]
+    volumes = [float(np.prod(half)) for _, half in boxes]
+    best = next(
+        i for i, volume in enumerate(volumes) if volume <= min(volumes) * (1.0 + 1e-9)
+    )  # the link's own axes if as good
+    (centre, half), axes = boxes[best], candidates[best]
     if not half.any():
         return None
     half = np.maximum(half, _THINNEST * half.max())
     to_unit = (axes / half).T  # (3, 3), takes the box to a cube of half edge 1
-    factor = max(_reach((shape.points - centre) @ to_unit.T, to_unit @ shape.spread) for shape in shapes)
+    factor = max(_largest_norm((shape.points - centre) @ to_unit.T, to_unit @ shape.spread) for shape in shapes)
     return Extent(centre, axes, half, min(factor, np.sqrt(3.0)) * half)
 
 
-def _box(points: Array, spreads: Array, of_point: np.ndarray, axes: Array) -> tuple[Array, Array, Array]:
-    """Centre (3,) and half edges (3,) of the box along given axes, which come back between them.
+def _box(points: Array, spreads: Array, of_point: np.ndarray, axes: Array) -> tuple[Array, Array]:
+    """Centre (3,) and half edges (3,) of the box along given axes.
 
     Args:
         points: (N, 3), of all shapes.
@@ -285,34 +290,34 @@ def _box(points: Array, spreads: Array, of_point: np.ndarray, axes: Array) -> tu
         of_point: (N,), the shape of each point.
         axes: (3, 3), columns.
     """
-    wide = np.linalg.norm(np.swapaxes(spreads, 1, 2) @ axes, axis=1)
+    spread_along = np.linalg.norm(np.swapaxes(spreads, 1, 2) @ axes, axis=1)
     top, bottom = np.full(3, -np.inf), np.full(3, np.inf)
     for part in (slice(k, k + _PART) for k in range(0, len(points), _PART)):
-        along, beside = points[part] @ axes, wide[of_point[part]]
-        top = np.maximum(top, (along + beside).max(axis=0))
-        bottom = np.minimum(bottom, (along - beside).min(axis=0))
-    return axes @ (top + bottom) / 2.0, axes, (top - bottom) / 2.0
+        position, margin = points[part] @ axes, spread_along[of_point[part]]
+        top = np.maximum(top, (position + margin).max(axis=0))
+        bottom = np.minimum(bottom, (position - margin).min(axis=0))
+    return axes @ (top + bottom) / 2.0, (top - bottom) / 2.0
 
 
-def _reach(points: Array, spread: Array) -> float:
+def _largest_norm(points: Array, spread: Array) -> float:
     """Greatest |p + spread @ u| over points p, (N, 3), and |u| <= 1.
 
-    With p turned into the singular directions of spread, values s, its square is the least over t > max s^2 of
-    |p|^2 + t + sum s^2 p^2 / (t - s^2), the Lagrange dual, which has no gap for a quadratic over a ball; no t gives too
-    little.
+    With p in the singular directions of spread, singular values s, its square is the minimum over t > max s^2 of
+    |p|^2 + t + sum s^2 p^2 / (t - s^2), the Lagrange dual. It has no gap for a quadratic over a ball, and every t gives
+    an upper bound.
     """
     if not spread.any():
         return float(np.linalg.norm(points, axis=1).max())
     U, s, _ = np.linalg.svd(spread)
     reach = 0.0
     for p in (points @ U) ** 2:
-        below, far = s[0] ** 2 - s**2, float(np.sqrt(s**2 @ p))  # the best t is at most `far` beyond max s^2
+        below, limit = s[0] ** 2 - s**2, float(np.sqrt(s**2 @ p))  # bound on the best t - max s^2
 
-        def dual(beyond: float, p: Array = p, below: Array = below) -> float:
-            return float(p.sum() + s[0] ** 2 + beyond + (s**2 * p / (beyond + below)).sum())
+        def dual(excess: float, p: Array = p, below: Array = below) -> float:
+            return float(p.sum() + s[0] ** 2 + excess + (s**2 * p / (excess + below)).sum())
 
         least = (s[0] + np.sqrt(p.sum())) ** 2
-        if far > 0.0:
-            least = minimize_scalar(dual, bounds=(0.0, far), method="bounded", options={"xatol": 1e-9 * far}).fun
+        if limit > 0.0:
+            least = minimize_scalar(dual, bounds=(0.0, limit), method="bounded", options={"xatol": 1e-9 * limit}).fun
         reach = max(reach, float(np.sqrt(least)))
     return reach

@@ -1,4 +1,7 @@
-"""From URDF links and joints to a tree of bodies, and its chain (the only module with pytorch-kinematics)."""
+"""From URDF links and joints to a tree of bodies, their nominal parameters and the kinematic chain.
+
+The only module that imports pytorch-kinematics.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,20 @@ from pytorch_kinematics.frame import Frame
 from pytorch_kinematics.frame import Joint as FrameJoint
 from pytorch_kinematics.frame import Link as FrameLink
 from scipy.spatial.transform import Rotation
-from yourdfpy.urdf import Joint, Link
+from yourdfpy.urdf import Inertial, Joint, Link
 
-from torchid.errors import UnknownNameError, UrdfError, warn
+from torchid import parameters
+from torchid.errors import UnknownNameError, UnphysicalInertiaWarning, UrdfError, warn
 from torchid.guards import MAX_NUMBER
 from torchid.parameters import Array
 from torchid.robot.urdf import MOVING_TYPES
 
 FT_FIELD = "force/torque sensor at a fixed joint"
+
+_TRIANGLE_TOLERANCE = 1e-3  # URDFs carry few digits: thin plates violate the inequality by rounding alone
+_ROUNDING = 1e-6  # of the largest principal inertia
+_POINT = 1e-12  # [m^2]: below it the link is a point mass
+_MOVED = " (moved by its joint)"  # the frame a joint moves; the body's link frame may be offset from it
 
 
 @dataclass(frozen=True)
@@ -37,9 +46,9 @@ class BodyJoint:
     """The joint that moves a body; of kind "fixed", the weld through a force/torque sensor.
 
     `T_parent_joint`, (4, 4), is the pose of the joint frame at position 0 in the parent body's link frame; the joint
-    moves that frame about or along `axis`, (3,), of unit length in it. `T_joint_link`, (4, 4), is the pose of the
-    body's link frame in the moved joint frame: the identity unless the base link turned the joint around. The axis of
-    a weld is z, or -z where the joint is turned around, so that the sensor reads the opposite wrench.
+    moves that frame about or along `axis`, (3,), a unit vector in it. `T_joint_link`, (4, 4), is the pose of the body's
+    link frame in the moved joint frame: the identity unless `base_link` reverses the joint. The axis of a weld is z, or
+    -z where the joint is reversed, so that the sensor reads the opposite wrench.
     """
 
     name: str
@@ -79,8 +88,9 @@ def build_tree(
         raise UnknownNameError(path, "robot.base_link", base_link, names)
     _check_welds(path, names, joints, ft_joints)
     mimics = _resolve_mimics(path, joints)
+    locked = {name for name, mimic in mimics.items() if not mimic.master}
     neighbours: dict[str, list[tuple[Joint, bool]]] = {name: [] for name in names}
-    for joint in joints:  # a parent's own children come first, in the URDF's order
+    for joint in joints:  # children before parents, each in the URDF's order
         neighbours[joint.parent].append((joint, False))
     for joint in joints:
         neighbours[joint.child].append((joint, True))
@@ -91,18 +101,18 @@ def build_tree(
         name, joint, reverse = stack.pop()
         if joint is None:
             _start_body(tree, name, None)
-        elif joint.name in ft_joints or (joint.type in MOVING_TYPES and not _is_locked(joint, mimics)):
+        elif joint.name in ft_joints or (joint.type in MOVING_TYPES and joint.name not in locked):
             _start_body(tree, name, _body_joint(tree, joint, reverse, mimics.get(joint.name)))
         else:
             parent = joint.child if reverse else joint.parent
             body, T_body_parent = tree.links[parent]
             tree.links[name] = (body, T_body_parent @ _locked_pose(joint, reverse, mimics))
-        ahead = [
-            (other.parent if turned else other.child, other, turned)
-            for other, turned in neighbours[name]
+        next_joints = [
+            (other.parent if backwards else other.child, other, backwards)
+            for other, backwards in neighbours[name]
             if other is not joint
         ]
-        stack.extend(reversed(ahead))
+        stack.extend(reversed(next_joints))
     return tree
 
 
@@ -127,8 +137,8 @@ def _find_root(path: Path, links: list[Link], joints: list[Joint]) -> str:
     roots = [link.name for link in links if link.name not in parent]
     reached, queue = set(roots[:1]), list(roots[:1])
     children: dict[str, list[str]] = {}
-    for child, above in parent.items():
-        children.setdefault(above, []).append(child)
+    for child, parent_name in parent.items():
+        children.setdefault(parent_name, []).append(child)
     while queue:
         for child in children.get(queue.pop(), []):
             reached.add(child)
@@ -138,45 +148,41 @@ def _find_root(path: Path, links: list[Link], joints: list[Joint]) -> str:
             path, "tree", f"several root links: {', '.join(roots[:4])}", "one link that is no joint's child"
         )
     if len(reached) < len(links):
-        lost = next(link.name for link in links if link.name not in reached)
-        raise UrdfError(path, f"link '{lost}'", "part of a loop of joints", "a tree without loops")
+        unreached = next(link.name for link in links if link.name not in reached)
+        raise UrdfError(path, f"link '{unreached}'", "part of a loop of joints", "a tree without loops")
     return roots[0]
 
 
 def _resolve_mimics(path: Path, joints: list[Joint]) -> dict[str, Mimic]:
-    """Mimic relations of moving joints, chains of them folded onto the independent joint at their end."""
+    """Mimic relations of moving joints; a chain of them is composed into one relation to its independent joint."""
     by_name = {joint.name: joint for joint in joints}
     resolved = {}
     for joint in joints:
         if joint.mimic is None or joint.type not in MOVING_TYPES:
             continue
-        multiplier, offset, master, seen = 1.0, 0.0, joint, {joint.name}
+        multiplier, offset, master, visited = 1.0, 0.0, joint, {joint.name}
         while master.mimic is not None and master.type in MOVING_TYPES:
             offset += multiplier * master.mimic.offset
             multiplier *= master.mimic.multiplier
             master = by_name[master.mimic.joint]
-            if master.name in seen:
+            if master.name in visited:
                 raise UrdfError(
                     path, f"joint '{joint.name}', <mimic>", "a chain that closes on itself", "a free master"
                 )
-            seen.add(master.name)
-        _check_ratio(path, joint.name, multiplier, offset)
+            visited.add(master.name)
+        _check_mimic_size(path, joint.name, multiplier, offset)
         if master.type not in MOVING_TYPES:
-            found = f"its mimic master '{master.name}' is fixed, so it is held still too"
+            found = f"its mimic master '{master.name}' is fixed, so that it is fixed too"
             warn(f"{path}: joint '{joint.name}': {found}")
         resolved[joint.name] = Mimic(master.name if master.type in MOVING_TYPES else "", multiplier, offset)
     return resolved
 
 
-def _check_ratio(path: Path, joint: str, multiplier: float, offset: float) -> None:
-    """Each ratio of a chain is bounded, their product not yet."""
+def _check_mimic_size(path: Path, joint: str, multiplier: float, offset: float) -> None:
+    """Bound the product of a chain's ratios; `read_urdf` bounds each of them."""
     if not max(abs(multiplier), abs(offset)) <= MAX_NUMBER:
         found = f"multiplier {multiplier:g} and offset {offset:g} along its chain"
         raise UrdfError(path, f"joint '{joint}', <mimic>", found, f"at most {MAX_NUMBER:g}")
-
-
-def _is_locked(joint: Joint, mimics: dict[str, Mimic]) -> bool:
-    return joint.name in mimics and not mimics[joint.name].master
 
 
 def _start_body(tree: BodyTree, name: str, joint: BodyJoint | None) -> None:
@@ -194,7 +200,7 @@ def _inverse(T: Array) -> Array:
 
 
 def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None) -> BodyJoint:
-    """The joint on the path from the base: if turned around, its frame sits at the child link and its axis flips."""
+    """The joint as seen from the base: if reversed, its frame is at the child link and its axis changes sign."""
     body, T_body_near = tree.links[joint.child if reverse else joint.parent]
     weld = joint.type not in MOVING_TYPES
     axis = np.array([0.0, 0.0, 1.0]) if weld else joint.axis / np.linalg.norm(joint.axis)
@@ -212,7 +218,7 @@ def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None
 
 
 def _locked_pose(joint: Joint, reverse: bool, mimics: dict[str, Mimic]) -> Array:
-    """Pose of the far link in the near one across a joint that does not move."""
+    """Pose of the next link in the previous one, seen from the base, across a joint that does not move."""
     T_parent_child = _origin(joint)
     if joint.name in mimics:
         T_parent_child = T_parent_child @ _motion(joint, mimics[joint.name].offset)
@@ -228,12 +234,45 @@ def _motion(joint: Joint, position: float) -> Array:
     return T
 
 
-_MOVED = " (moved by its joint)"  # the frame a joint moves; the body's link frame may be offset from it
+def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Array:
+    """Parameters (L, 12) of the bodies, each in its link frame.
+
+    Warns:
+        UnphysicalInertiaWarning: a link's inertia belongs to no distribution of positive mass.
+    """
+    nominal = np.zeros((len(tree.names), parameters.PER_BODY))
+    for name, (body, T_body_link) in tree.links.items():
+        inertial = links[name].inertial
+        if inertial is None:
+            continue
+        _warn_if_unphysical(path, name, inertial)
+        T_link_com = np.eye(4) if inertial.origin is None else inertial.origin
+        at_com = parameters.inertial_vector(inertial.mass, np.zeros(3), inertial.inertia)
+        nominal[body, parameters.INERTIAL] += parameters.change_of_frame(T_body_link @ T_link_com) @ at_com
+    for body, joint in enumerate(tree.joints):
+        if joint is not None:
+            nominal[body, parameters.FRICTION] = joint.friction, joint.damping
+    return nominal
+
+
+def _warn_if_unphysical(path: Path, link: str, inertial: Inertial) -> None:
+    small, middle, large = np.linalg.eigvalsh(inertial.inertia)
+    if large == small == inertial.mass == 0.0:
+        return
+    if inertial.mass == 0.0:
+        what = "mass 0 kg with an inertia that is not 0"
+    elif small < -_ROUNDING * large - _POINT * inertial.mass:
+        what = f"principal inertias {small:.3g}, {middle:.3g}, {large:.3g} kg m^2 are not all positive"
+    elif large > (small + middle) * (1.0 + _TRIANGLE_TOLERANCE) + _POINT * inertial.mass:
+        what = f"largest principal inertia {large:.3g} exceeds the sum of the others, {small + middle:.3g} kg m^2"
+    else:
+        return
+    warn(f"{path}: link '{link}': {what}; used as written", UnphysicalInertiaWarning)
 
 
 @dataclass(frozen=True)
 class JointGeometry:
-    """Where joint frames sit, one row per body of the chain; the base's row is the identity.
+    """Poses of joint frames, one row per body of the chain; the base's row is the identity.
 
     `T_parent_joint`, (L, 4, 4): joint frame at position 0 in the parent's joint frame [m]. `axis`, (L, 3), unit
     length. `prismatic`, `welded`, (L,) bool. `T_joint_link`, (L, 4, 4): the body's link frame in its moved joint frame.
@@ -273,7 +312,7 @@ def build_chain(tree: BodyTree) -> pk.Chain:
 
 
 def joint_geometry(chain: pk.Chain, body_names: tuple[str, ...]) -> JointGeometry:
-    """Read back from a chain what the regressor needs."""
+    """Joint frames and axes of a chain, for the regressor."""
     moved = [chain.find_frame(name + _MOVED) for name in body_names]
     links = [chain.find_frame(name) for name in body_names]
     return JointGeometry(

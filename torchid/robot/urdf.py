@@ -1,4 +1,4 @@
-"""Reading a URDF, strictly, and the mesh files that it names, within limits."""
+"""Strict reading of a URDF and of the mesh files that it names, with limits on their size."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ JOINT_TYPES = (*MOVING_TYPES, "fixed")
 _KEPT = {"link": {"inertial"}, "joint": {"origin", "parent", "child", "axis", "mimic", "dynamics"}}
 _INERTIA_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _SCALARS = ("value", "multiplier", "offset", "damping", "friction", *_INERTIA_ATTRIBUTES)
-_NUMBERS = {"xyz": 3, "rpy": 3} | dict.fromkeys(_SCALARS, 1)  # how many an attribute holds
+_NUMBERS = {"xyz": 3, "rpy": 3} | dict.fromkeys(_SCALARS, 1)  # count of numbers in an attribute
 _DECIMAL = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
 
 
@@ -43,7 +43,7 @@ def parse_xml(path: Path) -> etree._ElementTree:
     Raises:
         UrdfError: the file is missing or is not well-formed XML with a `<robot>` root.
     """
-    try:  # not by its name: libxml2 would unpack what is compressed, without bounds
+    try:  # read first: given a path, libxml2 would decompress files without bounds
         content = read_bytes(path, MAX_URDF)
     except FileNotFoundError as error:
         raise UrdfError(path, "file", "no such file", "a readable URDF file") from error
@@ -64,7 +64,7 @@ def parse_xml(path: Path) -> etree._ElementTree:
 
 
 def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
-    """Links and joints of a URDF, checked so far as one element at a time can be.
+    """Links and joints of a URDF, each element checked on its own; `build_tree` checks the tree.
 
     Visual, collision, material and transmission tags are dropped before the parse: they carry no kinematics, and
     meshes need not be there.
@@ -74,32 +74,29 @@ def read_urdf(path: Path) -> tuple[list[Link], list[Joint]]:
             prismatic and fixed, numbers missing, not finite or beyond `MAX_NUMBER`, mass negative, more than
             `MAX_LINKS` links.
     """
-    stripped = _stripped(path)
-    _check_names(path, stripped)
-    links, joints = ([element.get("name", "") for element in stripped.findall(tag)] for tag in ("link", "joint"))
-    for element in stripped:
+    root = _read_elements(path)
+    _check_names(path, root)
+    links, joints = ([element.get("name", "") for element in root.findall(tag)] for tag in ("link", "joint"))
+    for element in root:
         _check_numbers(path, element)
-    for element in stripped.findall("joint"):
+    for element in root.findall("joint"):
         _check_joint(path, element, links, joints)
-    for element in stripped.findall("link"):
+    for element in root.findall("link"):
         _check_link(path, element)
     try:
-        model = yourdfpy.URDF.load(
-            io.BytesIO(etree.tostring(stripped)), build_scene_graph=False, load_meshes=False
-        ).robot
+        model = yourdfpy.URDF.load(io.BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False).robot
         for joint in model.joints:
             if joint.dynamics is not None:  # left as text by yourdfpy
                 joint.dynamics.damping = float(joint.dynamics.damping or 0.0)
                 joint.dynamics.friction = float(joint.dynamics.friction or 0.0)
     except ValueError as error:
         raise UrdfError(path, "XML", f"a number cannot be read: {error}", "decimal numbers") from error
-    _check_masses(path, model.links)
-    _check_joint_values(path, model.joints)
+    _check_values(path, model.links, model.joints)
     return model.links, model.joints
 
 
-def _stripped(path: Path) -> etree._Element:
-    """The URDF's XML, without what is not read."""
+def _read_elements(path: Path) -> etree._Element:
+    """The URDF's XML, reduced to the elements in `_KEPT`."""
     root = parse_xml(path).getroot()
     for tag in ("link", "joint"):
         count = len(root.findall(tag))
@@ -136,7 +133,7 @@ def _check_name(path: Path, field: str, name: str) -> None:
 
 
 def _check_numbers(path: Path, owner: etree._Element) -> None:
-    """Refuse what is no decimal number, before a parser that would not name the element."""
+    """Refuse attributes that are not decimal numbers; yourdfpy's error would not name the element."""
     of = f"{owner.tag!s} '{owner.get('name')}'"
     for part in owner:
         for element in part.iter():
@@ -194,14 +191,13 @@ def _check_link(path: Path, link: etree._Element) -> None:
         raise UrdfError(path, field, f"no {', '.join(missing)}", "all six numbers of <inertia> [kg m^2]")
 
 
-def _check_masses(path: Path, links: list[Link]) -> None:
+def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
+    """Refuse negative masses and friction, and axes that are zero."""
     for link in links:
         if link.inertial is not None and link.inertial.mass < 0.0:
             field = f"link '{link.name}', <inertial>"
             raise UrdfError(path, field, f"mass {link.inertial.mass:g} kg", "mass > 0, or 0 for a massless link")
 
-
-def _check_joint_values(path: Path, joints: list[Joint]) -> None:
     for joint in joints:
         field = f"joint '{joint.name}'"
         if joint.dynamics is not None and min(joint.dynamics.damping, joint.dynamics.friction) < 0.0:
@@ -212,12 +208,12 @@ def _check_joint_values(path: Path, joints: list[Joint]) -> None:
 
 
 FORMATS = ("stl", "obj", "dae", "ply", "off")
-_PART = {"obj": b"usemtl"}
-_USE = 2**15  # bytes that each use of a shape counts as, for the time it takes
+_PART_KEYWORD = {"obj": b"usemtl"}  # keyword that starts a part of a mesh
+_BYTES_PER_INSTANCE = 2**15  # [bytes] added for every instance of a geometry: bounds the time that loading takes
 
 
 class MeshError(Exception):
-    """A mesh file that is missing, lies elsewhere, or cannot be read."""
+    """A mesh file that is missing, outside the package, or cannot be read."""
 
 
 def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
@@ -236,7 +232,7 @@ def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
             check_collada(content, MAX_UNFOLDED)
     except (OSError, ValueError, etree.XMLSyntaxError, RecursionError) as error:
         raise MeshError(f"{excerpt(filename)}: {type(error).__name__}: {excerpt(str(error))}") from error
-    if kind in _PART and content.lower().count(_PART[kind]) > MAX_PARTS:
+    if kind in _PART_KEYWORD and content.lower().count(_PART_KEYWORD[kind]) > MAX_PARTS:
         raise MeshError(f"{excerpt(filename)}: more than {MAX_PARTS} parts")
     if kind == "obj" and max(map(len, content.splitlines()), default=0) > MAX_LINE:
         raise MeshError(f"{excerpt(filename)}: a line of more than {format_bytes(MAX_LINE)}")
@@ -244,92 +240,98 @@ def mesh_content(urdf: Path, filename: str) -> tuple[str, bytes]:
 
 
 def _mesh_file(urdf: Path, filename: str) -> Path:
-    """The file that a URDF's author meant: in its package, or, as `package://NAME/...`, in one beside it.
+    """The mesh file that a URDF refers to: in its package or, as `package://NAME/...`, in one beside it.
 
-    The package is the nearest folder above the URDF with a `package.xml`, or else the one above the URDF's own. Links
-    in it are followed: workspaces are made of them.
+    The package is the nearest folder above the URDF with a `package.xml`, or else the parent of the URDF's folder.
+    Symbolic links in it are followed: workspaces use them.
     """
     if not is_plain(filename):
         raise MeshError(f"{excerpt(filename)}: no name of a file")
-    package = _package(urdf)
+    package = _package_folder(urdf)
     scheme, _, rest = filename.rpartition("://")
     if scheme not in ("", "file", "package"):
         raise MeshError(f"{excerpt(filename)}: neither a file nor in a package")
-    candidates = _in_packages(urdf, package, rest) if scheme == "package" else _in_package(urdf, package, rest)
+    candidates = (
+        _paths_of_package_url(urdf, package, rest) if scheme == "package" else _paths_in_package(urdf, package, rest)
+    )
     try:
-        found = next((path for path in candidates if path.is_file()), None)
+        file = next((path for path in candidates if path.is_file()), None)
     except OSError as error:
         raise MeshError(f"{excerpt(filename)}: {error.strerror}") from error
-    if found is not None:
-        return found
+    if file is not None:
+        return file
     outside = scheme != "package" and not candidates
     raise MeshError(f"{excerpt(filename)}: {f'outside {package}' if outside else 'no such file'}")
 
 
-def _package(urdf: Path) -> Path:
+def _package_folder(urdf: Path) -> Path:
     folders = urdf.absolute().parents
     marked = next((folder for folder in folders if (folder / "package.xml").is_file()), None)
-    return marked or (folders[1] if len(folders) > 2 else folders[0])  # and not the root of all files
+    return marked or (folders[1] if len(folders) > 2 else folders[0])  # never the root of the file system
 
 
-def _in_package(urdf: Path, package: Path, name: str) -> list[Path]:
-    """Paths that a path may mean, from the URDF's folder upwards, as far as they are in the package."""
+def _paths_in_package(urdf: Path, package: Path, name: str) -> list[Path]:
+    """Candidates for a relative path: in the URDF's folder and those above it, inside the package."""
     folders = [folder for folder in urdf.absolute().parents if folder.is_relative_to(package)]
     paths = [Path(os.path.normpath(folder / name)) for folder in folders]
     return [path for path in paths if path.is_relative_to(package)]
 
 
-def _in_packages(urdf: Path, package: Path, name: str) -> list[Path]:
-    """Paths that `package://name` may mean: a package above the URDF, one beside its own, or its own renamed."""
+def _paths_of_package_url(urdf: Path, package: Path, name: str) -> list[Path]:
+    """Candidates for `package://name`: a package above the URDF, one beside its own, or its own renamed."""
     parts = PurePosixPath(name.lstrip("/")).parts
     if not parts or ".." in parts:
         return []
     above = [folder.parent for folder in urdf.absolute().parents if folder.name == parts[0]]
     beside = [] if package.parent == package.parent.parent else [package.parent]
-    own = _in_package(urdf, package, str(PurePosixPath(*parts[1:])))
+    own = _paths_in_package(urdf, package, str(PurePosixPath(*parts[1:])))
     return [*(folder.joinpath(*parts) for folder in (*above, *beside)), *own]
 
 
 def check_collada(content: bytes, largest: int) -> None:
-    """Refuse a document type, which may declare entities, and shapes that unfold to more than `largest` bytes.
+    """Refuse a document type, which may declare entities, and shapes that expand to more than `largest` bytes.
 
     Raises:
-        ValueError, etree.XMLSyntaxError, RecursionError: what was found.
+        ValueError: a document type, a cyclic node, or shapes that are too large.
+        etree.XMLSyntaxError, RecursionError: XML that cannot be parsed.
     """
     first = etree.iterparse(io.BytesIO(content), events=("start",), resolve_entities=False, no_network=True)
-    _, root = next(first)  # no document type can follow; and none was expanded, for the parser has its limits
+    _, root = next(first)  # a document type comes before the root; nothing has been expanded yet
     if root.getroottree().docinfo.doctype:
-        raise ValueError("a document type, which meshes need not have")
+        raise ValueError("a document type (DOCTYPE), which may declare entities")
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, huge_tree=True
     )  # large arrays, as pycollada reads
-    size = _Unfolded(etree.parse(io.BytesIO(content), parser).getroot()).size()
+    size = _InstancedText(etree.parse(io.BytesIO(content), parser).getroot()).size()
     if size > largest:
-        raise ValueError(f"shapes of {size} bytes, each as often as it is used")
+        raise ValueError(f"shapes of {size} bytes, all instances counted")
 
 
-class _Unfolded:
-    """How much text the shapes of a document have, each counted as often as nodes use it."""
+class _InstancedText:
+    """Text size of a COLLADA document's geometries, counted once for every instance of them."""
 
     def __init__(self, root: etree._Element) -> None:
         self._root = root
         self._shapes = {
             "#" + str(shape.get("id")): sum(map(len, shape.itertext())) for shape in root.iter("{*}geometry")
         }
-        self._nodes = {"#" + str(node.get("id")): node for node in root.iter("{*}node")}
+        self._nodes = {"#" + str(child.get("id")): child for child in root.iter("{*}node")}
         self._sizes: dict[etree._Element, int] = {}
 
     def size(self) -> int:
-        """Of all scenes."""
-        return sum(self._of(scene, set()) for scene in self._root.iter("{*}visual_scene"))
+        """Total over all scenes."""
+        return sum(self._size_of(scene, set()) for scene in self._root.iter("{*}visual_scene"))
 
-    def _of(self, above: etree._Element, open_: set[etree._Element]) -> int:
-        if above in open_:
-            raise ValueError("a node within itself")
-        if above not in self._sizes:
-            inner = open_ | {above}
-            total = sum(_USE + self._shapes.get(str(x.get("url")), 0) for x in above.findall("{*}instance_geometry"))
-            total += sum(self._of(node, inner) for node in above.findall("{*}node"))
-            used = [self._nodes.get(str(x.get("url"))) for x in above.findall("{*}instance_node")]
-            self._sizes[above] = total + sum(self._of(node, inner) for node in used if node is not None)
-        return self._sizes[above]
+    def _size_of(self, node: etree._Element, ancestors: set[etree._Element]) -> int:
+        if node in ancestors:
+            raise ValueError("a node that contains itself")
+        if node not in self._sizes:
+            inner = ancestors | {node}
+            total = sum(
+                _BYTES_PER_INSTANCE + self._shapes.get(str(x.get("url")), 0)
+                for x in node.findall("{*}instance_geometry")
+            )
+            total += sum(self._size_of(child, inner) for child in node.findall("{*}node"))
+            instances = [self._nodes.get(str(x.get("url"))) for x in node.findall("{*}instance_node")]
+            self._sizes[node] = total + sum(self._size_of(child, inner) for child in instances if child is not None)
+        return self._sizes[node]

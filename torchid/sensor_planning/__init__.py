@@ -1,1 +1,1 @@
-"""Which sensors a scenario needs, which could be left out, and what a proposed set loses."""
+"""The cheapest sensors for a scenario, redundant sensors, and the observability of the base with a proposed set."""

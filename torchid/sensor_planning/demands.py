@@ -1,4 +1,4 @@
-"""Candidate sensors with their cost, and what the contacts demand of them for the base to survive the projection."""
+"""Candidate sensors with their cost, and what contacts demand of them so that the base survives the projection."""
 
 from __future__ import annotations
 
@@ -21,15 +21,20 @@ from torchid.sensing import Contact, SensorNoise, SensorSet
 
 KINDS = ("joint_torque", "contact", "ft_sensor")
 PER = ("device", "axis", "none")
+TOLERANCE = 1e-6
+"""A share of unit vectors below this counts as zero, as in the rank of S_b V_x that this predicts.
+
+Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as independent in both.
+"""
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A sensor that may be chosen.
 
-    `kind`: one of `KINDS`. `dofs`: places among the robot's `dof_names` that a torque sensor, or a force/torque sensor
-    in a limb, reads. `contact`: index among the contacts, and `components`, in `WRENCH_COMPONENTS`, of a force/torque
-    sensor there. `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it.
+    `kind`: one of `KINDS`. `dofs`: indices in the robot's `dof_names` that a torque sensor, or a force/torque sensor in
+    a limb, measures. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a sensor there.
+    `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it.
     """
 
     name: str
@@ -41,12 +46,12 @@ class Candidate:
 
     @property
     def channels(self) -> int:
-        """Numbers it reads."""
+        """Number of measured components."""
         return len(self.components) + len(self.dofs)
 
 
 def total_cost(chosen: Iterable[Candidate]) -> float:
-    """Of some candidates together."""
+    """Total cost of some candidates."""
     return sum(candidate.cost for candidate in chosen)
 
 
@@ -62,7 +67,7 @@ def candidates(
 
     Args:
         robot: the robot.
-        contacts: where the environment can push; a sensor reads components that its contact can exert.
+        contacts: all contacts; a sensor measures the components that its contact can exert.
         joint_torques: joints that can carry a torque sensor; None for all.
         per: "device", one force/torque sensor per contact, "axis", one candidate per component, or "none" at contacts.
             In limbs, too, a candidate per component with "axis".
@@ -71,7 +76,7 @@ def candidates(
 
     Raises:
         UnknownNameError: a joint, or a name in `costs`, that does not exist.
-        SensorError: `per` is another word, or a cost is not a positive number.
+        SensorError: `per` is not in `PER`, or a cost is not a positive number.
     """
     if per not in PER:
         raise SensorError("sensors", "candidates.per", f"'{per}'", ", ".join(PER))
@@ -92,7 +97,7 @@ def candidates(
                 Candidate(f"{contact.frame}.{name}", "contact", 1.0, contact=index, components=(k,))
                 for name, k in names
             ]
-    return _priced([*offered, *_in_limbs(robot, ft_sensors, per == "axis")], costs or {})
+    return _with_costs([*offered, *_in_limbs(robot, ft_sensors, per == "axis")], costs or {})
 
 
 def _in_limbs(robot: Robot, names: Sequence[str], by_axis: bool) -> list[Candidate]:
@@ -109,11 +114,11 @@ def _in_limbs(robot: Robot, names: Sequence[str], by_axis: bool) -> list[Candida
     return offered
 
 
-def _priced(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[Candidate, ...]:
-    known = [*KINDS, *(candidate.name for candidate in offered)]
+def _with_costs(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[Candidate, ...]:
+    names = [*KINDS, *(candidate.name for candidate in offered)]
     for name, cost in costs.items():
-        if name not in known:
-            raise UnknownNameError("sensors", "costs", name, known)
+        if name not in names:
+            raise UnknownNameError("sensors", "costs", name, names)
         if not (math.isfinite(cost) and cost > 0.0):
             raise SensorError("sensors", f"costs.{name}", str(cost), "a positive number")
     prices = [costs.get(c.name, c.channels * costs.get(c.kind, 1.0)) for c in offered]
@@ -123,7 +128,7 @@ def _priced(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tuple[C
 def sensor_set(
     robot: Robot, contacts: Sequence[Contact], chosen: Iterable[Candidate], noise: SensorNoise | None = None
 ) -> SensorSet:
-    """The sensor set that measures what some candidates read, and nothing else."""
+    """The sensor set that consists of some candidates."""
     torque, wrench = np.zeros(robot.n_dofs, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
     for candidate in chosen:
         torque[list(candidate.dofs)] = True
@@ -135,7 +140,7 @@ def sensor_set(
 def contained_candidates(
     contacts: Sequence[Contact], sensors: SensorSet, candidates: Sequence[Candidate]
 ) -> tuple[Candidate, ...]:
-    """The candidates that a sensor set contains: those all of whose readings are measured."""
+    """The candidates that a sensor set contains: those whose components are all measured."""
     wrench = measured_components(contacts, sensors)
     return tuple(
         c
@@ -144,24 +149,17 @@ def contained_candidates(
     )
 
 
-TOLERANCE = 1e-6
-"""A share of unit vectors below this counts as zero, as in the rank of S_b V_x that this predicts.
-
-Axes that a URDF's rounded angles (1.5708) tilt by 4e-6 from parallel count as independent in both.
-"""
-
-
 @dataclass(frozen=True, eq=False)
 class Demand:
-    """What a group of contacts demands, at one posture.
+    """Demand of a group of contacts at one posture: sensors whose vectors span the target.
 
     Attributes:
-        contacts: places of the group's contacts, ascending; `frames`: their names.
-        joints: places of the independent joints between the base and the contacts, ascending.
+        contacts: indices of the group's contacts, ascending; `frames`: their names.
+        joints: indices of the independent joints between the base and the contacts, ascending.
         rows: (k,) the contact that each row of J belongs to.
         target: (k, d) orthonormal basis of range(J_b).
-        vectors: (k, w) unit vectors of every candidate that acts on the group; others, and those that act on it with
-            no lever, are absent.
+        vectors: (k, w) unit vectors of every candidate that acts on the group; others, and those without a lever arm,
+            are absent.
     """
 
     contacts: tuple[int, ...]
@@ -176,7 +174,7 @@ class Demand:
         return np.hstack([np.zeros((len(self.rows), 0)), *(self.vectors[c] for c in chosen if c in self.vectors)])
 
     def missing(self, chosen: Iterable[Candidate]) -> int:
-        """Dimensions of the target that some candidates leave unreached; 0 if they meet the demand."""
+        """Dimensions of the target outside the span of some candidates; 0 if they meet the demand."""
         return int(self.unreached(orthonormal_basis(self.stacked(chosen))))
 
     def unreached(self, basis: Array) -> Array:
@@ -203,7 +201,7 @@ def orthogonal_part(vectors: Array, basis: Array) -> Array:
 
 
 def span_basis(vectors: Array) -> Array:
-    """Orthonormal basis (k, r) of the span of parts of unit vectors (k, w); small ones are none."""
+    """Orthonormal basis (k, r) of the span of parts of unit vectors (k, w), without negligible ones."""
     U, values, _ = np.linalg.svd(vectors, full_matrices=False)
     return U[:, values > BASE_RANK_TOLERANCE]
 
@@ -216,15 +214,15 @@ def demands(
     seed: int = 0,
     joint_position: Array | None = None,
 ) -> list[Demand]:
-    """What some contact states demand, each group of contacts once; nothing for a bolted base.
+    """Demands of some contact states, each group of contacts once; none for a bolted base.
 
     Args:
         robot: the robot.
         contacts: all contacts.
-        states: which of them touch the ground together.
+        states: contact states.
         candidates: sensors to choose from.
-        seed: of the random posture, which represents almost all.
-        joint_position: (n,) instead of that [rad or m].
+        seed: of the random posture, at which ranks are those of almost every posture.
+        joint_position: (n,), another posture instead [rad or m].
     """
     if robot.fixed_base:
         return []
@@ -240,20 +238,20 @@ def demands(
 
 
 def _groups(above: Sequence[AbstractSet[int]], state: ContactState) -> list[tuple[int, ...]]:
-    """Active contacts, grouped by shared joints among those `above` each."""
-    active = [index for index, touching in enumerate(state) if touching]
+    """Active contacts, grouped by shared joints; `above`: joints between the base and each contact."""
+    active = [index for index, in_contact in enumerate(state) if in_contact]
     return [tuple(active[k] for k in group) for group in connected_groups([above[index] for index in active])]
 
 
 def connected_groups(sets: Sequence[AbstractSet[Hashable]]) -> list[tuple[int, ...]]:
-    """Places of sets that are linked by common members, ascending; an empty set is alone."""
+    """Indices of sets that are linked by common members, ascending; an empty set is a group of its own."""
     groups: list[tuple[list[int], set[Hashable]]] = []
     for index, members in enumerate(sets):
-        touched = [group for group in groups if group[1] & members]
+        linked = [group for group in groups if group[1] & members]
         groups = [group for group in groups if not group[1] & members]
-        places = sorted([index, *(k for group in touched for k in group[0])])
-        groups.append((places, set(members).union(*(group[1] for group in touched))))
-    return sorted(tuple(places) for places, _ in groups)
+        indices = sorted([index, *(k for group in linked for k in group[0])])
+        groups.append((indices, set(members).union(*(group[1] for group in linked))))
+    return sorted(tuple(indices) for indices, _ in groups)
 
 
 def _demand(
@@ -263,7 +261,7 @@ def _demand(
     J: Array,
     candidates: Sequence[Candidate],
 ) -> Demand:
-    """What a group demands, from the Jacobians of all contacts, (C, 6, n_rows)."""
+    """Demand of a group, from the Jacobians of all contacts, (C, 6, n_rows)."""
     rows = [(index, k) for index in group for k in contacts[index].components]
     J_group = np.stack([J[row] for row in rows])
     J_group /= np.linalg.norm(J_group[:, :6])
@@ -275,7 +273,7 @@ def _demand(
             if (length > BASE_RANK_TOLERANCE).any():
                 vectors[candidate] = x[:, length > BASE_RANK_TOLERANCE] / length[length > BASE_RANK_TOLERANCE]
         elif candidate.contact in group:
-            read = [rows.index((candidate.contact, k)) for k in candidate.components]
-            vectors[candidate] = np.eye(len(rows))[:, read]
+            measured_rows = [rows.index((candidate.contact, k)) for k in candidate.components]
+            vectors[candidate] = np.eye(len(rows))[:, measured_rows]
     frames = tuple(contacts[index].frame for index in group)
     return Demand(group, frames, joints, tuple(index for index, _ in rows), span_basis(J_group[:, :6]), vectors)

@@ -27,9 +27,9 @@ from torchid.sensor_planning.demands import (
     orthonormal_basis,
 )
 
-_ZERO = 1e-5  # of a unit vector
+_ZERO = 1e-5  # share of a unit vector that counts as zero
 _CHUNK = 1024
-_NEGLIGIBLE = 5e-3  # [m], less than what is printed
+_NEGLIGIBLE = 5e-3  # [m], below the printed precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +37,12 @@ class BaseObservability:
     """Observability of the base with a sensor set in one contact state.
 
     Attributes:
-        state: which contacts touch; `name`: their frames joined by "+".
+        state: the contact state; `name`: frames in contact, joined by "+".
         generic: over random postures; its rank is that of almost every posture.
         zero: at position zero of every joint, where many robots' limbs are straight.
         recorded: over postures of a log, or None.
         lost: None if the generic rank is 6.
-        dependent: if the rank falls at position zero only, for each unmet demand the sensors that are dependent there.
+        dependent: if the rank is deficient at position zero only, the sensors dependent there, by unmet demand.
     """
 
     state: ContactState
@@ -73,14 +73,14 @@ class PostureSummary:
 
 @dataclass(frozen=True, eq=False)
 class LostBase:
-    """The part of the base's equations of motion that a set loses.
+    """The part of the base's equations of motion that does not survive the projection with a sensor set.
 
     Attributes:
-        posture: (n,) [rad or m] where that was determined.
+        posture: (n,) [rad or m] at which it was computed.
         directions: (6, m) orthonormal w, force then moment at the base origin in the base frame, with w^T S_b V_x = 0:
             the equation of motion of the base along w is in none of the rows.
-        descriptions: the same space in words, see `describe_wrench`.
-        unmet_groups: frames of each group of contacts whose demand is not met, and the dimensions missing.
+        descriptions: the same space as text, see `describe_wrench`.
+        unmet_groups: frames of each group of contacts whose demand is not met, and the missing dimensions.
         remedies: candidates each of which, added alone, leaves fewer dimensions missing.
     """
 
@@ -103,12 +103,12 @@ def assess_sensors(
     seed: int = 0,
     postures: Mapping[ContactState, Array] | None = None,
 ) -> list[BaseObservability]:
-    """Rank of the base with a sensor set in every contact state, by the projection itself; nothing for a bolted base.
+    """Observability of the base with a sensor set in every contact state, from S_b V_x; none for a bolted base.
 
     Args:
         robot: the robot.
         contacts: all contacts.
-        states: which of them touch together.
+        states: contact states.
         sensors: the set.
         choice: candidates for remedies.
         samples: number of random postures.
@@ -126,8 +126,8 @@ def assess_sensors(
     for state in states:
         generic = demands(robot, contacts, [state], everything, seed)
         straight = demands(robot, contacts, [state], everything, joint_position=np.zeros(robot.n))
-        cause = _Cause(generic, straight, mounted, choice)
-        checks.append(_assess_state(builder, state, drawn, postures.get(state), cause))
+        state_demands = _StateDemands(generic, straight, mounted, choice)
+        checks.append(_assess_state(builder, state, drawn, postures.get(state), state_demands))
     return checks
 
 
@@ -142,38 +142,38 @@ def base_values(builder: RowBuilder, state: ContactState, postures: Array) -> to
 
 
 def dependent_sensors(generic: Demand, singular: Demand, chosen: Iterable[Candidate]) -> tuple[str, ...]:
-    """The fewest sensors that are independent at one posture but not at another, where the demand is unmet therefore.
+    """The smallest group of sensors that is independent at one posture but dependent at another, where they fail.
 
     Args:
-        generic: a demand at a posture where the chosen sensors meet it; if they do not, nothing is named.
-        singular: the same demand where they do not.
-        chosen: sensors of one reading each.
+        generic: a demand at a posture at which the chosen sensors meet it; if they do not, the result is empty.
+        singular: the same demand at a posture at which they do not.
+        chosen: sensors of one component each.
     """
     needed = [c for c in chosen if c in generic.vectors]
     if generic.missing(needed) or not singular.missing(needed):
         return ()
-    for candidate in tuple(needed):  # those that no sensor can be spared of are independent
+    for candidate in tuple(needed):  # reduce to a minimal set, which is independent
         fewer = [c for c in needed if c != candidate]
         needed = needed if generic.missing(fewer) else fewer
     for count in range(1, len(needed) + 1):
-        for some in combinations(needed, count):
-            if orthonormal_basis(singular.stacked(some)).any(axis=0).sum() < count:
-                return tuple(c.name for c in some)
+        for group in combinations(needed, count):
+            if orthonormal_basis(singular.stacked(group)).any(axis=0).sum() < count:
+                return tuple(c.name for c in group)
     return ()
 
 
 def simple_wrench_basis(space: Array) -> list[Array]:
-    """Wrenches (6,) that span a space (6, m), with as many zeros as elimination gives; pure moments come last.
+    """Wrenches (6,) that span a space (6, m), with many zeros by Gauss-Jordan elimination; pure moments come last.
 
-    Elimination pivots on the largest force component left, and on a moment component only if no force is left.
+    The pivot is the largest remaining force component, or moment component if no force remains.
     """
     rows = np.array(space.T)
     done = 0
     for block in (slice(0, 3), slice(3, 6)):
         while done < len(rows):
-            left = np.abs(rows[done:, block])
-            row, column = divmod(int(np.argmax(left)), 3)
-            if left[row, column] < _ZERO:
+            remaining = np.abs(rows[done:, block])
+            row, column = divmod(int(np.argmax(remaining)), 3)
+            if remaining[row, column] < _ZERO:
                 break
             rows[[done, done + row]] = rows[[done + row, done]]
             rows[done] /= rows[done, block.start + column]
@@ -202,7 +202,7 @@ def describe_wrench(wrench: Array) -> str:
 
 
 @dataclass(frozen=True)
-class _Cause:
+class _StateDemands:
     """Demands of a state at a random posture and at position zero, the mounted sensors, and candidates for remedies."""
 
     generic: Sequence[Demand]
@@ -211,7 +211,7 @@ class _Cause:
     choice: Sequence[Candidate]
 
     def missing(self, *more: Candidate) -> list[int]:
-        """Dimensions missing, demand by demand."""
+        """Missing dimensions, demand by demand."""
         return [demand.missing((*self.mounted, *more)) for demand in self.generic]
 
     def dependent(self) -> tuple[tuple[str, ...], ...]:
@@ -221,14 +221,14 @@ class _Cause:
 
 
 def _assess_state(
-    builder: RowBuilder, state: ContactState, drawn: Array, recorded: Array | None, cause: _Cause
+    builder: RowBuilder, state: ContactState, drawn: Array, recorded: Array | None, state_demands: _StateDemands
 ) -> BaseObservability:
     zero = np.zeros((1, drawn.shape[1]))
     generic, straight = base_values(builder, state, drawn), base_values(builder, state, zero)
     ranks, lost = base_rank(generic), None
     if ranks.max() < 6:
         regular = zero if base_rank(straight)[0] == ranks.max() else drawn[[int(ranks.argmax())]]
-        lost = _lost(builder, state, regular, cause)
+        lost = _lost_base(builder, state, regular, state_demands)
     return BaseObservability(
         state=state,
         name=state_name(builder.contacts, state),
@@ -236,22 +236,22 @@ def _assess_state(
         zero=PostureSummary.of(straight),
         recorded=None if recorded is None else PostureSummary.of(base_values(builder, state, recorded)),
         lost=lost,
-        dependent=cause.dependent(),
+        dependent=state_demands.dependent(),
     )
 
 
-def _lost(builder: RowBuilder, state: ContactState, posture: Array, cause: _Cause) -> LostBase:
+def _lost_base(builder: RowBuilder, state: ContactState, posture: Array, state_demands: _StateDemands) -> LostBase:
     [(_, V)] = builder.null_space_bases(resting_samples(posture, state), state)
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
     directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]
-    short = cause.missing()
-    groups = zip(cause.generic, short, strict=True)
+    missing = state_demands.missing()
+    groups = zip(state_demands.generic, missing, strict=True)
     return LostBase(
         posture=posture[0],
         directions=directions,
         descriptions=tuple(describe_wrench(wrench) for wrench in simple_wrench_basis(directions)),
         unmet_groups=tuple((demand.frames, dimensions) for demand, dimensions in groups if dimensions),
-        remedies=tuple(c for c in cause.choice if sum(cause.missing(c)) < sum(short)),
+        remedies=tuple(c for c in state_demands.choice if sum(state_demands.missing(c)) < sum(missing)),
     )
 
 

@@ -33,11 +33,11 @@ from torchid.sensor_planning.search import CheapestSet, DemandGroup, all_minimal
 
 CRITERIA = ("per_sample", "stack")
 StepCallback = Callable[[str, int, int], None]
-"""Called with what is going on, steps done and steps in all."""
+"""Called with a description, the number of steps done, and that of all steps."""
 
 _EXACT = 1e-9
-_POSTURES = 500  # of a log, in a contact state
-_TRIED = 4  # random postures: the rank is that of almost every one
+_POSTURES = 500  # of the logs, per contact state
+_TRIED = 4  # random postures: their largest rank is that of almost every posture
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class PlanningProblem:
 
     Attributes:
         robot, contacts, states: the scenario.
-        candidates: sensors to choose from; `keep`: those that are there anyway, `exclude`: that cannot be.
+        candidates: sensors to choose from; `keep`: those in every set; `exclude`: those in none.
         noise: of the sensors.
-        logs: motion to weigh the sensors by; empty: random motion in the scenario's states.
-        prior: (12 L,), how far parameters may be off the nominal ones, 0 where they are known.
+        logs: motion for which information is computed; if empty, random motion in the scenario's states.
+        prior: (12 L,), prior standard deviation of the parameters about the nominal ones, 0 where they are known.
         criterion: one of `CRITERIA`.
         seed: of random postures and motion.
     """
@@ -91,9 +91,9 @@ class PlanningProblem:
 class PartPlan:
     """A part of the robot that can be planned on its own.
 
-    `frames`: its contacts. `sets`: all its minimal sets, no sensor of which can be left out; None if there are too many
-    candidates to try all. `ranked`: the cheapest of them with their information [bits], most informative first; if they
-    were not all tried, those on the way from one to a better one.
+    `frames`: its contacts. `sets`: all its minimal sets, in which no sensor is redundant; None if there are too many
+    candidates to enumerate. `ranked`: the cheapest of them with their information [bits], most informative first; if
+    they were not enumerated, those visited by the exchange search.
     """
 
     frames: tuple[str, ...]
@@ -113,9 +113,9 @@ class Removal:
 
 @dataclass(frozen=True)
 class Branch:
-    """A chain of joints between the base, a body where limbs part, and a tip.
+    """A chain of joints without branching, between the base, branching bodies and tips.
 
-    `joints`: its independent joints, from the base outward. `contacts`: frames beyond it that some state uses.
+    `joints`: its independent joints, from the base outward. `contacts`: frames beyond it, in contact in some state.
     """
 
     joints: tuple[str, ...]
@@ -128,13 +128,13 @@ class Branch:
 
     @property
     def constrained(self) -> bool:
-        """Whether a contact lies beyond it; sensors in other branches do not help to observe the base."""
+        """Whether there is a contact beyond it; sensors in other branches do not help to observe the base."""
         return bool(self.contacts)
 
 
 @dataclass(frozen=True)
 class ContactRequirement:
-    """A group of contacts that share joints, and what it takes for the base to survive the projection.
+    """A group of contacts that share joints, and the sensors with which the base survives the projection.
 
     `joints`: between the base and the contacts. `branches`: names of the branches these belong to. `fewest_readings`:
     the fewest joint torques and contact components that meet this group's demand alone, a lower bound if not `proven`.
@@ -149,12 +149,12 @@ class ContactRequirement:
 
 @dataclass(frozen=True)
 class SensorPlan:
-    """The recommended sensors of a scenario, and why.
+    """The recommended sensors of a scenario, with the reasons.
 
     Attributes:
         problem: that it solves.
         chosen: the recommended set. Its `cost` is the least possible if `proven`; `lower_bound`: no set costs less.
-        parts: what can be planned on its own. The minimal sets of the robot are the unions of one set of each part.
+        parts: independent parts. The minimal sets of the robot are the unions of one set of each part.
         branches: chains of joints, and which of them contacts constrain; `requirements`: of every group of contacts.
         observability: of the base with the recommended set, state by state.
         stack_rank, stack_full: rank of the stack of samples with it, and with all candidates.
@@ -176,28 +176,28 @@ class SensorPlan:
 
 
 def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None) -> SensorPlan:
-    """The smallest sensor set for a scenario, the most informative of those.
+    """The cheapest sensor set for a scenario, and of these the most informative one.
 
     Raises:
-        SensorError: no set of the candidates will do, or a criterion that does not fit the robot.
+        SensorError: the candidates do not suffice, or a criterion that does not fit the robot.
     """
-    tell = progress or (lambda *_: None)
+    report = progress or (lambda *_: None)
     if problem.criterion not in CRITERIA:
         raise SensorError("sensors", "criterion", f"'{problem.criterion}'", ", ".join(CRITERIA))
     if problem.criterion == "per_sample" and problem.robot.fixed_base:
-        raise SensorError("sensors", "criterion", "per_sample, with a bolted base, which cannot be lost", "stack")
+        raise SensorError("sensors", "criterion", "per_sample, which needs a floating base", "stack")
     stack = problem.stack
     parts: tuple[PartPlan, ...] = ()
     if problem.criterion == "stack":
         chosen = irredundant_set(
-            stack, problem.keep, problem.exclude, _counted(tell, "leaving sensors out", len(problem.candidates))
+            stack, problem.keep, problem.exclude, _counted(report, "leaving sensors out", len(problem.candidates))
         )
         cost, floor = total_cost(chosen), total_cost(problem.keep)
         least = CheapestSet(chosen, cost, floor, cost <= floor)
     else:
-        wanted = demands(problem.robot, problem.contacts, problem.states, problem.candidates, problem.seed)
-        least = cheapest_set(wanted, problem.candidates, problem.keep, problem.exclude)
-        parts, chosen = _best_parts(problem, demand_groups(wanted, problem.candidates), least, tell)
+        all_demands = demands(problem.robot, problem.contacts, problem.states, problem.candidates, problem.seed)
+        least = cheapest_set(all_demands, problem.candidates, problem.keep, problem.exclude)
+        parts, chosen = _best_parts(problem, demand_groups(all_demands, problem.candidates), least, report)
     sensors = sensor_set(problem.robot, problem.contacts, chosen)
     return SensorPlan(
         problem=problem,
@@ -211,12 +211,12 @@ def plan_sensors(problem: PlanningProblem, progress: StepCallback | None = None)
         observability=tuple(problem.assess(sensors)),
         stack_rank=stack.rank(chosen),
         stack_full=stack.full,
-        removals=tuple(_removals(problem, chosen, tell)),
+        removals=tuple(_removals(problem, chosen, report)),
     )
 
 
 def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[ContactState]) -> tuple[Branch, ...]:
-    """All branches with joints of their own, depth first; a finger that only mimics has none."""
+    """All branches with independent joints, depth first; a chain of mimic joints has none."""
     used = [contact.frame for contact, *active in zip(contacts, *states, strict=True) if any(active)]
     tree = KinematicTree(robot)
     above = {frame: {tree.body_of[node] for node in tree.path(tree.frame(robot, frame)[0])} for frame in used}
@@ -237,7 +237,7 @@ def branches(robot: Robot, contacts: Sequence[Contact], states: Iterable[Contact
 def contact_requirements(
     robot: Robot, contacts: Sequence[Contact], states: Iterable[ContactState], seed: int = 0
 ) -> tuple[ContactRequirement, ...]:
-    """Of every group of contacts, if all joint torques and contact components could be measured."""
+    """Requirements of every group of contacts, with all joint torques and contact components as candidates."""
     states = tuple(states)
     limbs = branches(robot, contacts, states)
     channels = candidates(robot, contacts, per="axis")
@@ -259,45 +259,45 @@ def contact_requirements(
 
 
 def _best_parts(
-    problem: PlanningProblem, parts: Sequence[DemandGroup], least: CheapestSet, tell: StepCallback
+    problem: PlanningProblem, parts: Sequence[DemandGroup], least: CheapestSet, report: StepCallback
 ) -> tuple[tuple[PartPlan, ...], tuple[Candidate, ...]]:
     """Every part with its minimal sets, and the union of their most informative cheapest sets.
 
-    Parts are ranked in turn, with the best sets of those before and the first sets of those after.
+    Parts are ranked in turn, with the best sets of the previous parts and the first sets of the next ones.
     """
     chosen = frozenset(least.chosen)
     logs = problem.logs or problem.stack.samples
     out = []
     for part in parts:
         frames = tuple(dict.fromkeys(frame for demand in part.demands for frame in demand.frames))
-        ours = frozenset(part.candidates)
-        keep, exclude = problem.keep & ours, problem.exclude & ours
+        own = frozenset(part.candidates)
+        keep, exclude = problem.keep & own, problem.exclude & own
         sets = all_minimal_sets(part.demands, part.candidates, keep, exclude)
-        first = tuple(c for c in part.candidates if c in chosen)
+        initial = tuple(c for c in part.candidates if c in chosen)
         ranking = SetRanking(
             robot=problem.robot,
             contacts=problem.contacts,
             logs=logs,
             candidates=part.candidates,
-            others=tuple(chosen - ours),
+            others=tuple(chosen - own),
             noise=problem.noise,
             prior=problem.prior,
         )
-        what = f"ranking sets, {', '.join(frames)}"
+        description = f"ranking sets, {', '.join(frames)}"
         if sets is None:
-            tell(what, 0, 1)
-            ranked = improve_by_exchange(ranking, part, first, keep, exclude)
+            report(description, 0, 1)
+            ranked = improve_by_exchange(ranking, part, initial, keep, exclude)
         else:
-            bound = total_cost(first) * (1.0 + _EXACT)
+            bound = total_cost(initial) * (1.0 + _EXACT)
             cheapest = [s for s in sets if total_cost(s) <= bound]
-            ranked = rank_sets(ranking, cheapest, _counted(tell, what, len(cheapest)))
-        chosen = (chosen - ours) | frozenset(ranked[0].sensors)
+            ranked = rank_sets(ranking, cheapest, _counted(report, description, len(cheapest)))
+        chosen = (chosen - own) | frozenset(ranked[0].sensors)
         out.append(PartPlan(frames, part.candidates, None if sets is None else tuple(sets), tuple(ranked)))
     return tuple(out), tuple(c for c in problem.candidates if c in chosen)
 
 
-def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], tell: StepCallback) -> Iterable[Removal]:
-    step = _counted(tell, "leaving sensors out", len(chosen))
+def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], report: StepCallback) -> Iterable[Removal]:
+    step = _counted(report, "leaving sensors out", len(chosen))
     for candidate in chosen:
         fewer = [c for c in chosen if c is not candidate]
         yield Removal(candidate, _base_rank(problem, fewer), problem.stack.rank(fewer))
@@ -305,7 +305,7 @@ def _removals(problem: PlanningProblem, chosen: Sequence[Candidate], tell: StepC
 
 
 def _base_rank(problem: PlanningProblem, chosen: Sequence[Candidate]) -> int | None:
-    """Least rank(S_b V_x) over the states, each at almost every posture; None for a bolted base."""
+    """Least rank(S_b V_x) over the states, each at a generic posture; None for a bolted base."""
     if problem.robot.fixed_base:
         return None
     postures = random_postures(problem.robot, _TRIED, np.random.default_rng(problem.seed))
@@ -313,7 +313,7 @@ def _base_rank(problem: PlanningProblem, chosen: Sequence[Candidate]) -> int | N
     return min(int(base_rank(base_values(builder, state, postures)).max()) for state in problem.states)
 
 
-def _counted(tell: StepCallback, what: str, steps: int) -> Callable[[], None]:
-    """Tells one step more at every call."""
+def _counted(report: StepCallback, what: str, steps: int) -> Callable[[], None]:
+    """Callback without arguments that reports one step more at every call."""
     numbers = count(1)
-    return lambda: tell(what, next(numbers), steps)
+    return lambda: report(what, next(numbers), steps)

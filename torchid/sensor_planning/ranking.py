@@ -1,4 +1,4 @@
-"""Rank and information of sensor sets over all samples of a motion, many sets from one pass."""
+"""Rank and information of sensor sets over all samples of a motion; one pass serves many sets."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensor_planning.demands import Candidate, sensor_set
 from torchid.sensor_planning.search import DemandGroup
 
-_ROUNDING_SHARE = 1e-9  # a share of the largest column in units of the scales, or of unit columns, that is rounding
-_SAMPLES = 96  # a contact state: bits change by less than 1 % with four times as many
+_ROUNDING_SHARE = 1e-9  # of the largest column in units of the scales, or of unit columns: smaller ones are rounding
+_SAMPLES = 96  # per contact state: bits change by less than 1 % with four times as many
 _ROUNDING = 1e-13
 _ROUNDS = 12
 _SAME_COST = 1e-9
@@ -37,10 +37,10 @@ _SAME_COST = 1e-9
 class MotionStack:
     """Ranks of the stack of many samples, of inertial parameters, for any choice of sensors.
 
-    `rank(S_b V_x) = 6` in every sample suffices to reach every body. It is not necessary: what a sample loses of the
-    base depends on its posture, and another sample may show it.
+    `rank(S_b V_x) = 6` in every sample suffices to reach every body. It is not necessary: the directions of the base
+    that a sample loses depend on its posture, and other samples may determine them.
 
-    How inertia is split at a weld with a force/torque sensor does not count: no other sensor could tell.
+    The split of inertia at a weld with a force/torque sensor is not counted: no other sensor determines it.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class MotionStack:
         candidates: Sequence[Candidate],
         seed: int = 0,
     ) -> None:
-        """Draw samples of every contact state, to be used for all sets."""
+        """Draw samples of every contact state, the same for all sets."""
         self.robot, self.contacts, self.states = robot, tuple(contacts), tuple(states)
         self.candidates = tuple(candidates)
         self.samples = structural_samples(robot, contacts, states, seed=seed)
@@ -79,10 +79,10 @@ def irredundant_set(
 ) -> tuple[Candidate, ...]:
     """Sensors with which the stack still has the rank of all candidates, and none of which is redundant for it.
 
-    The dearest are dropped first; a cheaper set of another kind may exist.
+    The most expensive are dropped first; a cheaper irredundant set may exist.
 
     Raises:
-        SensorError: the candidates that are left have a lower rank than all of them.
+        SensorError: without the excluded candidates the rank is lower.
     """
     kept, excluded = frozenset(keep), frozenset(exclude)
     chosen = [c for c in stack.candidates if c not in excluded]
@@ -106,10 +106,10 @@ class RankedSet(NamedTuple):
 
 
 class SetRanking:
-    """Bits that any choice from some candidates gives, beside sensors that are there anyway.
+    """Information [bits] of any choice of candidates, in addition to given sensors.
 
-    A sensor that is left out takes one row per sample and channel with it: with R the whitened rows of all sensors and
-    c the way its channel enters the generalized force, L^-1 Q R, where Q = c^T W and L L^T = Q Q^T.
+    Leaving a sensor out removes one row per sample and channel: L^-1 Q R, where R are the whitened rows of all sensors,
+    Q = c^T W with c the direction of the channel in the generalized force, and L L^T = Q Q^T.
     """
 
     @one_thread()
@@ -124,16 +124,16 @@ class SetRanking:
         noise: SensorNoise,
         prior: Array,
     ) -> None:
-        """Work out the rows of all sensors together.
+        """Compute the rows of all sensors together.
 
         Args:
             robot: the robot.
             contacts: its contacts.
-            logs: samples to weigh the sensors by; forces in them do not matter.
+            logs: samples for which information is computed; their forces are not used.
             candidates: to choose from.
-            others: sensors that are there in any case.
+            others: sensors in every set.
             noise: of all sensors.
-            prior: (12 L,), how far parameters may be off the nominal ones, 0 where they are known.
+            prior: (12 L,), prior standard deviation of the parameters about the nominal ones, 0 where they are known.
         """
         self.candidates = tuple(candidates)
         sensors = sensor_set(robot, contacts, [*candidates, *others], noise)
@@ -146,13 +146,15 @@ class SetRanking:
             rows, W = builder.rows_by_sample(samples, state)
             R = rows[..., :-1] @ directions
             self._information += rows_information(R, weight)
-            owners, ways = self._ways(builder, samples, state)
+            owners, ways = self._channel_directions(builder, samples, state)
             if owners:
                 Q = reading_directions(ways, W)
                 self._states.append(_StateRows(weight, owners, Q, Q @ R))
 
-    def _ways(self, builder: RowBuilder, samples: Samples, state: ContactState) -> tuple[list[int], Tensor]:
-        """How each channel of the candidates enters the generalized force, (B, c, n_rows), and whose it is."""
+    def _channel_directions(
+        self, builder: RowBuilder, samples: Samples, state: ContactState
+    ) -> tuple[list[int], Tensor]:
+        """Candidate of each channel by index, and its direction in the generalized force, (B, c, n_rows)."""
         J = builder.contact_jacobian(samples)
         base, owners, ways = builder.tree.base_rows, [], []
         for number, candidate in enumerate(self.candidates):
@@ -169,16 +171,16 @@ class SetRanking:
     @one_thread()
     @torch.no_grad()
     def bits(self, chosen: Iterable[Candidate]) -> float:
-        """Information [bits] about the parameters, against knowing each to within its prior."""
+        """Information gain [bits] about the parameters over the prior."""
         kept = {self.candidates.index(candidate) for candidate in chosen}
         information = self._information
         for rows in self._states:
-            gone = [row for row, owner in enumerate(rows.owners) if owner not in kept]
-            if gone:
-                Q = rows.Q[:, gone]
+            left_out = [row for row, owner in enumerate(rows.owners) if owner not in kept]
+            if left_out:
+                Q = rows.Q[:, left_out]
                 gram = Q @ Q.mT
-                gram.diagonal(dim1=1, dim2=2).add_(_ROUNDING)  # channels that read alike, or nothing
-                lost = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows.QR[:, gone], upper=False)
+                gram.diagonal(dim1=1, dim2=2).add_(_ROUNDING)  # dependent or zero channels
+                lost = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), rows.QR[:, left_out], upper=False)
                 information = information - rows_information(lost, rows.weight)
         return float(0.5 * torch.linalg.slogdet(information).logabsdet / np.log(2.0))
 
@@ -188,9 +190,9 @@ def rank_sets(
 ) -> list[RankedSet]:
     """Sets with their bits, most informative first; `done` is called after each, from several threads."""
 
-    def run(places: Iterator[int]) -> list[tuple[float, int]]:
+    def run(indices: Iterator[int]) -> list[tuple[float, int]]:
         ranked = []
-        for index in places:
+        for index in indices:
             ranked.append((-ranking.bits(sets[index]), index))
             if done is not None:
                 done()
@@ -208,17 +210,17 @@ def improve_by_exchange(
     keep: AbstractSet[Candidate],
     exclude: AbstractSet[Candidate],
 ) -> list[RankedSet]:
-    """Sets reached from a sufficient one by exchanging one sensor at a time, uphill in information, best first.
+    """Sets reached from a sufficient one by exchanging one sensor at a time for more information, best first.
 
     Args:
         ranking: of the part's candidates.
         part: whose demands every set meets.
-        first: where to start.
-        keep: sensors that stay.
-        exclude: sensors that cannot be taken.
+        first: the initial set.
+        keep: sensors in every set.
+        exclude: sensors in no set.
     """
     best = RankedSet(ranking.bits(first), tuple(first))
-    climbed = [best]
+    visited = [best]
     for _ in range(_ROUNDS):
         others = _neighbours(part, best.sensors, keep, exclude)
         neighbours = [RankedSet(ranking.bits(chosen), chosen) for chosen in others]
@@ -226,26 +228,26 @@ def improve_by_exchange(
         if higher.bits <= best.bits:
             break
         best = higher
-        climbed.append(best)
-    return climbed[::-1]
+        visited.append(best)
+    return visited[::-1]
 
 
 def _neighbours(
     part: DemandGroup, chosen: Sequence[Candidate], keep: AbstractSet[Candidate], exclude: AbstractSet[Candidate]
 ) -> Iterator[tuple[Candidate, ...]]:
     """Sufficient sets that differ by one sensor of the same cost."""
-    for gone in chosen:
+    for old in chosen:
         for new in part.candidates:
-            same_cost = abs(new.cost - gone.cost) <= _SAME_COST * gone.cost
-            if gone not in keep and new not in exclude and new not in chosen and same_cost:
-                exchanged = tuple(c for c in part.candidates if (c in chosen and c is not gone) or c is new)
+            same_cost = abs(new.cost - old.cost) <= _SAME_COST * old.cost
+            if old not in keep and new not in exclude and new not in chosen and same_cost:
+                exchanged = tuple(c for c in part.candidates if (c in chosen and c is not old) or c is new)
                 if not any(demand.missing(exchanged) for demand in part.demands):
                     yield exchanged
 
 
 @dataclass(frozen=True)
 class _StateRows:
-    """Of B samples with all sensors: rows that hang on each candidate, Q (B, c, nv) and Q R (B, c, P)."""
+    """Of B samples with all sensors: Q (B, c, n_rows) and Q R (B, c, P) of the channels, and their candidates."""
 
     weight: float
     owners: list[int]
@@ -254,7 +256,7 @@ class _StateRows:
 
 
 def _splits(robot: Robot) -> Array:
-    """Changes of all parameters, (12 L, M), that take inertia from the body before a weld and add it to that beyond."""
+    """Changes of all parameters, (12 L, M), that move inertia from the body before a weld to the one beyond."""
     splits = [np.zeros((robot.nominal.size, 0))]
     for index, body in enumerate(robot.bodies):
         joint = body.joint
@@ -269,10 +271,10 @@ def _splits(robot: Robot) -> Array:
 
 
 def _rank_of(changes: Array, problem: LinearProblem) -> int:
-    """Rank of the effect on a problem's rows of changes of its parameters, (P, M), each scaled to the size of one."""
+    """Rank of the effect of parameter changes, (P, M), each scaled to size 1, on a problem's rows."""
     least = _ROUNDING_SHARE * np.linalg.norm(problem.A * problem.scale, axis=0).max(initial=0.0)
     sizes = (np.abs(changes) / problem.scale[:, None]).max(axis=0, initial=0.0)
     columns = problem.A @ (changes / np.maximum(sizes, np.finfo(float).tiny))
     norms = np.linalg.norm(columns, axis=0)
-    visible = columns[:, norms > least] / norms[norms > least]
-    return int(np.linalg.matrix_rank(visible, tol=_ROUNDING_SHARE)) if visible.size else 0
+    unit_columns = columns[:, norms > least] / norms[norms > least]
+    return int(np.linalg.matrix_rank(unit_columns, tol=_ROUNDING_SHARE)) if unit_columns.size else 0

@@ -28,12 +28,12 @@ from torchid.sensor_planning.demands import (
 
 _DEVICES, _COMBINATIONS, _BATCH = 5, 100_000, 4096
 _MEMORY = 2**22  # numbers in one batch of the enumeration
-_EXACT = 1e-7  # relative; what a solver of integer programs rounds
+_EXACT = 1e-7  # relative accuracy of the integer program
 
 
 @dataclass(frozen=True)
 class CheapestSet:
-    """A sufficient set, by the order of the candidates; `proven` if its cost is `lower_bound`, the least possible."""
+    """A sufficient set, in the order of the candidates; `proven` if its cost is `lower_bound`, the least possible."""
 
     chosen: tuple[Candidate, ...]
     cost: float
@@ -56,7 +56,7 @@ def cheapest_set(
         candidates: to choose from.
         keep: in the set, needed or not.
         exclude: not in the set.
-        seconds: after these, the best set found is returned with the bound reached, unproven.
+        seconds: time limit, after which the best known set is returned, unproven.
 
     Raises:
         SensorError: as `usable_candidates`.
@@ -82,19 +82,19 @@ def all_minimal_sets(
     exclude: Iterable[Candidate] = (),
     limit: int = 14,
 ) -> list[tuple[Candidate, ...]] | None:
-    """Every sufficient set that would not suffice without any one of its candidates (but the kept ones).
+    """Every minimal sufficient set: without any one of its candidates, except kept ones, it does not suffice.
 
-    Meant for the demands and candidates of one `DemandGroup`: the sets of a robot are all unions of one set of each.
+    For the demands and candidates of one `DemandGroup`: the sets of a robot are all unions of one set of each group.
 
     Args:
         demands: to be met.
         candidates: to choose from.
         keep: in every set.
         exclude: in none.
-        limit: the most candidates to enumerate the sets of.
+        limit: largest number of candidates, without kept ones, whose sets are enumerated.
 
     Returns:
-        The sets by size; None if more than `limit` candidates are open.
+        The sets by size; None beyond the limit.
 
     Raises:
         SensorError: as `usable_candidates`.
@@ -120,7 +120,7 @@ def all_minimal_sets(
 def usable_candidates(
     demands: Sequence[Demand], candidates: Sequence[Candidate], keep: Iterable[Candidate], exclude: Iterable[Candidate]
 ) -> tuple[frozenset[Candidate], tuple[Candidate, ...]]:
-    """The kept candidates and all that are not excluded, once these are known to suffice.
+    """The kept candidates, and all that are not excluded after a check that these suffice.
 
     Raises:
         SensorError: they do not suffice, or one is both kept and excluded.
@@ -130,9 +130,9 @@ def usable_candidates(
         raise SensorError("sensors", "keep", f"'{contradiction.name}', which is also excluded", "one or the other")
     usable = tuple(c for c in candidates if c not in excluded)
     lacking = [
-        f"{short} of {demand.target.shape[1]} dimensions of {' + '.join(demand.frames)}"
+        f"{missing} of {demand.target.shape[1]} dimensions of {' + '.join(demand.frames)}"
         for demand in demands
-        if (short := demand.missing(usable))
+        if (missing := demand.missing(usable))
     ]
     if lacking:
         found = f"all of them leave {'; '.join(lacking)} undetermined"
@@ -144,77 +144,78 @@ def usable_candidates(
 
 @dataclass(frozen=True)
 class DemandGroup:
-    """Demands that compete for the same candidates: a part of the problem that can be solved on its own."""
+    """Demands with common candidates: an independent part of the problem."""
 
     demands: tuple[Demand, ...]
     candidates: tuple[Candidate, ...]
 
 
 def demand_groups(demands: Sequence[Demand], candidates: Sequence[Candidate]) -> list[DemandGroup]:
-    """Independent parts. A candidate in none of them is never needed."""
+    """Independent parts of the problem. A candidate in none of them is never needed."""
     acting = [demand.vectors.keys() & set(candidates) for demand in demands]
     return [
         DemandGroup(
-            tuple(demands[index] for index in places),
-            tuple(c for c in candidates if any(c in acting[index] for index in places)),
+            tuple(demands[index] for index in indices),
+            tuple(c for c in candidates if any(c in acting[index] for index in indices)),
         )
-        for places in connected_groups(acting)
+        for indices in connected_groups(acting)
     ]
 
 
 @dataclass(frozen=True)
 class CostBound:
-    """No set that meets the demand costs less than `bound`; `chosen`, the best set found, costs that if it is exact."""
+    """Lower bound of the cost of any set that meets a demand; `chosen` is the best known set, which may cost more."""
 
     bound: float
     chosen: tuple[Candidate, ...]
 
 
 def bound_cost(demand: Demand, candidates: Sequence[Candidate]) -> CostBound:
-    """The cheapest of the candidates that meet one demand, which they can; without a set if there are too many.
+    """The cheapest candidates that meet one demand, which all together meet; no set if there are too many.
 
-    Sensors of several components are taken or left in all ways; the rest is a choice among single vectors.
+    All subsets of the sensors with several components are enumerated; the rest is a choice among single vectors.
     """
-    ours = [c for c in candidates if c in demand.vectors]
-    devices = [c for c in ours if demand.vectors[c].shape[1] > 1]
-    single = sorted((c for c in ours if c not in devices), key=lambda c: c.cost)
+    acting = [c for c in candidates if c in demand.vectors]
+    devices = [c for c in acting if demand.vectors[c].shape[1] > 1]
+    single = sorted((c for c in acting if c not in devices), key=lambda c: c.cost)
     if len(devices) > _DEVICES:
         return CostBound(0.0, ())
     cost, best = np.array([c.cost for c in single]), CostBound(math.inf, ())
     for taken in chain.from_iterable(combinations(devices, count) for count in range(len(devices) + 1)):
         basis = orthonormal_basis(demand.stacked(taken))
         target, vectors = orthogonal_part(demand.target, basis), orthogonal_part(demand.stacked(single), basis)
-        bound, places = _least_of_vectors(span_basis(target), vectors, cost)
+        bound, indices = _cheapest_vectors(span_basis(target), vectors, cost)
         bound += total_cost(taken)
         if bound < best.bound:
-            best = CostBound(bound, (*taken, *(single[k] for k in places)))
+            best = CostBound(bound, (*taken, *(single[k] for k in indices)))
     return best
 
 
 def inequalities(demand: Demand, candidates: Sequence[Candidate], chosen: AbstractSet[Candidate]) -> Iterator[Array]:
-    """Some that a set violates which does not meet the demand.
+    """Valid inequalities on sets that meet the demand, violated by `chosen`, which does not.
 
-    Each F is `chosen`, enlarged while it leaves as much of the target unreached: fewer and smaller weights for the same
-    right-hand side. Enlarging first by what does not act on one of the contacts finds what that contact needs.
+    Each is from a set F: `chosen`, enlarged as long as it leaves as many dimensions of the target unreached. That
+    gives fewer and smaller weights for the same right-hand side. Candidates that do not act on one of the contacts come
+    first, so that the inequality is about that contact.
 
     Yields:
         Rows (n + 1,): weights of the n candidates, then the right-hand side.
     """
-    ours = [c for c in candidates if c in demand.vectors]
-    start = orthonormal_basis(demand.stacked(c for c in ours if c in chosen))
-    short = int(demand.unreached(start))
+    acting = [c for c in candidates if c in demand.vectors]
+    start = orthonormal_basis(demand.stacked(c for c in acting if c in chosen))
+    missing = int(demand.unreached(start))
     for contact in demand.contacts:
         rows = np.array(demand.rows) == contact
-        there = {c for c in ours if demand.vectors[c][rows].any()}
-        for order in (ours, ours[::-1]):
+        there = {c for c in acting if demand.vectors[c][rows].any()}
+        for order in (acting, acting[::-1]):
             basis = start
             for candidate in sorted(order, key=lambda c: c in there):
                 wider = orthonormal_basis(np.hstack([basis, demand.vectors[candidate]]))
-                if demand.unreached(wider) == short:
+                if demand.unreached(wider) == missing:
                     basis = wider
             gains = demand.gains(basis)
-            weights = [0 if c in chosen else min(gains.get(c, 0), short) for c in candidates]
-            yield np.array([*weights, short], dtype=float)
+            weights = [0 if c in chosen else min(gains.get(c, 0), missing) for c in candidates]
+            yield np.array([*weights, missing], dtype=float)
 
 
 def _cheapest_part(part: DemandGroup, kept: AbstractSet[Candidate], deadline: float) -> CheapestSet:
@@ -254,10 +255,10 @@ def _cheapest_part(part: DemandGroup, kept: AbstractSet[Candidate], deadline: fl
     return CheapestSet(chosen, total_cost(best), total_cost(best) if proven else bound, proven)
 
 
-def _pruned(part: DemandGroup, wanted: AbstractSet[Candidate], kept: AbstractSet[Candidate]) -> frozenset[Candidate]:
-    """A sufficient set: all candidates, less whatever can be spared, the unwanted and the dear first."""
+def _pruned(part: DemandGroup, preferred: AbstractSet[Candidate], kept: AbstractSet[Candidate]) -> frozenset[Candidate]:
+    """A sufficient set: redundant candidates are removed, those not preferred first, then the most expensive."""
     chosen = frozenset(part.candidates)
-    for candidate in sorted(chosen - kept, key=lambda c: (c in wanted, -c.cost, c.name)):
+    for candidate in sorted(chosen - kept, key=lambda c: (c in preferred, -c.cost, c.name)):
         fewer = chosen - {candidate}
         if not any(d.missing(fewer) for d in part.demands if candidate in d.vectors):
             chosen = fewer
@@ -270,8 +271,8 @@ def _sufficient(
     """Which sets meet every demand, (N,) bool, for membership (N, len(free)) of candidates beside the kept ones."""
     result = np.ones(len(member), dtype=bool)
     for demand in demands:
-        ours = [k for k, c in enumerate(free) if c in demand.vectors]
-        owner = np.repeat(ours, [demand.vectors[free[k]].shape[1] for k in ours]).astype(int)
+        acting = [k for k, c in enumerate(free) if c in demand.vectors]
+        owner = np.repeat(acting, [demand.vectors[free[k]].shape[1] for k in acting]).astype(int)
         always, vectors = demand.stacked(kept), demand.stacked(free)
         for some in np.array_split(np.flatnonzero(result), 1 + len(member) * vectors.size // _MEMORY):
             masked = vectors * member[some][:, None, owner]
@@ -281,13 +282,13 @@ def _sufficient(
     return result
 
 
-def _least_of_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float, Sequence[int]]:
-    """Bound and places of the choice among vectors (k, N), by ascending cost (N,), that spans a target (k, d)."""
+def _cheapest_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float, Sequence[int]]:
+    """Bound and indices of the cheapest vectors, of (k, N) by ascending cost (N,), that span a target (k, d)."""
     d, length = target.shape[1], np.linalg.norm(vectors, axis=0)
     if d == 0:
         return 0.0, ()
-    places = np.flatnonzero(length > TOLERANCE)
-    vectors, cost = vectors[:, places] / length[places], cost[places]
+    indices = np.flatnonzero(length > TOLERANCE)
+    vectors, cost = vectors[:, indices] / length[indices], cost[indices]
     rest = orthogonal_part(vectors, target)
     length = np.linalg.norm(rest, axis=0)
     inside = length <= TOLERANCE
@@ -297,16 +298,16 @@ def _least_of_vectors(target: Array, vectors: Array, cost: Array) -> tuple[float
         floor = float(cost[: d + g].sum()) if d + g <= len(cost) else math.inf
         budget -= math.comb(int((~inside).sum()), g) if g < len(rest) else 1
         if floor >= best or budget < 0:
-            return min(best, floor), places[chosen].tolist()
+            return min(best, floor), indices[chosen].tolist()
         for flat in _flats(rest, inside, g, d + g):
             basis = _cheapest_basis(vectors, flat)
             if len(basis) == d + g and cost[basis].sum() < best:
                 best, chosen = float(cost[basis].sum()), np.array(basis)
-    return best, places[chosen].tolist()
+    return best, indices[chosen].tolist()
 
 
 def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.ndarray]:
-    """Members (N,) bool of flats of dimension g that have at least so many."""
+    """Members (N,) bool of flats of dimension g with at least `least` members."""
     if g == len(rest):
         yield np.ones(rest.shape[1], dtype=bool)
         return
@@ -319,7 +320,7 @@ def _flats(rest: Array, inside: np.ndarray, g: int, least: int) -> Iterator[np.n
 
 
 def _cheapest_basis(vectors: Array, flat: np.ndarray) -> list[int]:
-    """Places of independent vectors among the members (N,) bool of a flat, the first ones first."""
+    """Indices of independent vectors among the members (N,) bool of a flat, chosen greedily."""
     basis, chosen = np.zeros((len(vectors), 0)), []
     for index in np.flatnonzero(flat).tolist():
         left = orthogonal_part(vectors[:, [index]], basis)
