@@ -207,9 +207,8 @@ class _Npz:
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`."""
         entry = self._entry(name)
-        with self._archive.open(entry) as stream:
-            with _python_2_headers_allowed():
-                array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+        with self._archive.open(entry) as stream, _python_2_headers_allowed():
+            array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
         return array
 
     def lazy(self, name: str, folder: Path) -> LazyArray:

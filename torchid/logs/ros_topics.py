@@ -49,7 +49,7 @@ class WrenchTopic:
     """`geometry_msgs/WrenchStamped` or `Wrench`.
 
     `sign` is -1 where it is the robot's action on the environment, or the child side's on the parent side. `frame` is
-    the expected `header.frame_id`, by default the contact's frame; in a limb, the frame that equals the joint's child frame.
+    the expected `header.frame_id`, by default the contact's frame; in a limb, the name of the joint's child frame.
     """
 
     topic: _Name
