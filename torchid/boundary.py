@@ -1,4 +1,4 @@
-"""The boundary between a command and its user: whatever stops a command is reported in one line of plain text."""
+"""Run a command for its user: every failure is reported in one line of plain text."""
 
 from __future__ import annotations
 
@@ -14,19 +14,17 @@ from contextlib import contextmanager, suppress
 from torchid.errors import BaseLostError, EscapedStream, InputError, TorchidWarning, activity_of, one_line
 from torchid.staging import list_written, reset_written, termination_as_interrupt
 
-#: What the machine refuses, and not the user's files nor the program: no room, no memory, no permission.
+#: Errors of the system, not of the user's files or the program: no room, no memory, no permission.
 _MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE)
-#: Of numbers that went wrong in a library: they may touch results. Others speak to programmers.
+#: Numerical warnings of libraries, which may affect results; other warnings are meant for programmers.
 _NUMERICAL = (RuntimeWarning,)
-_HOW = "--debug shows where"
 
 
 def run_guarded(program: str, command: Callable[[], int | None], debug: bool = False) -> int:
-    """Run a command so that whatever stops it is reported in one line.
+    """Run a command; every failure is reported in one line.
 
-    Control characters in all output are escaped. Numerical warnings of libraries become a line of ours, for they may
-    affect results; their other warnings and log messages, often with text out of files, are no help to users and are
-    shown with `debug` only.
+    Control characters in all output are escaped. Numerical warnings of libraries are printed as one line, as they may
+    affect results; their other warnings and log messages are shown with `debug` only.
 
     Args:
         program: its name.
@@ -46,64 +44,67 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
                 status = command() or 0
             sys.stdout.flush()
             return status
-        except BrokenPipeError:  # `torchid ... | head` is no error
-            _forget(sys.stdout)
+        except BrokenPipeError:  # `torchid ... | head` is not an error
+            _redirect_to_null(sys.stdout)
             return 1
         except KeyboardInterrupt as interrupt:
-            _say(program, str(interrupt) or f"interrupted; {list_written()} was written")
+            _print_line(program, str(interrupt) or f"interrupted; {list_written()} was written")
             return 1
         except Exception as error:  # a full disk, or a bug: no traceback unless `debug`
             if debug:
                 traceback.print_exc()
             status, line = _describe_failure(error)
-            _say(program, line)
+            _print_line(program, line)
             return status
 
 
 def _describe_failure(error: Exception) -> tuple[int, str]:
-    """Exit status and the one line that says what stopped a command."""
+    """Exit status and the line that reports an error."""
     if isinstance(error, (InputError, BaseLostError)):
         return 2, str(error)
-    doing = activity_of(error)
-    where = f"{doing}: " if doing else ""
+    activity = activity_of(error)
+    where = f"{activity}: " if activity else ""
     if isinstance(error, MemoryError):
         return 1, f"{where}not enough memory ({str(error) or 'the system gives no more'}); accepted: smaller logs"
     if isinstance(error, OSError) and error.errno in _MACHINE:
         return 1, f"{where}{type(error).__name__}: {error}"
     text = str(error) or "no text"
-    return 1, f"{where}{type(error).__name__}: {text}; this is a fault in torchid, please report it ({_HOW})"
+    return (
+        1,
+        f"{where}{type(error).__name__}: {text}; this is a fault in torchid, please report it (--debug shows where)",
+    )
 
 
 class _Warnings:
-    """Warnings as lines, each of another text once."""
+    """Prints warnings as lines; repeated warnings of libraries once."""
 
     def __init__(self, program: str, debug: bool) -> None:
-        self._program, self._debug, self._seen = program, debug, set[str]()
+        self._program, self._debug, self._printed = program, debug, set[str]()
 
     def __call__(self, message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         text = f"{category.__name__}: {message}"
         if not issubclass(category, TorchidWarning):
-            if not (self._debug or issubclass(category, _NUMERICAL)) or text in self._seen:
+            if not (self._debug or issubclass(category, _NUMERICAL)) or text in self._printed:
                 return
-            self._seen.add(text)
+            self._printed.add(text)
             text = f"NumericalWarning: a library met a number that it cannot handle ({message})"
-        _say(self._program, text)
+        _print_line(self._program, text)
 
 
-def _say(program: str, text: str) -> None:
+def _print_line(program: str, text: str) -> None:
     with suppress(BrokenPipeError):
         print(f"{program}: {one_line(text)}", file=sys.stderr)
 
 
-def _forget(stream: object) -> None:
-    """Let the interpreter's last flush of a closed pipe go nowhere."""
+def _redirect_to_null(stream: object) -> None:
+    """Redirect a closed pipe, so that the interpreter's last flush does not fail."""
     with suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # type: ignore[attr-defined]
 
 
 @contextmanager
 def plain_streams() -> Iterator[None]:
-    """Standard output and error without control characters in what is written."""
+    """Escape control characters in all text that is written to standard output and error."""
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = (EscapedStream(stream) for stream in before)
     try:
@@ -114,10 +115,10 @@ def plain_streams() -> Iterator[None]:
 
 @contextmanager
 def _libraries_silent(debug: bool) -> Iterator[None]:
-    """Keep what libraries log, often with texts out of files, from standard error."""
+    """Keep log messages of libraries from standard error: they often contain text of files."""
     handler, root = logging.NullHandler(), logging.getLogger()
     if not debug:
-        root.addHandler(handler)  # without any, Python writes warnings to standard error
+        root.addHandler(handler)  # without a handler, Python writes warnings to standard error
     try:
         yield
     finally:

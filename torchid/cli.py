@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from torchid import __version__
 from torchid.boundary import plain_streams, run_guarded
 from torchid.errors import during
-from torchid.staging import interrupts_deferred as _interrupt_held_back
+from torchid.staging import interrupts_deferred
 
 if TYPE_CHECKING:
     from torchid.commands import Identification
@@ -24,34 +24,34 @@ if TYPE_CHECKING:
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
-_ANALYZE = "say what sensors and motion determine, and plan the smallest sensor set"
+_ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
-_CHECK = "say whether logs are fit to be fitted, and what is wrong with them where"
-_SIMULATE = "let a robot move in simulation and write the logs of its sensors (needs the extra [sim])"
+_CHECK = "check logs for errors before a fit"
+_SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
-    with plain_streams():  # argparse repeats what it does not understand
+    with plain_streams():  # argparse repeats unknown arguments in its errors
         options = _options(arguments)
     return run_guarded("torchid", lambda: _command(options), options.debug)
 
 
 def _command(options: argparse.Namespace) -> int | None:
-    what = getattr(options, "file", getattr(options, "run", getattr(options, "source", "")))
-    with during(options.name, what):
+    target = getattr(options, "file", getattr(options, "run", getattr(options, "source", "")))
+    with during(options.name, target):
         status: int | None = options.command(options)
         return status
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says; overrides may also come after options, which argparse does not know."""
+    """The parsed command line; overrides may also follow options, which argparse does not support."""
     parser = _parser()
-    options, late = parser.parse_known_args(arguments)
-    if late and (not hasattr(options, "overrides") or any(text.startswith("-") for text in late)):
-        parser.error(f"unrecognized arguments: {' '.join(late)}")
-    if late:
-        options.overrides = [*options.overrides, *late]
+    options, rest = parser.parse_known_args(arguments)
+    if rest and (not hasattr(options, "overrides") or any(text.startswith("-") for text in rest)):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:
+        options.overrides = [*options.overrides, *rest]
     return options
 
 
@@ -62,14 +62,14 @@ def _parser() -> argparse.ArgumentParser:
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     identify.add_argument("file", help="experiment file (YAML)")
     identify.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example estimator.ridge=0.01")
-    identify.add_argument("--resume", action="store_true", help="go on with a training (sgd) that was interrupted")
+    identify.add_argument("--resume", action="store_true", help="continue an interrupted training (sgd)")
     identify.set_defaults(command=_identify)
     evaluate = commands.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
     evaluate.add_argument("run", help="run folder")
     evaluate.add_argument(
         "--log", action="append", required=True, metavar="FILE", help="log to evaluate; may be repeated"
     )
-    evaluate.add_argument("--device", help="where to compute, if not where the run did: cpu, cuda, cuda:0, ...")
+    evaluate.add_argument("--device", help="device, by default that of the run: cpu, cuda, cuda:0, ...")
     evaluate.set_defaults(command=_evaluate)
     analyze = commands.add_parser("analyze", help=_ANALYZE, description=_ANALYZE)
     analyze.add_argument("file", help="experiment file (YAML); logs and sensors may be left out")
@@ -86,10 +86,10 @@ def _parser() -> argparse.ArgumentParser:
     check = commands.add_parser("check", help=_CHECK, description=_CHECK)
     check.add_argument("file", help="experiment file (YAML), whose logs are checked against its robot, or a log")
     check.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, with an experiment file")
-    check.add_argument("--urdf", metavar="FILE", help="robot of a log; without it, what needs a robot is not checked")
+    check.add_argument("--urdf", metavar="FILE", help="robot of a log; without it, checks against a robot are skipped")
     check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
-    check.add_argument("--fixed-base", action="store_true", help="that robot's base does not move")
-    check.add_argument("--topics", metavar="FILE", help="experiment file whose logs.topics says what a bag holds")
+    check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
+    check.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
     check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
     check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
     check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     convert = commands.add_parser("convert", help=_CONVERT, description=_CONVERT)
     convert.add_argument("source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, or a bag of ROS messages")
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
-    convert.add_argument("--topics", metavar="FILE", help="experiment file whose logs.topics says what a bag holds")
+    convert.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
     for name, command in commands.choices.items():
@@ -107,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _identify(options: argparse.Namespace) -> None:
-    with _interrupt_held_back():
+    with interrupts_deferred():
         from torchid.commands.identify import identify
         from torchid.config import load_config
         from torchid.estimators import Estimate
@@ -145,8 +145,26 @@ def _identify(options: argparse.Namespace) -> None:
     print(f"written to    {run.experiment.config.output}")
 
 
+def _print_headline(worse: list[WorseThanNominal]) -> None:
+    from torchid.problem.metrics import ADVICE, describe_worse
+
+    for line in (
+        f"WORSE THAN URDF: {describe_worse(worse)}",
+        f"{ADVICE}; the results are written all the same, status 0",
+    ):
+        print(fill(line, 100, subsequent_indent="  "))
+
+
+def _print_noise(noise: NoiseSummary) -> None:
+    from torchid.report.tables import noise_advice, noise_table, print_tables
+
+    print_tables(noise_table([asdict(group) for group in noise.groups]))
+    if noise.suggested:
+        print(noise_advice(noise.suggested))
+
+
 def _print_fit(run: Identification) -> None:
-    """Key figures, a line each."""
+    """Print the key figures, one per line."""
     from torchid.commands.training import body_eigenvalues
     from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, SgdEstimate
 
@@ -157,7 +175,7 @@ def _print_fit(run: Identification) -> None:
     if run.validation is not None:
         _print_validation(run.validation)
     if run.ridge is not None:
-        print(f"ridge         {run.ridge.ridge:g}, chosen by what predicts left-out blocks of the training logs")
+        print(f"ridge         {run.ridge.ridge:g}, chosen by cross-validation on blocks of the training logs")
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
     if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
@@ -176,16 +194,6 @@ def _print_fit(run: Identification) -> None:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
 
 
-def _print_headline(worse: list[WorseThanNominal]) -> None:
-    from torchid.problem.metrics import ADVICE, describe_worse
-
-    for line in (
-        f"WORSE THAN URDF: {describe_worse(worse)}",
-        f"{ADVICE}; the results are written all the same, status 0",
-    ):
-        print(fill(line, 100, subsequent_indent="  "))
-
-
 def _print_validation(validation: CrossValidation) -> None:
     from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 
@@ -196,7 +204,7 @@ def _print_validation(validation: CrossValidation) -> None:
 
 
 def _mass_text(mass: TotalMass) -> str:
-    """The total mass with its standard error, or why there is none to be printed."""
+    """The total mass with its standard error, or the reason why it is not determined."""
     if mass.determined:
         return f"{mass.value:.3f} ± {mass.standard_error:.2g} kg"
     if not mass.separable:
@@ -205,16 +213,8 @@ def _mass_text(mass: TotalMass) -> str:
     return f"not determined by the data{known}"
 
 
-def _print_noise(noise: NoiseSummary) -> None:
-    from torchid.report.tables import noise_advice, noise_table, print_tables
-
-    print_tables(noise_table([asdict(one) for one in noise.groups]))
-    if noise.suggested:
-        print(noise_advice(noise.suggested))
-
-
 def _evaluate(options: argparse.Namespace) -> None:
-    with _interrupt_held_back():
+    with interrupts_deferred():
         from torchid.commands.evaluate import evaluate
         from torchid.report.tables import error_tables, print_tables
 
@@ -224,7 +224,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _analyze(options: argparse.Namespace) -> None:
-    with _interrupt_held_back():
+    with interrupts_deferred():
         from torchid.commands.analyze import analyze
         from torchid.config import load_analysis
         from torchid.report.analysis import accuracy_table
@@ -272,7 +272,7 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    with _interrupt_held_back():
+    with interrupts_deferred():
         from torchid.commands.check import check_files, check_outputs, write_check_outputs
         from torchid.report.log_checks import finding_table, log_heading, skipped_checks_text
         from torchid.report.tables import print_tables
@@ -281,19 +281,19 @@ def _check(options: argparse.Namespace) -> int:
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
     write_check_outputs(checked, options.json, options.figure)
-    for one in checked:
-        print(log_heading(one))
-        if one.findings:
-            print_tables(finding_table(one.findings))
-        if missing := skipped_checks_text(one):
-            print(fill(f"not checked   {missing}", 100, subsequent_indent=" " * 14))
-        print(fill(f"verdict       {one.verdict}", 100, subsequent_indent=" " * 14))
+    for log in checked:
+        print(log_heading(log))
+        if log.findings:
+            print_tables(finding_table(log.findings))
+        if skipped := skipped_checks_text(log):
+            print(fill(f"not checked   {skipped}", 100, subsequent_indent=" " * 14))
+        print(fill(f"verdict       {log.verdict}", 100, subsequent_indent=" " * 14))
         print()
-    return 0 if all(one.usable for one in checked) else 1
+    return 0 if all(log.usable for log in checked) else 1
 
 
 def _convert(options: argparse.Namespace) -> None:
-    with _interrupt_held_back():
+    with interrupts_deferred():
         from torchid.commands.check import convert
 
     log = convert(options.source, options.target, options.topics, options.overwrite)
@@ -301,7 +301,7 @@ def _convert(options: argparse.Namespace) -> None:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    with _interrupt_held_back():
+    with interrupts_deferred():
         from torchid.commands.simulate import simulate
         from torchid.config import load_simulation
         from torchid.report.tables import print_tables, stability_table

@@ -1,7 +1,7 @@
-"""Limits on the time and memory that reading a file may take, each with its reason, and checks that readers share.
+"""Limits on the size of input files, each with its reason, and checks that all readers share.
 
-Files may come from anywhere. No file below 10 MB takes more than 10 s or 1 GB to be read or refused. The limits lie far
-beyond what robots and their logs need.
+Files are not trusted. No file below 10 MB takes more than 10 s or 1 GB to be read or refused. The limits are far above
+the needs of robots and their logs.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ MAX_LETTERS = 200
 
 # ----------------------------------------------------------------------------------------------------------- logs
 
-#: Bytes that the arrays of a file of any size may come to, and how many times its own size those of a larger one may:
-#: measured motion shrinks to half, values of 12 bits to a fifth, and only constants to less than a tenth. `check` reads
-#: 12 MB a second and needs five times their memory. Files of more than `LARGE` bytes may hold more constants.
+#: Unpacked bytes that are allowed for any file, and their ratio to the file's size: measured motion is compressed to
+#: half, values of 12 bits to a fifth, and only constants to less than a tenth. `check` reads 12 MB/s and needs five
+#: times their memory. Above `LARGE` bytes, files may contain more constants.
 MAX_SMALL, MAX_GROWTH = 64 * MEBIBYTE, 12
 LARGE, MAX_GROWTH_LARGE = 10_000_000, 100
-#: Bytes that the arrays of a file of any size may declare where they are read whole: 16 GiB are 2e7 samples of a
-#: 30-joint robot with three channels a joint.
+#: Bytes of all arrays of a log that is read whole: 16 GiB are 2e7 samples of a 30-joint robot with three channels per
+#: joint.
 MAX_ARRAYS = 2**34
-#: Most arrays in a file, and names in an array: a log has 22 fields, and no robot a thousand joints.
+#: Arrays in a file, and names in an array: a log has 22 fields, robots have less than a thousand joints.
 MAX_FIELDS, MAX_NAMES = 200, 10_000
-#: Most columns of a table: a humanoid with every sensor has about 500. A schema is built before it can be refused, so
-#: that its lists may have twice as many entries, for groups of rows too.
+#: Columns of a table: a humanoid with every sensor has about 500. Entries of the lists of a schema: the schema is read
+#: before its columns are counted, and also lists groups of rows.
 MAX_COLUMNS, MAX_SCHEMA = 20_000, 2**16
-#: Chunks of an HDF5 dataset beside those that the file has room for: the library takes 400 bytes for every one that is
-#: read, whether it is stored or not. A chunk that is stored takes 40 bytes of index at least.
+#: Chunks of an HDF5 dataset in addition to those that the file has room for: the library takes 400 bytes for every
+#: chunk that is read, stored or not. The index of a stored chunk takes at least 40 bytes.
 MAX_CHUNKS, CHUNK_BYTES = 10_000, 40
 
 # ----------------------------------------------------------------------------------------------------------- bags
 
-#: Bytes of one record. A camera's image has a few million, the chunk of messages around it hardly more.
+#: Bytes of one record: an image of a camera has a few million, a chunk of messages little more.
 MAX_RECORD = 2**28
-#: Records of a bag that its bytes need not make up for, at 5 us each, and bytes that make up for another one; the same
-#: of messages of the topics in use, which take 20 us. A message of 20 joints has 700 bytes, a third when compressed.
+#: Records that are allowed for any bag (5 us each), and bytes of the file per further record; the same for messages of
+#: the topics in use (20 us each). A message of 20 joints has 700 bytes, a third when compressed.
 FREE_RECORDS, RECORD_BYTES = 500_000, 20
 FREE_MESSAGES, MESSAGE_BYTES = 200_000, 40
 #: Topics of a bag: a humanoid's has 200.
@@ -56,33 +56,30 @@ MAX_TOPICS = 10_000
 
 #: Bytes of a settings file, nesting, entries with aliases unfolded, and characters of one entry.
 MAX_YAML, MAX_DEPTH, MAX_NODES, MAX_TEXT = MEBIBYTE, 30, 5000, 5000
-#: Bytes of a `parameters.json`: of the largest robot in ten contact states it has 10 MB; empty lists take 12 times
-#: their text.
+#: Bytes of a `parameters.json`: the largest robot in ten contact states has 10 MB. Empty lists take 12 times their text
+#: in memory.
 MAX_JSON = 32 * MEBIBYTE
 #: Files in a checkpoint's archive, and values in its state: a few for each parameter group.
 MAX_STATE = 10_000
 
 # ----------------------------------------------------------------------------------------------------------- robots
 
-#: Bytes of a URDF, its links, and the depth of its XML: the largest of the robots that were looked at has 0.2 MB and
-#: 130 links. A chain of 300 joints takes pytorch-kinematics 2 s, of 800 it overflows its stack.
+#: Bytes and links of a URDF: the largest of the tested robots has 0.2 MB and 130 links. pytorch-kinematics takes 2 s
+#: for a chain of 300 joints and overflows its stack at 800.
 MAX_URDF, MAX_LINKS = 8 * MEBIBYTE, 300
-#: kg, m or any other unit: products of several stay far from what float64 can hold.
+#: Size of a number in a URDF, in any unit: products stay within the range of float64.
 MAX_NUMBER = 1e9
-#: Bytes of a mesh file, the largest known one has 29 MB; and of the shapes in a COLLADA file, each counted as often
-#: as it is used.
+#: Bytes of a mesh file (the largest known one has 29 MB), and of the shapes in a COLLADA file, counted per use.
 MAX_MESH, MAX_UNFOLDED = 32 * MEBIBYTE, 64 * MEBIBYTE
-#: Parts of a text mesh, for each of which trimesh takes a millisecond, and bytes of a line, for it splits long ones
-#: slowly.
+#: Parts of a text mesh (trimesh takes 1 ms for each), and bytes of a line (trimesh splits long lines slowly).
 MAX_PARTS, MAX_LINE = 1000, 2**16
-#: Shapes of a link, each of which gives axes to try on all others; points of all shapes of a robot, a mesh counted as
-#: often as it is named (one of 29 MB has 1.7 million corners, of which a hundredth are on its hull); and how many turns
-#: of a point are tried, at 30 ns each.
+#: Shapes of a link, each with axes that are tried on all others; points of all shapes of a robot, counted per use of a
+#: mesh (one of 29 MB has 1.7 million vertices, a hundredth of them on its hull); and rotations of points, 30 ns each.
 MAX_SHAPES, MAX_POINTS, MAX_AXES = 300, 10_000_000, 50_000_000
 
 
 def check_regular(path: Path) -> None:
-    """Raise OSError unless `path` is a file with an end: a pipe waits, a device goes on forever."""
+    """Raise OSError unless `path` is a regular file: pipes block, devices are endless."""
     mode = path.stat().st_mode
     if stat.S_ISDIR(mode):
         raise OSError(errno.EISDIR, "a folder")
@@ -90,35 +87,35 @@ def check_regular(path: Path) -> None:
         raise OSError(errno.EINVAL, "a pipe, a device or a socket")
 
 
-def read_bytes(path: Path, most: int) -> bytes:
-    """What a file holds.
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """The content of a file.
 
     Raises:
-        OSError: it is no file, or cannot be read.
-        ValueError: it has more than `most` bytes, which are not read.
+        OSError: it is not a regular file, or cannot be read.
+        ValueError: it has more than `max_bytes` bytes; they are not read.
     """
     check_regular(path)
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with open(handle, "rb") as stream:
-        if os.fstat(handle).st_size <= most:
-            content = stream.read(most + 1)
-            if len(content) <= most:
+        if os.fstat(handle).st_size <= max_bytes:
+            content = stream.read(max_bytes + 1)
+            if len(content) <= max_bytes:
                 return content
-    raise ValueError(f"more than {format_bytes(most)}")
+    raise ValueError(f"more than {format_bytes(max_bytes)}")
 
 
 def format_bytes(size: int) -> str:
-    """A limit in words."""
+    """A limit as text."""
     return f"{size // MEBIBYTE} MiB" if size >= MEBIBYTE else f"{size} bytes"
 
 
 def max_unpacked_bytes(size: int) -> int:
-    """Bytes that a log file of `size` bytes may come to when it is unpacked."""
+    """Largest unpacked size of a log file of `size` bytes."""
     return max(MAX_SMALL, MAX_GROWTH * size, MAX_GROWTH_LARGE * (size - LARGE))
 
 
 def check_unpacked_size(path: Path, total: int) -> None:
-    """Raise LogError where a file declares arrays of `total` bytes that it is far too small for."""
+    """Raise LogError where a file declares arrays of `total` bytes, far more than its size allows."""
     size = path.stat().st_size
     if total > max_unpacked_bytes(size):
         found = f"arrays of {total} bytes in a file of {size}"
@@ -127,7 +124,7 @@ def check_unpacked_size(path: Path, total: int) -> None:
 
 
 def check_fields(names: Iterable[str | bytes], count: int) -> None:
-    """Raise ValueError at more arrays than a log has, or at a name that none of them has and no message can show."""
+    """Raise ValueError at more arrays than a log may have, or at an unprintable or too long name."""
     if count > MAX_FIELDS:
         raise ValueError(f"{count} arrays, more than the {MAX_FIELDS} that a log may have")
     for name in names:
@@ -136,7 +133,7 @@ def check_fields(names: Iterable[str | bytes], count: int) -> None:
 
 
 def check_names(shape: Sequence[int], longest: int = 0) -> None:
-    """Raise ValueError where an array of text of this shape holds more names, or longer ones, than a robot has."""
+    """Raise ValueError where an array of text of this shape has too many or too long names."""
     if math.prod(shape) > MAX_NAMES:
         raise ValueError(f"{math.prod(shape)} names, more than the {MAX_NAMES} that an array may have")
     if longest > MAX_LETTERS:
@@ -144,14 +141,14 @@ def check_names(shape: Sequence[int], longest: int = 0) -> None:
 
 
 def require_plain_name(text: str) -> str:
-    """The name itself; ValueError if it is longer than any name, or holds characters that no message can show."""
+    """The name itself; ValueError if it is too long or not printable."""
     if len(text) > MAX_LETTERS or not is_plain(text):
         raise ValueError(f"a name of {len(text)} characters: {excerpt(text)}")
     return text
 
 
 class Budget:
-    """How many bytes, records and messages may still come out of a log file that is unpacked chunk by chunk."""
+    """Remaining bytes, records and messages of a log file that is unpacked chunk by chunk."""
 
     def __init__(self, size: int) -> None:
         """For a file of `size` bytes."""
@@ -160,23 +157,23 @@ class Budget:
         self._messages = FREE_MESSAGES + size // MESSAGE_BYTES
 
     def next_chunk_bytes(self) -> int:
-        """Bytes that the next piece may have."""
+        """Largest size of the next chunk."""
         return min(self._bytes, MAX_RECORD)
 
     def spend_bytes(self, count: int) -> None:
-        """Take a piece of `count` bytes; ValueError where the file comes to more than it may."""
+        """Count a chunk of `count` bytes; ValueError where the limit is exceeded."""
         self._bytes -= count
         if self._bytes < 0:
             raise ValueError("chunks that expand to more bytes than a file of this size may hold")
 
     def spend_record(self) -> None:
-        """Take a record; ValueError where there are more than a file of this size may have."""
+        """Count a record; ValueError where the limit is exceeded."""
         self._records -= 1
         if self._records < 0:
             raise ValueError("more records than a file of this size may have")
 
     def spend_message(self) -> None:
-        """Take a message of a topic in use; ValueError where there are more than a file of this size may have."""
+        """Count a message of a topic in use; ValueError where the limit is exceeded."""
         self._messages -= 1
         if self._messages < 0:
             raise ValueError("more messages than a file of this size may have")

@@ -1,4 +1,4 @@
-"""The order of a body's parameters and of a wrench's components, and the linear algebra that depends on the former."""
+"""Order of a body's parameters and of a wrench's components, and functions of the parameters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def inertia_matrix(phi: Array) -> Array:
 
 
 def inertial_vector(mass: float, com: Array, inertia_com: Array) -> Array:
-    """Ten inertial numbers about the link origin from the usual description.
+    """Ten inertial parameters about the link origin, from mass, centre of mass and central inertia.
 
     Args:
         mass: [kg].
@@ -70,7 +70,7 @@ def pseudo_inertia(phi: Array) -> Array:
 
 
 PSEUDO_BASIS = pseudo_inertia(np.eye(INERTIAL.stop))
-"""Change of a pseudo-inertia with each of the ten inertial numbers, (10, 4, 4): it is linear in them."""
+"""Derivative of the pseudo-inertia with respect to the ten inertial parameters, (10, 4, 4); it is linear in them."""
 
 
 def _from_pseudo_inertia(pseudo: Array) -> Array:
@@ -82,7 +82,7 @@ def _from_pseudo_inertia(pseudo: Array) -> Array:
 
 
 def change_of_frame(T_new_old: Array) -> Array:
-    """Matrix X, (10, 10), with `phi_new = X @ phi_old` for one and the same body.
+    """Matrix X, (10, 10), with `phi_new = X @ phi_old` for the same body.
 
     Args:
         T_new_old: pose of the old frame in the new one, (4, 4) [m].
@@ -91,7 +91,7 @@ def change_of_frame(T_new_old: Array) -> Array:
 
 
 POSSIBLE_MARGIN = -1e-9
-"""Least `consistency_margin` of a body that counts as possible: a point mass or a thin plate is 0 but for rounding."""
+"""Smallest `consistency_margin` of a consistent body: point masses and thin plates are at 0, up to rounding."""
 
 
 def consistency_margin(phi: Array) -> Array:
@@ -114,10 +114,10 @@ def least_eigenvalues(phi: Array, scale: Array) -> Array:
 
 
 def perturb_parameters(phi: Array, error: float, rng: np.random.Generator) -> Array:
-    """Parameters (L, 12) of bodies that differ from `phi` by up to a share `error`, yet could exist as well as those.
+    """Parameters (L, 12) with relative errors up to `error`, which keep physical consistency.
 
     Mass, each coordinate of the centre of mass, and the inertia about it are multiplied by factors from 1 - error to
-    1 + error, independently and uniformly; friction stays.
+    1 + error, independently and uniformly; friction does not change.
     """
     out = phi.copy()
     for body in np.flatnonzero(phi[:, MASS] > 0.0):

@@ -1,4 +1,4 @@
-"""Types that settings are made of, with the check that files and constructors share."""
+"""Types of settings, and their check in files and constructors."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, Valida
 from pydantic_core import ErrorDetails
 
 
-def _no_flag(value: object) -> object:
-    """The value, unless it is true or false, which pydantic takes for 1 and 0."""
+def _not_bool(value: object) -> object:
+    """The value; ValueError for true and false, which pydantic accepts as 1 and 0."""
     if isinstance(value, bool):
-        raise ValueError("a number")  # and not 1.0 for `true`
+        raise ValueError("a number")
     return value
 
 
-def _with_name(value: dict[str, Any]) -> dict[str, Any]:
+def _has_name(value: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(value.get("name"), str):
         raise ValueError("a mapping with the name of a class, and its options")
     return value
 
 
-Number = Annotated[float, BeforeValidator(_no_flag), Field(allow_inf_nan=False)]
+Number = Annotated[float, BeforeValidator(_not_bool), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
 NotNegative = Annotated[Number, Field(ge=0.0)]
 BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]
-Count = Annotated[int, BeforeValidator(_no_flag), Field(ge=1)]
-Seed = Annotated[int, BeforeValidator(_no_flag), Field(ge=0)]
-NamedClass = Annotated[dict[str, Any], AfterValidator(_with_name)]
+Count = Annotated[int, BeforeValidator(_not_bool), Field(ge=1)]
+Seed = Annotated[int, BeforeValidator(_not_bool), Field(ge=0)]
+NamedClass = Annotated[dict[str, Any], AfterValidator(_has_name)]
 """A class of another package by its name, and its options: `{name: Adam, lr: 0.05}`."""
 
 
 def validate_settings(settings: object) -> None:
-    """Check the fields of a dataclass whose types have a range, a choice or another check; for its `__post_init__`.
+    """Check the fields of a dataclass against their annotated types; for its `__post_init__`.
 
     Raises:
-        ValueError: names the field, what was found and what is accepted.
+        ValueError: names the field, its value and the accepted values.
     """
     for name, adapter in _adapters(type(settings)).items():  # type: ignore[arg-type]  # mypy: no type is hashable
         value = getattr(settings, name)
@@ -49,7 +49,7 @@ def validate_settings(settings: object) -> None:
 
 
 def accepted_values(error: ErrorDetails) -> str:
-    """What a type accepts, in words, by the error that a value raised."""
+    """The accepted values of a type, as text, from the error of a value."""
     count = error.get("ctx", {}).get("min_length", 1)
     plain: Mapping[str, str] = {
         "float_parsing": "a number",

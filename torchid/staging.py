@@ -13,16 +13,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-_ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # not all on Windows
+#: Signals that end a command; Windows lacks some.
+_TERMINATION = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _written: list[str] = []
 
 
 @contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Defer Ctrl-C until the block is done, which is short and must happen as a whole.
+    """Defer Ctrl-C to the end of a short block that must not be interrupted.
 
     Raises:
-        KeyboardInterrupt: after a block that Ctrl-C fell into, unless it is ignored.
+        KeyboardInterrupt: at the end of a block during which Ctrl-C was pressed, unless it is ignored.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -39,14 +40,14 @@ def interrupts_deferred() -> Iterator[None]:
 
 @contextmanager
 def termination_as_interrupt() -> Iterator[None]:
-    """Let SIGTERM, and SIGHUP of a terminal that closes, end a command as Ctrl-C does, which leaves nothing behind.
+    """Let SIGTERM and SIGHUP (a closed terminal) end a command as Ctrl-C does, with all cleanup.
 
-    One that is ignored stays so: SIGHUP after `nohup`.
+    Ignored signals stay ignored, such as SIGHUP after `nohup`.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.getsignal(number) for number in _ENDING}
+    before = {number: signal.getsignal(number) for number in _TERMINATION}
     changed = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
     for number in changed:
         signal.signal(number, _as_interrupt)
@@ -58,7 +59,7 @@ def termination_as_interrupt() -> Iterator[None]:
 
 
 def _as_interrupt(number: int, frame: FrameType | None) -> None:
-    """What Ctrl-C would do, even where a shell that started the command in the background has it ignored."""
+    """Act as Ctrl-C, even where it is ignored because a shell started the command in the background."""
     handler = signal.getsignal(signal.SIGINT)
     if callable(handler):
         handler(number, frame)
@@ -67,12 +68,12 @@ def _as_interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def reset_written() -> None:
-    """Start the list of results that a command has written."""
+    """Clear the list of results that a command has written."""
     _written.clear()
 
 
 def note_written(result: object) -> None:
-    """Add a file or folder that stays to the list of what the command has written."""
+    """Add a file or folder to the list of results that the command has written."""
     _written.append(str(result))
 
 
@@ -83,12 +84,12 @@ def list_written() -> str:
 
 try:
     import fcntl
-except ImportError:  # not on Windows, where what a killed process left stays
+except ImportError:  # Windows: leftovers of killed processes are not removed
     fcntl = None  # type: ignore[assignment]
 
 CAN_LOCK = fcntl is not None
 
-NEW, OLD = "new", "old"  # what is being made, and what it replaces
+NEW, OLD = "new", "old"  # names in a staging folder: the result, and the one that it replaces
 _LOCK = "lock"
 _NAME = re.compile(r"\..+-[0-9a-f]{8}\.torchid", re.DOTALL)
 _TRIES = 100
@@ -96,15 +97,15 @@ _TRIES = 100
 
 @contextmanager
 def staging_folder(target: Path) -> Iterator[Path]:
-    """A hidden folder beside `target`, locked by this process, that goes with the block, but for an `old` in it.
+    """A hidden folder beside `target`, locked by this process and removed after the block, except an `old` in it.
 
     Raises:
-        OSError: none can be made.
+        OSError: the folder cannot be made.
     """
     folder, lock = target, -1
     try:
         with interrupts_deferred():
-            folder, lock = _made(target)
+            folder, lock = _make_staging_folder(target)
         yield folder
     finally:
         with interrupts_deferred():
@@ -118,12 +119,13 @@ def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
 
     Args:
         path: the file.
-        result: whether it is one that a command answers with.
+        result: whether it is a result of the command, for `list_written`.
 
     Raises:
         OSError: the file cannot be written.
     """
-    _clear_leftovers(path)
+    for _ in leftovers(path):
+        pass
     with staging_folder(path) as folder:
         yield folder / NEW
         with interrupts_deferred():
@@ -133,35 +135,29 @@ def atomic_file(path: Path, result: bool = True) -> Iterator[Path]:
 
 
 def leftovers(target: Path) -> Iterator[Path]:
-    """Staging folders beside `target` whose process is gone, each removed before the next, but for `old`."""
+    """Staging folders beside `target` whose process has ended; each is removed before the next, except an `old`."""
     prefix = f".{target.name}-"
     with suppress(OSError):
         for path in sorted(target.parent.iterdir()):
             if path.name.startswith(prefix) and len(path.name) == len(prefix) + 16 and _NAME.fullmatch(path.name):
-                yield from _taken_over(path)
-
-
-def _clear_leftovers(target: Path) -> None:
-    """Remove what killed processes left of results that were to become `target`."""
-    for _ in leftovers(target):
-        pass
+                yield from _take_over(path)
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether a path is a staging folder whose process is gone, with nothing in it that was there before."""
+    """Whether a path is a staging folder whose process has ended, without an `old` in it."""
     if not _NAME.fullmatch(path.name):
         return False
-    return any(not os.path.lexists(folder / OLD) for folder in _taken_over(path, keep=True))
+    return any(not os.path.lexists(folder / OLD) for folder in _take_over(path, keep=True))
 
 
 def remove_leftover(folder: Path) -> None:
-    """Remove a staging folder whose process is gone, but for `old`."""
-    for _ in _taken_over(folder):
+    """Remove a staging folder whose process has ended, except an `old` in it."""
+    for _ in _take_over(folder):
         pass
 
 
-def _made(target: Path) -> tuple[Path, int]:
-    """A new staging folder and the descriptor of its lock; another process may take it for a leftover until locked."""
+def _make_staging_folder(target: Path) -> tuple[Path, int]:
+    """A new staging folder and the descriptor of its lock; until locked, another process may remove it."""
     for _ in range(_TRIES):
         folder = target.with_name(f".{target.name}-{secrets.token_hex(4)}.torchid")
         folder.mkdir()
@@ -172,11 +168,11 @@ def _made(target: Path) -> tuple[Path, int]:
             if try_lock(lock, folder / _LOCK) is not False:
                 return folder, lock
             os.close(lock)
-    raise FileNotFoundError(f"{target.parent}: another process removes every folder that is made there")
+    raise FileNotFoundError(f"{target.parent}: another process removes every new folder")
 
 
 def try_lock(handle: int, path: Path) -> bool | None:
-    """Whether a descriptor of a file now locks what is at its path; None where the file system knows no locks."""
+    """Whether a descriptor now locks the file at its path; None where the file system has no locks."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return os.path.samestat(os.fstat(handle), os.lstat(path))
@@ -186,8 +182,8 @@ def try_lock(handle: int, path: Path) -> bool | None:
         return None
 
 
-def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
-    """The folder if it is of a process that is gone; removed afterwards, unless it is to be kept."""
+def _take_over(folder: Path, keep: bool = False) -> Iterator[Path]:
+    """The folder if its process has ended; removed afterwards unless `keep`."""
     if not CAN_LOCK or folder.is_symlink() or not folder.is_dir():
         return
     lock = -1
@@ -203,7 +199,7 @@ def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
         if not keep:
             _discard(folder, lock)
             lock = -1
-    except OSError:  # another user's, or another process is quicker
+    except OSError:  # of another user, or taken over by another process
         return
     finally:
         if lock >= 0:
@@ -211,7 +207,7 @@ def _taken_over(folder: Path, keep: bool = False) -> Iterator[Path]:
 
 
 def _discard(folder: Path, lock: int) -> None:
-    """Remove a staging folder, but for what is in `old`; the lock is held to the end."""
+    """Remove a staging folder except `old`; the lock is held to the end."""
     new = folder / NEW
     with suppress(OSError):
         shutil.rmtree(new, ignore_errors=True) if new.is_dir() and not new.is_symlink() else new.unlink(missing_ok=True)

@@ -13,10 +13,11 @@ import yaml
 from demo import shortened_demo
 from refusals import files_in, refusal
 
-from torchid.cli import _interrupt_held_back, main
+from torchid.cli import main
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
 from torchid.problem.extras import list_extras
+from torchid.staging import interrupts_deferred
 
 Edit = Callable[[Path], None]
 
@@ -322,7 +323,7 @@ def test_evaluate_refuses_a_folder_that_is_no_run(tmp_path: Path, capsys: pytest
 
 
 def test_an_interrupt_that_a_loading_module_swallows_still_ends_the_command() -> None:
-    with pytest.raises(KeyboardInterrupt), _interrupt_held_back(), suppress(KeyboardInterrupt):  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), interrupts_deferred(), suppress(KeyboardInterrupt):  # noqa: PT012
         signal.raise_signal(signal.SIGINT)
 
 

@@ -117,7 +117,7 @@ def test_the_documented_check_from_python_runs(monkeypatch: pytest.MonkeyPatch) 
     said: dict[str, Any] = {}
     exec(code, said)
     assert said["checked"].usable
-    assert said["mended"].joint_position.shape == said["log"].joint_position.shape
+    assert said["repaired"].joint_position.shape == said["log"].joint_position.shape
 
 
 def test_findings_and_an_overview_are_written_whole(folder: Path, tmp_path: Path) -> None:

@@ -1,4 +1,8 @@
-"""Checks of a log before it is fitted: what is wrong with it, where, and what to do."""
+"""Checks of a log before it is fitted: what is wrong with it, where, and what to do.
+
+Every check module has the same order: thresholds, public check functions, helpers in order of call. Thresholds are
+named MIN_ or MAX_, quantity, unit: `_SHARE` and `_RATIO` are dimensionless, `_STEPS` are median steps of the log.
+"""
 
 from torchid.log_checks.check import Checked, check, drop_condemned
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, Span

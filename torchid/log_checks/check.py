@@ -1,4 +1,4 @@
-"""All checks of one log, each relying on those before it, and a log without what they condemned."""
+"""All checks of one log in their order, repair of the log, and exclusion of condemned samples."""
 
 from __future__ import annotations
 
@@ -41,19 +41,20 @@ from torchid.problem import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
-#: Share of a log's samples that may be condemned before nothing worth a fit is left.
-MOST_CONDEMNED = 0.5
-_SPELLED_OUT = 3
+#: Share of condemned samples above which a log is not usable.
+MAX_CONDEMNED_SHARE = 0.5
+#: Descriptions and spans that one line of text lists.
+_MAX_LISTED_TEXTS, _MAX_LISTED_SPANS = 3, 4
 
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A log with what was found in it.
+    """A log and the results of its checks.
 
     Attributes:
         log: as it was read.
-        repaired: with condemned values interpolated, so that a filter has nothing to smear.
-        findings: the gravest first.
+        repaired: with condemned values interpolated, so that a filter does not smear them.
+        findings: the most severe first.
         skipped: checks that could not be made.
     """
 
@@ -64,7 +65,7 @@ class Checked:
 
     @cached_property
     def condemned(self) -> BoolArray:
-        """Which samples (N,) must not be fitted."""
+        """Samples (N,) that must not be fitted."""
         return condemned_samples(self.findings, len(self.log))
 
     @property
@@ -77,13 +78,13 @@ class Checked:
         """Why the log cannot be used; empty if it can."""
         whole = tuple(f"{f.field}: {f.name}" for f in self.findings if f.condemns_all)
         share = float(self.condemned.mean()) if len(self.log) else 1.0
-        if not whole and share > MOST_CONDEMNED:
+        if not whole and share > MAX_CONDEMNED_SHARE:
             return (f"{100 * share:.3g} % of its samples are condemned",)
         return tuple(dict.fromkeys(whole))
 
     @property
     def verdict(self) -> str:
-        """In one line."""
+        """Whether the log is usable, in one line."""
         count = int(self.condemned.sum())
         if self.reasons:
             return f"not usable: {'; '.join(self.reasons)}"
@@ -96,83 +97,81 @@ def check(
     """Check a log as it was read.
 
     Args:
-        log: as `read_log` gives it, if need be with gaps.
-        robot: the robot; without one, what needs its URDF is skipped.
+        log: as `read_log` returns it, with or without gaps.
+        robot: the robot; without one, checks against its URDF are skipped.
         contacts: of the robot.
-        cutoff_hz: of the filter that the log will go through; None for a usual one.
+        cutoff_hz: cutoff [Hz] of the filter that the log will be preprocessed with; None for the default.
     """
-    found: list[Finding | Skipped] = list(check_magnitudes(log))
-    if (lost := _lost(found)) is not None:
-        return _concluded(log, log, [*found, _unchecked(lost)])
-    found += check_time_stamps(log)
-    found += (gaps := list(check_missing_values(log)))
-    if (lost := _lost(gaps)) is not None:
-        return _concluded(log, log, [*found, _unchecked(lost)])
-    repaired = repair_log(log, _findings(found))
-    found += check_repeats(channel_groups(repaired))
-    repaired = repair_log(log, _findings(found))
-    found += check_jumps(repaired, channel_groups(repaired))
-    repaired = repair_log(log, _findings(found))
-    if units := list(check_angle_unit(repaired, robot)):  # sizes of steps are meant in radians
-        found = [one for one in found if not (isinstance(one, Finding) and one.name == "step" and one.whole)]
-    found += [*units, *check_contact_flags(repaired)]
-    repaired = repair_log(log, _findings(found))
-    if (lost := _lost(found)) is None or lost.field != "time":
-        found += [
-            *check_derivatives(repaired),
-            *check_angular_velocity(repaired, robot),
-            *check_accelerometer(repaired, robot),
-        ]
-    if _lost(found) is None:
-        found += check_standing_feet(repaired, robot, contacts)
-    lost = _lost(found)
-    if lost is None:
-        found += check_forces_against_urdf(subtract_contact_offsets(repaired), robot, contacts, cutoff_hz)
-        found += check_limb_sensors(repaired, robot, contacts, cutoff_hz)
-        lost = _lost(found)
-    if lost is None or lost.name == "sign":
-        found += check_weight(subtract_contact_offsets(repaired), robot)
+    results: list[Finding | Skipped] = list(check_magnitudes(log))
+    if (blocking := _blocking_finding(results)) is not None:
+        return _collect(log, log, [*results, _skip_dependent(blocking)])
+    results += check_time_stamps(log)
+    results += (missing := list(check_missing_values(log)))
+    if (blocking := _blocking_finding(missing)) is not None:
+        return _collect(log, log, [*results, _skip_dependent(blocking)])
+    repaired = repair_log(log, _findings(results))
+    results += check_repeats(channel_groups(repaired))
+    repaired = repair_log(log, _findings(results))
+    results += check_jumps(repaired, channel_groups(repaired))
+    repaired = repair_log(log, _findings(results))
+    if units := list(check_angle_unit(repaired, robot)):  # thresholds of position steps are in radians
+        results = [x for x in results if not (isinstance(x, Finding) and x.name == "step" and x.whole)]
+    results += [*units, *check_contact_flags(repaired)]
+    repaired = repair_log(log, _findings(results))
+    blocking = _blocking_finding(results)
+    if blocking is None or blocking.field != "time":
+        results += check_derivatives(repaired)
+        results += check_angular_velocity(repaired, robot)
+        results += check_accelerometer(repaired, robot)
+    if _blocking_finding(results) is None:
+        results += check_standing_feet(repaired, robot, contacts)
+    if _blocking_finding(results) is None:
+        results += check_forces_against_urdf(subtract_contact_offsets(repaired), robot, contacts, cutoff_hz)
+        results += check_limb_sensors(repaired, robot, contacts, cutoff_hz)
+    blocking = _blocking_finding(results)
+    if blocking is None or blocking.name == "sign":
+        results += check_weight(subtract_contact_offsets(repaired), robot)
     else:
-        found.append(_unchecked(lost))
-    return _concluded(log, repaired, found)
+        results.append(_skip_dependent(blocking))
+    return _collect(log, repaired, results)
 
 
-def _concluded(log: Log, repaired: Log, found: Sequence[Finding | Skipped]) -> Checked:
-    findings = sorted(_merged(_findings(found)), key=lambda finding: SEVERITIES.index(finding.severity))
-    return Checked(log, repaired, tuple(findings), tuple(skip for skip in found if isinstance(skip, Skipped)))
+def _findings(results: Iterable[Finding | Skipped]) -> Iterator[Finding]:
+    return (result for result in results if isinstance(result, Finding))
 
 
-def _unchecked(lost: Finding) -> Skipped:
-    return Skipped("what relies on it", f"{lost.field} is condemned throughout: {lost.name}")
+def _blocking_finding(results: Iterable[Finding | Skipped]) -> Finding | None:
+    """The first finding that condemns the whole log: later checks cannot rely on its field."""
+    return next((finding for finding in _findings(results) if finding.condemns_all), None)
 
 
-def _findings(found: Iterable[Finding | Skipped]) -> Iterator[Finding]:
-    return (one for one in found if isinstance(one, Finding))
+def _skip_dependent(blocking: Finding) -> Skipped:
+    return Skipped("all further checks", f"{blocking.field} is condemned throughout: {blocking.name}")
 
 
-def _merged(found: Iterable[Finding]) -> Iterator[Finding]:
-    """Findings of the same kind in one field as one."""
-    alike: dict[tuple[str, str, str, str], list[Finding]] = {}
-    for one in found:
-        alike.setdefault((one.name, one.severity, one.field, one.advice), []).append(one)
-    for same in alike.values():
-        texts = [one.found for one in same]
-        more = f"; and {len(texts) - _SPELLED_OUT} more" if len(texts) > _SPELLED_OUT else ""
+def _collect(log: Log, repaired: Log, results: Sequence[Finding | Skipped]) -> Checked:
+    findings = sorted(_merge_alike(_findings(results)), key=lambda finding: SEVERITIES.index(finding.severity))
+    return Checked(log, repaired, tuple(findings), tuple(skip for skip in results if isinstance(skip, Skipped)))
+
+
+def _merge_alike(findings: Iterable[Finding]) -> Iterator[Finding]:
+    """One finding for all of one kind in one field."""
+    groups: dict[tuple[str, str, str, str], list[Finding]] = {}
+    for finding in findings:
+        groups.setdefault((finding.name, finding.severity, finding.field, finding.advice), []).append(finding)
+    for alike in groups.values():
+        texts = [finding.found for finding in alike]
+        more = f"; and {len(texts) - _MAX_LISTED_TEXTS} more" if len(texts) > _MAX_LISTED_TEXTS else ""
         yield replace(
-            same[0],
-            found="; ".join(texts[:_SPELLED_OUT]) + more,
-            channels=tuple(dict.fromkeys(channel for one in same for channel in one.channels)),
-            spans=tuple(span for one in same for span in one.spans),
+            alike[0],
+            found="; ".join(texts[:_MAX_LISTED_TEXTS]) + more,
+            channels=tuple(dict.fromkeys(channel for finding in alike for channel in finding.channels)),
+            spans=tuple(span for finding in alike for span in finding.spans),
         )
 
 
-def _lost(found: Iterable[Finding | Skipped]) -> Finding | None:
-    """A finding that condemns the whole log: checks that rely on its field would be meaningless."""
-    return next((one for one in _findings(found) if one.condemns_all), None)
-
-
 def condemned_samples(findings: Iterable[Finding], samples: int) -> BoolArray:
-    """Which of so many samples some finding condemns, (N,)."""
+    """Which of `samples` samples are condemned by any finding, (N,)."""
     mask = np.zeros(samples, bool)
     for finding in findings:
         if finding.severity == CONDEMNED:
@@ -181,19 +180,19 @@ def condemned_samples(findings: Iterable[Finding], samples: int) -> BoolArray:
 
 
 def repair_log(log: Log, findings: Iterable[Finding]) -> Log:
-    """The log with condemned values interpolated, and with jumps taken out that are no motion.
+    """The log with condemned values interpolated and without jumps that are not motions.
 
-    Only the channels that a finding names are changed: the samples stay out of the fit, but not out of the filter. A
-    flag that misses a contact is set. Findings that concern the whole log leave nothing to go by and change nothing.
+    Only the channels of a finding change: its samples are left out of the fit, but not out of the filter. Contact flags
+    that miss a force are set. Findings about the whole log change nothing.
     """
     local = [finding for finding in findings if finding.severity == CONDEMNED and not finding.whole]
     changed: dict[str, Any] = {}
-    for field in dict.fromkeys(field for finding in local for field in _touched(log, finding.field)):
+    for field in dict.fromkeys(field for finding in local for field in _affected_fields(log, finding.field)):
         flat = np.array(getattr(log, field), dtype=np.float64).reshape(len(log), -1)
         bad = np.zeros(flat.shape, dtype=bool)
         for finding in local:
             if finding.field in (field, "time"):
-                _mark(finding, channel_names(log, field), flat, bad)
+                _mark_condemned(finding, channel_names(log, field), flat, bad)
         _interpolate(log.time, flat, bad)
         if field == "base_quat_xyzw":
             flat /= np.linalg.norm(flat, axis=1, keepdims=True)
@@ -206,8 +205,15 @@ def repair_log(log: Log, findings: Iterable[Finding]) -> Log:
     return dataclasses.replace(log, **changed) if changed else log
 
 
-def _mark(finding: Finding, names: tuple[str, ...], flat: FloatArray, bad: BoolArray) -> None:
-    """Mark what a finding condemns in the channels (N, c), and take its shifts out of them."""
+def _affected_fields(log: Log, field: str) -> list[str]:
+    """Fields whose values a finding about `field` affects: all signals, if it is about time."""
+    if field == "time":
+        return [name for name, array in log.arrays().items() if name != "time" and array.dtype != np.bool_]
+    return [] if field == "contact_active" else [field]
+
+
+def _mark_condemned(finding: Finding, names: tuple[str, ...], flat: FloatArray, bad: BoolArray) -> None:
+    """Mark the condemned values of the channels (N, c) in `bad`, and subtract the finding's shifts."""
     for span in finding.spans:
         columns = names.index(span.channel) if span.channel in names else slice(None)
         bad[span.first : span.last + 1, columns] = True
@@ -215,33 +221,23 @@ def _mark(finding: Finding, names: tuple[str, ...], flat: FloatArray, bad: BoolA
             flat[span.last :, columns] -= span.shift
 
 
-def _touched(log: Log, field: str) -> list[str]:
-    """Fields whose values a finding about `field` makes doubtful: all signals, if it is about time."""
-    if field == "time":
-        return [name for name, array in log.arrays().items() if name != "time" and array.dtype != np.bool_]
-    return [] if field == "contact_active" else [field]
-
-
 def _interpolate(time: FloatArray, flat: FloatArray, bad: BoolArray) -> None:
-    """Replace the bad values of each column in place; at the ends they stay at the nearest good one."""
+    """Interpolate the bad values of each column in place; at the ends, repeat the nearest good value."""
     for column in np.flatnonzero(bad.any(axis=0)):
         good = ~bad[:, column] & np.isfinite(flat[:, column])
         if good.any():
-            here = bad[:, column]
-            flat[here, column] = np.interp(time[here], time[good], flat[good, column])
-
-
-_NAMED = 4
+            rows = bad[:, column]
+            flat[rows, column] = np.interp(time[rows], time[good], flat[good, column])
 
 
 def excluded_stamps(checked: Checked, time: FloatArray, cutoff_hz: float | None, derived: bool) -> BoolArray:
-    """Which stamps (K,) [s] of a preprocessed log condemned samples reach.
+    """Which stamps (K,) [s] of a preprocessed log are affected by condemned samples.
 
     Args:
         checked: the log as recorded.
         time: of the preprocessed log.
-        cutoff_hz: of the filter, which smears a sample over its reach to either side; None without one.
-        derived: whether anything was filtered, differentiated or resampled, which takes neighbours along.
+        cutoff_hz: cutoff of the filter, which spreads a sample over `REACH_PERIODS` to either side; None without one.
+        derived: whether the log was filtered, differentiated or resampled, which affects neighbouring samples.
     """
     step = median_step(checked.log)
     margin = JITTER * step + (DROPPED_SAMPLES * step if derived else 0.0)
@@ -254,35 +250,34 @@ def excluded_stamps(checked: Checked, time: FloatArray, cutoff_hz: float | None,
 
 
 def drop_condemned(samples: Samples, checked: Checked, cutoff_hz: float | None, derived: bool) -> Samples:
-    """The samples that condemned ones do not reach; see `excluded_stamps`.
+    """The samples that condemned samples do not affect; see `excluded_stamps`.
 
     Raises:
-        LogError: the log is not usable, or nothing is left.
+        LogError: the log is not usable, or no sample is left.
 
     Warns:
-        TorchidWarning: how many samples were left out, and why.
+        TorchidWarning: number of excluded samples, with the reasons.
     """
     source = samples.source
     if not checked.usable:
         accepted = "a log that torchid check finds usable, or preprocessing.exclude_condemned: false"
         raise LogError(source, "preprocessing.exclude_condemned", checked.verdict, accepted)
-    gone = excluded_stamps(checked, samples.time.cpu().numpy(), cutoff_hz, derived)
-    if not gone.any():
+    excluded = excluded_stamps(checked, samples.time.cpu().numpy(), cutoff_hz, derived)
+    if not excluded.any():
         return samples
-    reasons = _reasons(checked)
-    if gone.all():
+    reasons = _exclusion_reasons(checked)
+    if excluded.all():
         raise LogError(source, "preprocessing.exclude_condemned", f"no sample left: {reasons}", "a longer log")
-    message = f"{Path(source).name}: {gone.sum()} of {len(samples)} samples excluded: {reasons}"
-    warn(message)
-    return samples[torch.from_numpy(np.flatnonzero(~gone))]
+    warn(f"{Path(source).name}: {excluded.sum()} of {len(samples)} samples excluded: {reasons}")
+    return samples[torch.from_numpy(np.flatnonzero(~excluded))]
 
 
-def _reasons(checked: Checked) -> str:
-    """What condemns samples, and where."""
-    found = []
+def _exclusion_reasons(checked: Checked) -> str:
+    """Names of the condemning findings with their samples."""
+    reasons = []
     for finding in checked.findings:
         if finding.severity == CONDEMNED:
             spans = list(dict.fromkeys(str(span) for span in finding.spans))
-            more = f" and {len(spans) - _NAMED} more" if len(spans) > _NAMED else ""
-            found.append(f"{finding.field} {finding.name} at samples {', '.join(spans[:_NAMED])}{more}")
-    return "; ".join(found)
+            more = f" and {len(spans) - _MAX_LISTED_SPANS} more" if len(spans) > _MAX_LISTED_SPANS else ""
+            reasons.append(f"{finding.field} {finding.name} at samples {', '.join(spans[:_MAX_LISTED_SPANS])}{more}")
+    return "; ".join(reasons)

@@ -1,4 +1,4 @@
-"""What checks look at and what they say: groups of channels, statistics of them, findings and skipped checks."""
+"""Results of checks (findings, skipped checks), and their input: groups of channels and statistics of them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torchid.logs import Log
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray, column_labels
 from torchid.parameters import WRENCH_COMPONENTS
 
-#: These samples must not be fitted.
+#: The samples must not be fitted.
 CONDEMNED = "condemned"
-#: To be inspected; a fit may still be right.
+#: The user should inspect the samples; a fit may be right.
 SUSPICIOUS = "suspicious"
-#: True of the log and worth knowing.
+#: Information; nothing has to be done.
 NOTE = "note"
 
 SEVERITIES = (CONDEMNED, SUSPICIOUS, NOTE)
@@ -24,9 +24,9 @@ SEVERITIES = (CONDEMNED, SUSPICIOUS, NOTE)
 
 @dataclass(frozen=True)
 class Span:
-    """Successive samples, both ends included, of one channel of the finding's field ("": of all of them).
+    """Samples `first` to `last` (included) of one channel of the finding's field, or of all channels ("").
 
-    `shift`: by how much the channel is too large from `last` on, where a jump is known to be no motion.
+    `shift`: error of the channel from `last` on, for a jump that is not a motion.
     """
 
     first: int
@@ -43,17 +43,17 @@ class Span:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check found in a log.
+    """One result of a check.
 
     Attributes:
-        name: of what was found, as in "spike".
+        name: the kind of finding, such as "spike".
         severity: one of `SEVERITIES`.
         field: of the log.
-        channels: names within the field; empty for all of it.
-        spans: the samples; empty for the whole log, unless it shows at some samples only.
-        found: what was found, with numbers.
-        advice: what to do.
-        everywhere: whether it concerns every sample though it only shows at `spans`.
+        channels: names within the field; empty for all channels.
+        spans: the samples; empty for the whole log.
+        found: description with numbers.
+        advice: what the user should do.
+        everywhere: whether it concerns every sample although `spans` lists only some.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Finding:
 
     @property
     def whole(self) -> bool:
-        """Whether it concerns every sample."""
+        """Whether the finding concerns every sample."""
         return self.everywhere or not self.spans
 
     @property
@@ -76,7 +76,7 @@ class Finding:
         return self.severity == CONDEMNED and self.whole
 
     def mask(self, samples: int) -> BoolArray:
-        """Which of so many samples it concerns."""
+        """Which of `samples` samples the finding concerns."""
         mask = np.full(samples, self.whole)
         for span in self.spans:
             mask[span.first : span.last + 1] = True
@@ -85,7 +85,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Skipped:
-    """A check that could not be made, and what it lacks."""
+    """A check that could not be made, and the reason."""
 
     name: str
     reason: str
@@ -99,8 +99,8 @@ def find_spans(where: BoolArray | NDArray[np.intp], channel: str = "") -> Iterat
             yield Span(int(run[0]), int(run[-1]), channel)
 
 
-#: Standard deviations of a normal distribution in one median absolute deviation.
-NORMAL = 1.4826
+#: Standard deviation of a normal distribution over its median absolute deviation.
+STD_PER_MAD = 1.4826
 
 
 def neighbours_of(series: FloatArray, at: NDArray[np.intp], direction: int, count: int) -> FloatArray:
@@ -111,41 +111,30 @@ def neighbours_of(series: FloatArray, at: NDArray[np.intp], direction: int, coun
     """
     index = at[:, None] + direction * np.arange(1, count + 1)
     inside = (index >= 0) & (index < len(series))
-    found = series[np.clip(index, 0, len(series) - 1)]
-    found[~inside] = np.nan
-    return found
+    neighbours = series[np.clip(index, 0, len(series) - 1)]
+    neighbours[~inside] = np.nan
+    return neighbours
 
 
 def finite_median(values: FloatArray) -> FloatArray:
-    """Median along the second axis of (P, k, ...) over what is not NaN, the upper of two; 0 where nothing is."""
+    """Median without NaN along the second axis of (P, k, ...), the upper of two; 0 where all values are NaN."""
     ordered = np.sort(values, axis=1)  # NaN last
     count = np.sum(~np.isnan(ordered), axis=1, keepdims=True)
     middle = np.take_along_axis(ordered, np.minimum(count // 2, values.shape[1] - 1), axis=1)[:, 0]
     return np.where(count[:, 0] > 0, middle, 0.0)
 
 
-def block_spread(differences: FloatArray, block: int) -> FloatArray:
-    """Standard deviation (M,) of a normal distribution with the median size of its block of `differences` (M,)."""
-    block = min(block, len(differences))
-    whole = len(differences) // block
-    blocks = np.abs(differences[: whole * block]).reshape(whole, block)
-    medians = NORMAL * np.partition(blocks, block // 2, axis=1)[:, block // 2]
-    rest = len(differences) - whole * block
-    return np.append(np.repeat(medians, block), np.full(rest, medians[-1]))
-
-
 def widen_mask(where: BoolArray, distance: int) -> BoolArray:
-    """Which samples are within a distance of one in the mask (N,)."""
+    """Which samples are within `distance` samples of the mask (N,)."""
     padded = np.concatenate([np.zeros(distance + 1, np.intp), np.cumsum(where)])
     padded = np.concatenate([padded, np.full(distance, padded[-1])])
     return np.asarray(padded[2 * distance + 1 :] > padded[: -2 * distance - 1])
 
 
-#: Steps longer than this, in median steps, lack a sample.
-LONG_STEP = 1.5
+#: A longer step is a gap: a sample is missing.
+MIN_GAP_STEPS = 1.5
 
-AXES = "xyzw"
-UNITS = {
+FIELD_UNITS = {
     "joint_position": "rad",
     "joint_velocity": "rad/s",
     "joint_acceleration": "rad/s^2",
@@ -159,12 +148,12 @@ UNITS = {
     "imu_angular_velocity": "rad/s",
     "imu_angular_acceleration": "rad/s^2",
 }
-#: Fields that are no signals of a sensor.
-NO_SIGNALS = ("time", "contact_active")
+#: Fields that are not sensor signals.
+NON_SIGNAL_FIELDS = ("time", "contact_active")
 
 
 def median_step(log: Log) -> float:
-    """Median time between samples [s]; 1 where there is but one."""
+    """Median time between samples [s]; 1 for a single sample."""
     return float(np.median(np.diff(log.time))) if len(log) > 1 else 1.0
 
 
@@ -176,11 +165,11 @@ class ChannelGroup:
         field: of the log.
         name: of the contact or force/torque sensor; "" elsewhere.
         names: of the c channels within the field.
-        samples: (M,) numbers of the samples at which all channels were measured; of a contact, while it is active and
-            reads anything.
+        samples: (M,) numbers of the samples at which all channels were measured; of a contact, those while it is
+            active and its wrench is not zero.
         values: (M, c).
         elapsed: (M,) time since the first in median steps of the log.
-        piece: (M,) which successive samples without a gap between them each belongs to.
+        piece: (M,) number of the run of samples without a gap that each sample belongs to.
     """
 
     field: str
@@ -192,13 +181,8 @@ class ChannelGroup:
     piece: NDArray[np.intp]
 
     @property
-    def unit(self) -> str:
-        """Unit of the values, without one for quaternions."""
-        return UNITS.get(self.field, "" if self.field.startswith("base_quat") else "N, N m")
-
-    @property
     def joined(self) -> BoolArray:
-        """Whether neighbours are neighbours in the log, (M - 1,)."""
+        """Whether successive samples have no gap between them, (M - 1,)."""
         return np.asarray(np.diff(self.piece) == 0)
 
 
@@ -208,21 +192,21 @@ def channel_names(log: Log, field: str) -> tuple[str, ...]:
     array = log.arrays()[field]
     if array.ndim == 3:
         return tuple(f"{label} {component}" for label in labels for component in WRENCH_COMPONENTS)
-    return labels or tuple(AXES[: array.shape[1]] if array.ndim == 2 else ("",))
+    return labels or tuple("xyzw"[: array.shape[1]] if array.ndim == 2 else ("",))
 
 
 def channel_unit(field: str, name: str) -> str:
-    """Unit of a channel, "" for a number without one."""
+    """Unit of a channel; "" for dimensionless channels."""
     component = name.rpartition(" ")[2]
-    if field in UNITS or component not in WRENCH_COMPONENTS:
-        return UNITS.get(field, "")
+    if field in FIELD_UNITS or component not in WRENCH_COMPONENTS:
+        return FIELD_UNITS.get(field, "")
     return "N" if component.startswith("f") else "N m"
 
 
 def channel_groups(log: Log) -> Iterator[ChannelGroup]:
-    """All groups of a log that hold anything."""
+    """All groups of a log that are not empty."""
     for field in log.arrays():
-        if field in NO_SIGNALS:
+        if field in NON_SIGNAL_FIELDS:
             continue
         values: FloatArray = getattr(log, field)
         names = channel_names(log, field)
@@ -239,15 +223,15 @@ def channel_groups(log: Log) -> Iterator[ChannelGroup]:
 def _group(
     log: Log, field: str, name: str, names: tuple[str, ...], values: FloatArray, measured: BoolArray
 ) -> Iterator[ChannelGroup]:
-    some = ~np.isnan(values[measured]).all(axis=0) if measured.any() else np.zeros(values.shape[1], dtype=bool)
-    if not some.any():
+    columns = ~np.isnan(values[measured]).all(axis=0) if measured.any() else np.zeros(values.shape[1], dtype=bool)
+    if not columns.any():
         return
-    chosen = values if some.all() else values[:, some]
-    samples = np.flatnonzero(measured & ~np.isnan(chosen).any(axis=1))
+    values = values if columns.all() else values[:, columns]
+    samples = np.flatnonzero(measured & ~np.isnan(values).any(axis=1))
     if len(samples) < 2:
         return
     elapsed = (log.time[samples] - log.time[samples[0]]) / median_step(log)
-    apart = (np.diff(samples) > 1) | (np.diff(elapsed) > LONG_STEP)
-    kept = chosen if len(samples) == len(log) else chosen[samples]
-    piece = np.append(0, np.cumsum(apart))
-    yield ChannelGroup(field, name, tuple(np.array(names)[some].tolist()), samples, kept, elapsed, piece)
+    gaps = (np.diff(samples) > 1) | (np.diff(elapsed) > MIN_GAP_STEPS)
+    values = values if len(samples) == len(log) else values[samples]
+    piece = np.append(0, np.cumsum(gaps))
+    yield ChannelGroup(field, name, tuple(np.array(names)[columns].tolist()), samples, values, elapsed, piece)

@@ -1,4 +1,4 @@
-"""Sensors that repeat themselves: frozen, saturated, held at a lower rate, or constant."""
+"""Repeated readings: frozen, saturated, held at a lower rate, constant, or in a dead band."""
 
 from __future__ import annotations
 
@@ -16,29 +16,54 @@ from torchid.log_checks.findings import (
     ChannelGroup,
     Finding,
     Span,
+    channel_unit,
     finite_median,
     neighbours_of,
 )
 from torchid.logs.log import WRENCHES, BoolArray, FloatArray
 
-#: Samples at the very same extreme value from which on it is a limit and no coincidence.
-AT_LIMIT = 5
+#: Samples at one extreme value from which on it is a limit of the sensor.
+MIN_SAMPLES_AT_LIMIT = 5
 #: Fields that are zero while a joint rests.
-RATES = ("joint_velocity", "joint_acceleration")
+RATE_FIELDS = ("joint_velocity", "joint_acceleration")
 #: Fields in which a driver may set small readings to zero.
-DEAD_BANDS = (*RATES, "joint_torque", "ft_wrench", *WRENCHES)
+DEAD_BAND_FIELDS = (*RATE_FIELDS, "joint_torque", "ft_wrench", *WRENCHES)
+#: Logarithm (base 10) of the probability of a run of repeats by chance: none in a million samples.
+MAX_LOG10_PROBABILITY = -8.0
+#: Steps on either side that a run is compared with.
+NEIGHBOUR_STEPS = 10
+#: Typical step in quanta below which repeats are expected: a slow channel on a coarse grid repeats itself.
+_MIN_STEP_QUANTA = 4.0
+#: Speed next to a run over that on the same side of it; a robot that stops smoothly is slower. Noisy channels are
+#: averaged over this number of steps.
+_MIN_SPEED_SHARE, _AVERAGED_STEPS = 0.5, 4
+#: Share of repeats above which a channel may be held at a lower rate...
+MIN_REPEATED_SHARE = 0.2
+#: ... and the share of runs that have the typical length within one sample, if the rate is regular.
+_MIN_REGULAR_SHARE = 0.8
+#: Share of time in rests, values held longer than this multiple of the mean, of a robot that rests and starts again.
+_MAX_REST_SHARE, _MIN_REST_HOLDS = 0.2, 5.0
+#: Differences below this share of a channel's largest value are rounding, in double and in single precision.
+FLOAT64_ROUNDING_SHARE = 16.0 * float(np.finfo(np.float64).eps)
+_FLOAT32_ROUNDING_SHARE = 2.0 * float(np.finfo(np.float32).eps)
+#: A channel lies on a grid if this share of its small steps is a whole number of quanta; random steps reach a fifth.
+_MIN_GRID_SHARE, _MIN_GRID_STEPS, _MAX_GRID_QUANTA, _GRID_TOLERANCE_QUANTA = 0.95, 10, 10.5, 0.1
+#: Quantiles of the step size at which a quantum is looked for.
+_SMALL_STEP_QUANTILES = (0.001, 0.005, 0.02)
+#: Runs of repeats in one channel above which none is checked: coarse channels repeat all the time.
+_MAX_RUNS = 20000
 
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Runs of repeats by the steps that they cover: `first`, `last` (R,), both included."""
+    """Runs of repeats, by their `first` and `last` steps (R,), both included."""
 
     first: NDArray[np.intp]
     last: NDArray[np.intp]
 
     @classmethod
     def of_repeats(cls, repeated: BoolArray) -> Runs:
-        """Of steps (M - 1,) that repeat the value before."""
+        """Runs of a mask (M - 1,) of steps without change."""
         edges = np.diff(np.concatenate([[False], repeated, [False]]).astype(np.int8))
         return cls(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1)
 
@@ -47,192 +72,175 @@ class Runs:
 
     @property
     def lengths(self) -> NDArray[np.intp]:
-        """Number of repeats in each."""
+        """Number of repeats in each run."""
         return self.last - self.first + 1
 
-    def select(self, chosen: BoolArray) -> Runs:
-        """Some of the runs."""
-        return Runs(self.first[chosen], self.last[chosen])
+    def select(self, mask: BoolArray) -> Runs:
+        """The runs in a mask (R,)."""
+        return Runs(self.first[mask], self.last[mask])
 
     def mask(self, steps: int) -> BoolArray:
-        """Which of so many steps they cover."""
+        """Which of `steps` steps the runs cover."""
         edges = np.zeros(steps + 1, np.intp)
         np.add.at(edges, self.first, 1)
         np.add.at(edges, self.last + 1, -1)
         return np.asarray(np.cumsum(edges[:-1]) > 0)
 
 
-_Stuck = list[tuple[str, Runs]]
+_RunsByChannel = list[tuple[str, Runs]]
 
 
 def check_repeats(groups: Iterable[ChannelGroup]) -> Iterator[Finding]:
     """Findings about frozen, held, saturated and constant channels."""
-    given = tuple(groups)
-    positions = next((group for group in given if group.field == "joint_position"), None)
-    for group in given:
+    groups = tuple(groups)
+    positions = next((group for group in groups if group.field == "joint_position"), None)
+    for group in groups:
         steps = np.diff(group.values, axis=0)
         constant = (steps == 0.0).all(axis=0)
         if constant.any():
-            yield from _constant(group, constant)
+            yield from _constant_findings(group, constant)
         if constant.all():
             continue
         rests = _at_rest(group, steps, positions)
         together = ((steps == 0.0) & ~rests)[:, ~constant].all(axis=1) & group.joined
-        if every := _mean_hold(group.values[:, ~constant], together):
-            yield _held(group, [(name, every) for name in group.names])
+        changing = group.values[:, ~constant]
+        if hold := _mean_hold(changing, together):
+            yield _held_finding(group, [(name, hold) for name in group.names])
             continue
-        moving = group.values[:, ~constant]
-        runs = _implausible_runs(moving, together)
-        if group.field in DEAD_BANDS:
-            runs = runs.select(~_in_dead_band(moving, runs))
+        runs = _implausible_runs(changing, together)
+        if group.field in DEAD_BAND_FIELDS:
+            runs = runs.select(~_in_dead_band(changing, runs))
         if len(runs):
-            what = f"all {len(group.names)} channels" if len(group.names) > 1 else group.names[0]
-            yield _frozen(group, what, [(name, runs) for name in group.names], len(runs))
+            channels = f"all {len(group.names)} channels" if len(group.names) > 1 else group.names[0]
+            yield _frozen_finding(group, channels, [(name, runs) for name in group.names], len(runs))
         if len(group.names) > 1:
             repeated = (steps == 0.0) & ~rests & (group.joined & ~runs.mask(len(steps)))[:, None]
-            yield from _by_channel(group, repeated, np.flatnonzero(~constant))
+            yield from _channel_findings(group, repeated, np.flatnonzero(~constant))
 
 
 def _at_rest(group: ChannelGroup, steps: FloatArray, positions: ChannelGroup | None) -> BoolArray:
     """Which steps (M - 1, c) of joint velocities or accelerations are those of a joint that does not move."""
-    if positions is None or group.field not in RATES or not np.isin(group.samples, positions.samples).all():
+    if positions is None or group.field not in RATE_FIELDS or not np.isin(group.samples, positions.samples).all():
         return np.zeros(steps.shape, bool)
     columns = [positions.names.index(name) for name in group.names]
     position = positions.values[np.searchsorted(positions.samples, group.samples)][:, columns]
     return np.asarray((steps == 0.0) & (group.values[1:] == 0.0) & (np.diff(position, axis=0) == 0.0))
 
 
-def _by_channel(group: ChannelGroup, all_repeated: BoolArray, columns: np.ndarray) -> Iterator[Finding]:
-    """Channels that repeat by themselves, of steps (M - 1, c)."""
-    stuck: _Stuck = []
+def _channel_findings(group: ChannelGroup, all_repeated: BoolArray, columns: np.ndarray) -> Iterator[Finding]:
+    """Findings about single channels, by their steps without change (M - 1, c)."""
+    frozen: _RunsByChannel = []
     dead: list[tuple[str, float, float]] = []
     limits: list[tuple[str, Runs, float]] = []
-    every = {column: _mean_hold(group.values[:, [column]], all_repeated[:, column]) for column in columns}
-    for column in (column for column in columns if not every[column]):
+    holds = {column: _mean_hold(group.values[:, [column]], all_repeated[:, column]) for column in columns}
+    for column in (column for column in columns if not holds[column]):
         repeated = all_repeated[:, column]
         name, values = group.names[column], group.values[:, column]
         runs = _implausible_runs(values[:, None], repeated)
         zeros = values[runs.first] == 0.0
-        quiet = _in_dead_band(values[:, None], runs)
-        if group.field in DEAD_BANDS and quiet.any() and 2 * quiet.sum() >= zeros.sum():
+        small = _in_dead_band(values[:, None], runs)
+        if group.field in DEAD_BAND_FIELDS and small.any() and 2 * small.sum() >= zeros.sum():
             dead.append((name, float(np.abs(values[values != 0.0]).min()), 100.0 * float(np.mean(values == 0.0))))
             runs = runs.select(~zeros)
         for extreme in (values.min(), values.max()):
             at_limit = Runs.of_repeats(repeated & (values[1:] == extreme))
-            if (values[runs.first] == extreme).any() and at_limit.lengths.sum() >= AT_LIMIT:
+            if (values[runs.first] == extreme).any() and at_limit.lengths.sum() >= MIN_SAMPLES_AT_LIMIT:
                 limits.append((name, at_limit, float(extreme)))
                 runs = runs.select(values[runs.first] != extreme)
         if len(runs):
-            stuck.append((name, runs))
-    if stuck:
-        yield _frozen(group, join_names([name for name, _ in stuck]), stuck, sum(len(runs) for _, runs in stuck))
+            frozen.append((name, runs))
+    if frozen:
+        channels, count = join_names([name for name, _ in frozen]), sum(len(runs) for _, runs in frozen)
+        yield _frozen_finding(group, channels, frozen, count)
     if dead:
-        each = [f"{name} below {least:.3g} {group.unit} ({share:.2g} % of it)" for name, least, share in dead]
+        texts = [
+            f"{name} below {least:.3g} {channel_unit(group.field, name)} ({share:.2g} % of it)"
+            for name, least, share in dead
+        ]
         advice = "switch the dead band off; a velocity may be left out, and is derived then"
         names = tuple(name for name, _, _ in dead)
-        yield Finding("dead band", SUSPICIOUS, group.field, f"reads 0: {join_names(each)}", advice, names)
+        yield Finding("dead band", SUSPICIOUS, group.field, f"reads 0: {join_names(texts)}", advice, names)
     if limits:
-        yield _saturated(group, limits)
-    if any(every.values()):
-        yield _held(group, [(group.names[column], each) for column, each in every.items() if each])
+        yield _saturated_finding(group, limits)
+    if any(holds.values()):
+        yield _held_finding(group, [(group.names[column], hold) for column, hold in holds.items() if hold])
 
 
 def _spans(group: ChannelGroup, channel: str, runs: Runs, skip: int = 1) -> Iterator[Span]:
-    """Samples that repeat the one before; with it for a `skip` of 0."""
+    """Samples that repeat the sample before; with `skip` 0, the first reading too."""
     for first, last in zip(runs.first, runs.last, strict=True):
         yield Span(int(group.samples[first + skip]), int(group.samples[last + 1]), channel)
 
 
-def _frozen(group: ChannelGroup, what: str, stuck: _Stuck, count: int) -> Finding:
-    spans = tuple(span for name, runs in stuck for span in _spans(group, name, runs))
+def _frozen_finding(group: ChannelGroup, channels: str, frozen: _RunsByChannel, count: int) -> Finding:
+    spans = tuple(span for name, runs in frozen for span in _spans(group, name, runs))
     longest = max(spans, key=len)
     times = f"{format_count(len(longest), 'sample')} at {longest}"
     if count > 1:
         times = f"{count} times, the longest {times}"
-    whose = f"{group.name}, " if group.name else ""
-    text = f"{whose}{what}: repeated to the last bit amid motion, {times}"
+    prefix = f"{group.name}, " if group.name else ""
+    text = f"{prefix}{channels}: repeated to the last bit while the robot moves, {times}"
     advice = "leave these samples out; look for lost messages or a stalled driver"
-    return Finding("frozen", CONDEMNED, group.field, text, advice, tuple(name for name, _ in stuck), spans)
+    return Finding("frozen", CONDEMNED, group.field, text, advice, tuple(name for name, _ in frozen), spans)
 
 
-def _saturated(group: ChannelGroup, limits: list[tuple[str, Runs, float]]) -> Finding:
+def _saturated_finding(group: ChannelGroup, limits: list[tuple[str, Runs, float]]) -> Finding:
     spans = tuple(span for name, runs, _ in limits for span in _spans(group, name, runs, 0))
     names = tuple(dict.fromkeys(name for name, _, _ in limits))
     shares = [(name, extreme, 100.0 * np.mean(group.values == extreme, axis=0)) for name, _, extreme in limits]
     text = "stays at an extreme value: " + join_names(
-        [f"{name} at {at:.4g} {group.unit} in {share[group.names.index(name)]:.2g} %" for name, at, share in shares]
+        [
+            f"{name} at {extreme:.4g} {channel_unit(group.field, name)} in {share[group.names.index(name)]:.2g} %"
+            for name, extreme, share in shares
+        ]
     )
-    if group.field == "joint_position":  # on a stop, or on the bound of an inverse kinematics: it may be right there
+    if group.field == "joint_position":  # an end stop, or a limit of inverse kinematics
         advice = "none if these are the joints' stops; else widen the bounds of the encoder or inverse kinematics"
         return Finding("saturated", SUSPICIOUS, group.field, text, advice, names, spans)
     advice = "leave these samples out, or raise the sensor's range"
     return Finding("saturated", CONDEMNED, group.field, text, advice, names, spans)
 
 
-def _held(group: ChannelGroup, held: list[tuple[str, float]]) -> Finding:
-    every = max(each for _, each in held)
+def _held_finding(group: ChannelGroup, held: list[tuple[str, float]]) -> Finding:
+    hold = max(samples for _, samples in held)
     names = tuple(name for name, _ in held)
-    whose = f"{join_names(names)}: " if len(names) < len(group.names) else ""
-    text = (
-        f"{whose}new values only every {every:.3g} samples, repeated in between: "
-        f"{0.5 * (every - 1):.2g} samples late on average"
-    )
-    advice = f"record at one rate, or set preprocessing.cutoff_hz below {0.25 / every:.2g} of the sample rate"
+    prefix = f"{join_names(names)}: " if len(names) < len(group.names) else ""
+    delay = f"{0.5 * (hold - 1):.2g} samples late on average"
+    text = f"{prefix}new values only every {hold:.3g} samples, repeated in between: {delay}"
+    advice = f"record at one rate, or set preprocessing.cutoff_hz below {0.25 / hold:.2g} of the sample rate"
     return Finding("held", SUSPICIOUS, group.field, text, advice, names)
 
 
-def _constant(group: ChannelGroup, constant: BoolArray) -> Iterator[Finding]:
+def _constant_findings(group: ChannelGroup, constant: BoolArray) -> Iterator[Finding]:
     names = tuple(name for name, still in zip(group.names, constant, strict=True) if still)
     zero = not group.values[0][constant].any()
-    if zero and group.field in WRENCHES:  # what a point contact cannot exert
+    if zero and group.field in WRENCHES:  # moments of a point contact
         return
     text = f"{join_names(names)}: {'0' if zero else 'one value'} throughout"
     if zero and group.field == "joint_torque":
         advice = "write NaN if they were not measured: zeros are fitted as measured torques"
         yield Finding("constant", SUSPICIOUS, group.field, text, advice, names)
     else:
-        yield Finding("constant", NOTE, group.field, text, "none if that is so: what does not move adds nothing", names)
-
-
-# ------------------------------------------------------------------------------------------- repeats that are no chance
-
-#: Logarithm (base 10) of the probability below which a run of repeats is no chance: none in a million samples.
-CHANCE = -8.0
-#: Steps on either side that a run is compared with.
-NEIGHBOURS = 10
-#: Quanta per step that a channel must make to count: one that stops on a coarse grid repeats itself before it rests.
-_GRAINS = 4.0
-#: Share of the speed on one side that the robot must have next to a run: one that stops smoothly is below it. Of a
-#: noisy channel, the mean over so many steps counts.
-_MOVING, _NEAREST = 0.5, 4
-#: Share of repeats above which a channel is taken for one that was recorded at a lower rate and held...
-HELD = 0.2
-#: ... if this share of the runs has the typical length, give or take one sample.
-_REGULAR = 0.8
-#: Share of the time in values held longer than so many times the mean from which on a robot rests and starts again.
-_RESTING, _LONG = 0.2, 5.0
-#: Share of a channel's largest value below which differences are rounding, and the same after single precision.
-ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
-_SINGLE = 2.0 * float(np.finfo(np.float32).eps)
-#: A grid: this share of at least `_STEPS` steps of up to `_QUANTA` quanta is whole to within `_OFF` quanta, where of
-#: steps of any size a fifth would be.
-_ON_GRID, _STEPS, _QUANTA, _OFF = 0.95, 10, 10.5, 0.1
-#: Shares of the steps below which the smallest are looked for.
-_SMALLEST = (0.001, 0.005, 0.02)
-#: Runs of repeats beyond which none is judged: coarse channels repeat all the time.
-_MOST_RUNS = 20000
+        yield Finding(
+            "constant",
+            NOTE,
+            group.field,
+            text,
+            "none if the robot does not move there: constant channels add no information",
+            names,
+        )
 
 
 def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:
-    """For how many samples values (M, c) are held on average whose steps (M - 1,) `repeated` all; 0 if they are not.
+    """Mean number of samples for which values (M, c) are held, by steps without change (M - 1,); 0 if not held.
 
-    Held values repeat at more or less regular times while the robot moves on: the change after a repeat is no single
-    quantum, as it is of an encoder that creeps, and most repeats do not lie in long rests.
+    Held values repeat while the robot moves: changes after a repeat have several quanta, unlike those of a slow
+    encoder, and few repeats are part of long rests.
     """
-    if float(np.mean(repeated)) <= HELD:
+    if float(np.mean(repeated)) <= MIN_REPEATED_SHARE:
         return 0.0
     changes = np.flatnonzero(~repeated)
-    if len(changes) < NEIGHBOURS:
+    if len(changes) < NEIGHBOUR_STEPS:
         return 0.0
     lengths = np.diff(changes)
     quanta = np.array([_estimate_resolution(column) for column in values.T])
@@ -240,82 +248,79 @@ def _mean_hold(values: FloatArray, repeated: BoolArray) -> float:
     sizes = np.abs(values[after + 1] - values[after])
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = np.nan_to_num(sizes / quanta, nan=0.0, posinf=np.inf).max(axis=1)
-    if np.median(steps) <= _GRAINS:
+    if np.median(steps) <= _MIN_STEP_QUANTA:
         return 0.0
     typical = int(np.median(lengths))
-    if typical > 1 and float(np.mean(np.abs(lengths - typical) <= 1)) >= _REGULAR:
+    if typical > 1 and float(np.mean(np.abs(lengths - typical) <= 1)) >= _MIN_REGULAR_SHARE:
         return typical
     mean = float(lengths.mean())
-    return mean if lengths[lengths > _LONG * mean].sum() <= _RESTING * lengths.sum() else 0.0
+    return mean if lengths[lengths > _MIN_REST_HOLDS * mean].sum() <= _MAX_REST_SHARE * lengths.sum() else 0.0
 
 
 def _estimate_resolution(values: FloatArray) -> float:
-    """Quantum of the grid that the steps of a channel (M,) lie on; 0 if they lie on none, inf if they are too few."""
+    """Quantum of a channel (M,); 0 if its steps lie on no grid, inf if it has too few steps."""
     sizes = np.abs(np.diff(values))
-    sizes = sizes[sizes > _SINGLE * np.abs(values).max()]
-    if len(sizes) < _STEPS:
+    sizes = sizes[sizes > _FLOAT32_ROUNDING_SHARE * np.abs(values).max()]
+    if len(sizes) < _MIN_GRID_STEPS:
         return np.inf
-    for least in np.quantile(sizes, _SMALLEST):  # single quanta are rare in a channel that is fast
+    for least in np.quantile(sizes, _SMALL_STEP_QUANTILES):  # fast channels have few steps of one quantum
         quantum = float(np.median(sizes[sizes < 1.5 * least]))
-        steps = sizes[sizes < _QUANTA * quantum] / quantum
-        if len(steps) >= _STEPS and float(np.mean(np.abs(steps - np.rint(steps)) < _OFF)) >= _ON_GRID:
+        steps = sizes[sizes < _MAX_GRID_QUANTA * quantum] / quantum
+        if (
+            len(steps) >= _MIN_GRID_STEPS
+            and float(np.mean(np.abs(steps - np.rint(steps)) < _GRID_TOLERANCE_QUANTA)) >= _MIN_GRID_SHARE
+        ):
             return quantum
     return 0.0
 
 
 def _implausible_runs(values: FloatArray, repeated: BoolArray) -> Runs:
-    """Runs of repeats (M - 1,) in values (M, c), all channels at once, that are neither chance nor rest."""
+    """Runs of steps without change (M - 1,) in all channels (M, c) that neither chance nor rest explains."""
     runs = Runs.of_repeats(repeated)
-    if not 0 < len(runs) <= _MOST_RUNS:
+    if not 0 < len(runs) <= _MAX_RUNS:
         return runs.select(np.zeros(len(runs), bool))
     sizes = np.abs(np.diff(values, axis=0))
-    sides = [
-        neighbours_of(sizes, runs.first, -1, NEIGHBOURS),
-        neighbours_of(sizes, runs.last, 1, NEIGHBOURS),
-    ]  # (R, k, c)
+    ends = ((runs.first, -1), (runs.last, 1))
+    sides = [neighbours_of(sizes, step, direction, NEIGHBOUR_STEPS) for step, direction in ends]  # (R, k, c)
     typical = finite_median(np.concatenate(sides, axis=1))
     quanta = np.array([_estimate_resolution(column) for column in values.T])
-    finest = np.maximum(_finest(sides, ROUNDING * np.abs(values).max(axis=0)), quanta)
+    finest = np.maximum(_smallest_difference(sides, FLOAT64_ROUNDING_SHARE * np.abs(values).max(axis=0)), quanta)
     moving = np.ones(len(runs), bool)
     with np.errstate(divide="ignore", invalid="ignore"):
-        one = np.where(typical > _GRAINS * finest, 0.5 * finest / typical, 1.0)
-        chance = runs.lengths * np.log10(one).sum(axis=1)
+        probability = np.where(typical > _MIN_STEP_QUANTA * finest, 0.5 * finest / typical, 1.0)  # of one repeat
+        log_probability = runs.lengths * np.log10(probability).sum(axis=1)
         for side in sides:
             at_end = np.isnan(side[:, 0]).all(axis=1)
-            moving &= at_end | (_pace(side) >= _MOVING)
-    return runs.select((chance < CHANCE) & moving)
+            moving &= at_end | (_relative_speed(side) >= _MIN_SPEED_SHARE)
+    return runs.select((log_probability < MAX_LOG10_PROBABILITY) & moving)
 
 
 def _in_dead_band(values: FloatArray, runs: Runs) -> BoolArray:
-    """Which runs (R,) of values (M, c) are of zeros amid the smallest readings that there are.
+    """Which runs (R,) of values (M, c) are zeros next to the smallest readings of the channel.
 
-    A driver that reads 0 below some size goes to 0 and leaves it there; a sensor that is lost does so from any reading.
+    A driver with a dead band starts and ends its zeros at small readings, a lost sensor at any reading.
     """
     size = np.abs(values)
     least = np.where(size > 0.0, size, np.inf).min(axis=0)
     inside = (size[runs.first] == 0.0).all(axis=1)
     for neighbour in (runs.first - 1, runs.last + 2):
-        beyond = (neighbour < 0) | (neighbour >= len(size))
-        inside &= beyond | (size[np.clip(neighbour, 0, len(size) - 1)] <= 2.0 * least).all(axis=1)
+        at_end = (neighbour < 0) | (neighbour >= len(size))
+        inside &= at_end | (size[np.clip(neighbour, 0, len(size) - 1)] <= 2.0 * least).all(axis=1)
     return np.asarray(inside)
 
 
-def _pace(side: FloatArray) -> FloatArray:
-    """Speed next to runs over that on the same side of them, (R,), of sizes of steps (R, k, c)."""
+def _relative_speed(side: FloatArray) -> FloatArray:
+    """Speed next to runs over the median on the same side, (R,), by sizes of steps (R, k, c)."""
     usual = finite_median(side)
     noisy = finite_median(np.abs(np.diff(side, axis=1))) > 0.5 * usual
-    nearest = np.where(noisy, side[:, :_NEAREST].mean(axis=1), side[:, 0])
-    return _mean_known(np.where(usual > 0.0, nearest / usual, np.nan))
+    nearest = np.where(noisy, side[:, :_AVERAGED_STEPS].mean(axis=1), side[:, 0])
+    ratio = np.where(usual > 0.0, nearest / usual, np.nan)
+    known = np.isfinite(ratio)
+    return np.where(known, ratio, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
 
 
-def _finest(sides: list[FloatArray], rounding: FloatArray) -> FloatArray:
-    """The smallest difference of values or of steps that is not rounding in the neighbourhood, (R, c)."""
+def _smallest_difference(sides: list[FloatArray], rounding: FloatArray) -> FloatArray:
+    """Smallest difference of values or steps above rounding on both sides of each run, (R, c)."""
     sizes = np.concatenate([*sides, *(np.abs(np.diff(side, axis=1)) for side in sides)], axis=1)
-    least = np.where(sizes > rounding, sizes, np.inf).min(axis=1)  # so written, NaN is none either
+    least = np.where(sizes > rounding, sizes, np.inf).min(axis=1)  # NaN compares false
     return np.where(np.isfinite(least), least, 0.0)
-
-
-def _mean_known(values: FloatArray) -> FloatArray:
-    """Mean along the last axis over what is a number; 0 where nothing is."""
-    known = np.isfinite(values)
-    return np.where(known, values, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)

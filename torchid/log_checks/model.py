@@ -18,30 +18,28 @@ from torchid.logs.preprocess import preprocess
 from torchid.problem import RowBuilder, Samples, bind_log
 from torchid.problem.predict import force_series, null_space_part
 from torchid.robot import Robot
-from torchid.sensing import Contact, SensorSet, named_sensors
+from torchid.sensing import Contact, named_sensors
 
 #: Samples that are differentiated: all of a short log, `PIECES` evenly spread runs of a long one.
-DIFFERENTIATED, PIECES = 40000, 4
-#: Of these, evenly spread ones are compared; fewer to find which of many mistakes explains a misfit.
-COMPARED, TRIED = 800, 150
-#: Of a long log, as many samples are differentiated to try a mistake.
-DIFFERENTIATED_TO_TRY = 10000
-#: Default cutoff [Hz]: robots move below 5 Hz. At most this share of the sample rate.
-CUTOFF, _OF_RATE = 10.0, 0.2
-#: How much larger a torque's own part in the projected forces must be than what the model leaves of these, for its sign
-#: to be judged.
-CLEAR = 1.0
-#: A torque this many times larger or smaller than needed is no error of the model: friction that the URDF lacks makes
-#: up a factor of several, a gear 50 to 160.
-SCALE = 10.0
-#: As `CLEAR` for each joint's own row, where contact wrenches are known or there are none: a correlation of 0.9.
-CLEAR_ROW = 2.0
-#: Misfit of the base force from which on contact wrenches are not used to determine the sign of a torque.
-_TRUSTED = 0.3
-#: A torque [N m] that no sensor reads.
-NOTHING = 1e-9
-#: Singular values below this share of the largest count as that large: the data do not determine such combinations.
-_DEPENDENT, _TINY = 1e-12, 1e-100
+MAX_DIFFERENTIATED_SAMPLES, PIECES = 40000, 4
+#: The same where a corrected log is tried.
+MAX_TRIAL_DIFFERENTIATED_SAMPLES = 10000
+#: Evenly spread samples that are compared with the model; fewer where many corrected logs are tried.
+COMPARED_SAMPLES, TRIAL_SAMPLES = 800, 150
+#: Default cutoff (robots move below 5 Hz), and its largest share of the sample rate.
+DEFAULT_CUTOFF_HZ, _MAX_CUTOFF_RATE_SHARE = 10.0, 0.2
+#: Independent part of a torque in the projected forces, over the residual, from which on its gain is determined.
+MIN_SIGNAL_RATIO = 1.0
+#: The same in a joint's row, where contact wrenches are known or there are none: a correlation of 0.9.
+MIN_ROW_SIGNAL_RATIO = 2.0
+#: Gain that no model error explains: missing friction makes up a factor of several, a gear ratio 50 to 160.
+MAX_GAIN_RATIO = 10.0
+#: Misfit of the base force above which contact wrenches do not decide on the sign of a torque.
+_MAX_WRENCH_MISFIT = 0.3
+#: Torque below the resolution of any sensor.
+MIN_TORQUE_NM = 1e-9
+#: Smaller singular values, over the largest, are raised to this share: the data do not determine such combinations.
+_MIN_SINGULAR_VALUE_SHARE, _TINY = 1e-12, 1e-100
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,29 +48,29 @@ class TorqueFit:
 
     Attributes:
         joints: numbers of the m joints whose torque was measured.
-        gain: (m,) factor that each should be multiplied by.
-        clear: (m,) bool, whether the data determine the gain.
-        misfit: size of what the torques as they are miss of the model's, over the size of the model's.
-        misfit_corrected: as `misfit`, with torques multiplied by their gain where that is clear and not plausible.
+        gain: (m,) factor that each measured torque should be multiplied by.
+        determined: (m,) bool, whether the data determine the gain.
+        misfit: norm of the difference between measured and model torques, over the norm of the model's.
+        misfit_corrected: as `misfit`, with torques multiplied by their gain where that is determined and implausible.
     """
 
     joints: np.ndarray
     gain: FloatArray
-    clear: BoolArray
+    determined: BoolArray
     misfit: float
     misfit_corrected: float
 
     @property
-    def wrong(self) -> BoolArray:
-        """Joints (m,) whose torque is clearly reversed or of another size."""
-        return _wrong_gains(self.gain, self.clear)
+    def implausible(self) -> BoolArray:
+        """Joints (m,) whose torque is reversed or off by more than `MAX_GAIN_RATIO`."""
+        return _implausible_gains(self.gain, self.determined)
 
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
-    """How well measured forces agree with the URDF: torques, and what contact wrenches do to the base, if measured.
+    """How well measured forces agree with the URDF: joint torques, and contact wrenches by their effect on the base.
 
-    `base_force` and `base_moment`: size of the difference over the size of the model's.
+    `base_force`, `base_moment`: norm of the difference over the norm of the model's; None if not measured.
     """
 
     torque: TorqueFit | None
@@ -80,67 +78,64 @@ class ModelFit:
     base_moment: float | None
 
     @property
-    def of_torques(self) -> float | None:
-        """Misfit of the torques: single ones that are clearly wrong do not count, all of them do."""
+    def torque_misfit(self) -> float | None:
+        """Misfit of the torques; implausible ones are corrected first, unless all of them are implausible."""
         fit = self.torque
         if fit is None:
             return None
-        return fit.misfit if fit.wrong.sum() >= fit.clear.sum() else fit.misfit_corrected
+        return fit.misfit if fit.implausible.sum() >= fit.determined.sum() else fit.misfit_corrected
 
     @property
-    def of_wrenches(self) -> float | None:
-        """The larger misfit of what the contact wrenches do to the base."""
+    def wrench_misfit(self) -> float | None:
+        """The larger misfit of base force and base moment."""
         return max((part for part in (self.base_force, self.base_moment) if part is not None), default=None)
 
     @property
-    def known(self) -> tuple[bool, ...]:
-        """Which of torques, base force and base moment could be compared."""
+    def compared(self) -> tuple[bool, ...]:
+        """Which of torques, base force and base moment were compared."""
         return tuple(part is not None for part in (self.torque, self.base_force, self.base_moment))
 
     @property
     def misfit(self) -> float:
-        """Rms of all that there are."""
-        known = [x for x in (self.of_torques, self.base_force, self.base_moment) if x is not None]
-        return float(np.sqrt(np.mean(np.square(known)))) if known else 0.0
+        """Rms of all misfits."""
+        parts = [x for x in (self.torque_misfit, self.base_force, self.base_moment) if x is not None]
+        return float(np.sqrt(np.mean(np.square(parts)))) if parts else 0.0
 
 
-def _wrong_gains(gain: FloatArray, clear: BoolArray) -> BoolArray:
-    """Which gains (m,) no error of a model can be, among those that are clear."""
-    return clear & ((gain < 0.0) | (np.abs(np.log(np.maximum(np.abs(gain), _TINY))) > np.log(SCALE)))
+def _implausible_gains(gain: FloatArray, determined: BoolArray) -> BoolArray:
+    """Which determined gains (m,) no model error explains."""
+    return determined & ((gain < 0.0) | (np.abs(np.log(np.maximum(np.abs(gain), _TINY))) > np.log(MAX_GAIN_RATIO)))
 
 
 def default_cutoff_hz(log: Log) -> float:
-    """The cutoff [Hz] for a log where none is given."""
-    return min(CUTOFF, _OF_RATE / median_step(log))
+    """The cutoff [Hz] where the user gives none."""
+    return min(DEFAULT_CUTOFF_HZ, _MAX_CUTOFF_RATE_SHARE / median_step(log))
 
 
-def preprocess_pieces(log: Log, cutoff_hz: float, most: int = DIFFERENTIATED) -> list[Log]:
-    """The log with velocities and accelerations; of one longer than `most`, runs of samples from all over it.
+def preprocess_pieces(log: Log, cutoff_hz: float, max_samples: int = MAX_DIFFERENTIATED_SAMPLES) -> list[Log]:
+    """The log with velocities and accelerations; of one longer than `max_samples`, evenly spread runs of samples.
 
     Raises:
         InputError: the log cannot be filtered.
     """
-    count = 1 if len(log) <= most else PIECES
-    length = min(len(log), most) // count
+    count = 1 if len(log) <= max_samples else PIECES
+    length = min(len(log), max_samples) // count
     starts = np.linspace(0, len(log) - length, count).astype(int)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TorchidWarning)  # findings report the same
+        warnings.simplefilter("ignore", TorchidWarning)  # other findings report these
         return [preprocess(log.select(slice(start, start + length)), cutoff_hz) for start in starts]
 
 
 def bind_some_samples(
-    logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED
+    logs: Sequence[Log], robot: Robot, contacts: Sequence[Contact], count: int = COMPARED_SAMPLES
 ) -> list[Samples]:
     """About `count` evenly spread samples of filtered logs.
 
     Raises:
-        InputError: they do not fit the robot.
+        InputError: they do not match the robot.
     """
-    out = []
-    for log in logs:
-        samples = bind_log(log, robot, contacts)
-        out.append(samples[torch.linspace(0, len(samples) - 1, min(count // len(logs), len(samples))).long()])
-    return out
+    bound = [bind_log(log, robot, contacts) for log in logs]
+    return [part[torch.linspace(0, len(part) - 1, min(count // len(logs), len(part))).long()] for part in bound]
 
 
 def link_poses(log: Log, robot: Robot) -> dict[str, torch.Tensor]:
@@ -154,73 +149,67 @@ def fit_nominal_model(samples: Sequence[Samples], robot: Robot, contacts: Sequen
     measured = np.zeros(robot.n, dtype=bool)
     if all(part.torque is not None for part in samples):
         torque = np.concatenate([part.torque[:, : robot.n].numpy() for part in samples if part.torque is not None])
-        measured = np.isfinite(torque).all(axis=0) & (np.abs(torque) > NOTHING).any(axis=0)
-    builder = RowBuilder(robot, contacts, _joints_only(robot, contacts, measured))
+        measured = np.isfinite(torque).all(axis=0) & (np.abs(torque) > MIN_TORQUE_NM).any(axis=0)
+    sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
+    sensors = dataclasses.replace(sensors, torque=np.append(measured, sensors.torque[robot.n :]))
+    builder = RowBuilder(robot, contacts, sensors)
     forces = [force_series(builder, part, robot.nominal.flatten()[None]) for part in samples]
-    acting, needed = np.concatenate([f[0] for f in forces]), np.concatenate([f[1][0] for f in forces])
+    acting, required = np.concatenate([f[0] for f in forces]), np.concatenate([f[1][0] for f in forces])
     base = robot.base_rows
-    found = [_relative(acting[:, rows], needed[:, rows]) for rows in (slice(0, min(3, base)), slice(3, base))]
+    force, moment = (_misfit(acting[:, rows], required[:, rows]) for rows in (slice(0, min(3, base)), slice(3, base)))
     fit = None
     if measured.any():
-        joints = np.flatnonzero(measured)
-        fit = _projected_fit(builder, samples, needed, torque, joints)
+        fit = _fit_projected(builder, samples, required, torque, np.flatnonzero(measured))
         contact_part = acting[:, base : base + robot.n] - torque
-        trusted = not contacts or (found[0] is not None and found[0] < _TRUSTED and np.isfinite(contact_part).all())
-        if trusted and not fit.clear.all():
-            fit = _with_wrenches(fit, needed[:, base : base + robot.n] - contact_part, torque)
-    return ModelFit(fit, *found)
+        consistent = force is not None and force < _MAX_WRENCH_MISFIT and np.isfinite(contact_part).all()
+        if (consistent or not contacts) and not fit.determined.all():
+            fit = _fit_single_rows(fit, required[:, base : base + robot.n] - contact_part, torque)
+    return ModelFit(fit, force, moment)
 
 
-def _joints_only(robot: Robot, contacts: Sequence[Contact], measured: BoolArray) -> SensorSet:
-    every = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
-    mask = np.array(every.torque)
-    mask[: robot.n] = measured
-    return dataclasses.replace(every, torque=mask)
-
-
-def _relative(found: FloatArray, wanted: FloatArray) -> float | None:
-    """Size of the difference over that of `wanted`, over samples where `found` is known; None where it never is."""
-    known = np.isfinite(found).all(axis=1)
-    size = np.linalg.norm(wanted[known])
-    if not found.shape[1] or not known.any() or not size > 0.0 or not found[known].any():
+def _misfit(measured: FloatArray, model: FloatArray) -> float | None:
+    """Norm of the difference over that of the model, over samples (N, k) that were measured; None without any."""
+    known = np.isfinite(measured).all(axis=1)
+    size = np.linalg.norm(model[known])
+    if not measured.shape[1] or not known.any() or not size > 0.0 or not measured[known].any():
         return None
-    return float(np.linalg.norm(found[known] - wanted[known]) / size)
+    return float(np.linalg.norm(measured[known] - model[known]) / size)
 
 
-def _projected_fit(
-    builder: RowBuilder, samples: Sequence[Samples], needed: FloatArray, torque: FloatArray, joints: np.ndarray
+def _fit_projected(
+    builder: RowBuilder, samples: Sequence[Samples], required: FloatArray, torque: FloatArray, joints: np.ndarray
 ) -> TorqueFit:
-    """Gains by least squares in the contacts' null space, where no contact force counts."""
+    """Gains by least squares in the null space of the contacts, where contact forces vanish."""
     base = builder.tree.base_rows
     rows = [*range(base), *(base + joints)]
-    vectors = np.zeros((1 + len(joints), *needed.shape))
-    vectors[0] = needed
+    vectors = np.zeros((1 + len(joints), *required.shape))
+    vectors[0] = required
     for index, joint in enumerate(joints):
         vectors[1 + index, :, base + joint] = torque[:, joint]
     ends = np.cumsum([len(part) for part in samples])[:-1]
     parts = np.split(vectors, ends, axis=1)
-    inside = np.concatenate([null_space_part(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
-    inside = inside[..., rows].reshape(1 + len(joints), -1)
-    y, A = inside[0], inside[1:].T
+    projected = np.concatenate([null_space_part(builder, s, v) for s, v in zip(samples, parts, strict=True)], axis=1)
+    projected = projected[..., rows].reshape(1 + len(joints), -1)
+    y, A = projected[0], projected[1:].T
     norms = np.linalg.norm(A, axis=0)
     norms[norms == 0.0] = 1.0
     U, values, Vh = np.linalg.svd(A / norms, full_matrices=False)
-    inverse = Vh.T / np.maximum(values, max(_DEPENDENT * values.max(initial=0.0), _TINY))
+    inverse = Vh.T / np.maximum(values, max(_MIN_SINGULAR_VALUE_SHARE * values.max(initial=0.0), _TINY))
     gain = inverse @ (U.T @ y) / norms
-    own = norms / np.sqrt(np.square(inverse).sum(axis=1))  # what of each torque the others cannot make up for
-    clear = own * np.abs(gain) > CLEAR * np.linalg.norm(y - A @ gain)
-    corrected = np.where(_wrong_gains(gain, clear), gain, 1.0)
+    independent = norms / np.sqrt(np.square(inverse).sum(axis=1))  # norm of each column orthogonal to all others
+    determined = independent * np.abs(gain) > MIN_SIGNAL_RATIO * np.linalg.norm(y - A @ gain)
+    corrected = np.where(_implausible_gains(gain, determined), gain, 1.0)
     size = max(float(np.linalg.norm(y)), _TINY)
-    missed = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), corrected))
-    return TorqueFit(joints, gain, clear, *missed)
+    misfits = (float(np.linalg.norm(y - A @ factor)) / size for factor in (np.ones(len(joints)), corrected))
+    return TorqueFit(joints, gain, determined, *misfits)
 
 
-def _with_wrenches(fit: TorqueFit, needed: FloatArray, torque: FloatArray) -> TorqueFit:
-    """The fit with gains that all rows together leave open from each joint's own row, the contacts' part taken off."""
-    gain, clear = fit.gain.copy(), fit.clear.copy()
-    for index in np.flatnonzero(~clear):
-        want, have = needed[:, fit.joints[index]], torque[:, fit.joints[index]]
-        gain[index] = want @ have / (have @ have)
-        left = np.linalg.norm(want - gain[index] * have)
-        clear[index] = abs(gain[index]) * np.linalg.norm(have) > CLEAR_ROW * left
-    return dataclasses.replace(fit, gain=gain, clear=clear)
+def _fit_single_rows(fit: TorqueFit, required: FloatArray, torque: FloatArray) -> TorqueFit:
+    """The fit, with undetermined gains taken from the row of each joint, less the contribution of the contacts."""
+    gain, determined = fit.gain.copy(), fit.determined.copy()
+    for index in np.flatnonzero(~determined):
+        y, x = required[:, fit.joints[index]], torque[:, fit.joints[index]]
+        gain[index] = y @ x / (x @ x)
+        residual = np.linalg.norm(y - gain[index] * x)
+        determined[index] = abs(gain[index]) * np.linalg.norm(x) > MIN_ROW_SIGNAL_RATIO * residual
+    return dataclasses.replace(fit, gain=gain, determined=determined)

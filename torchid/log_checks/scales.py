@@ -1,4 +1,4 @@
-"""Scales that forces determine for any URDF near the given one: of time, of torques, and the point of wrenches."""
+"""Scales of time and torques, and the reference point of wrenches, estimated for all URDFs near the given one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ import torch
 
 from torchid import parameters
 from torchid.log_checks.findings import median_step
-from torchid.log_checks.model import DIFFERENTIATED_TO_TRY, NOTHING, bind_some_samples, preprocess_pieces
+from torchid.log_checks.model import (
+    MAX_TRIAL_DIFFERENTIATED_SAMPLES,
+    MIN_TORQUE_NM,
+    bind_some_samples,
+    preprocess_pieces,
+)
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.problem import RowBuilder, Samples
@@ -21,53 +26,53 @@ from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
-# ---------------------------------------------------------------------------------- equations of a URDF and any near it
+# ---------------------------------------------------------------------- equations with a prior on the URDF's parameters
 
-#: What a URDF may be off by, in units of `parameter_scale`: 0.1 is a mass, and an inertia, 15 to 20 % off.
+#: Errors of a URDF, in units of `parameter_scale`: 0.1 is a mass, or an inertia, that is 15 to 20 % off.
 URDF_ERROR = 0.1
-#: Friction that a URDF lacks, in the joint's rms torque.
-FRICTION = 0.2
-#: What no parameters explain (flexibility, filters, shape of friction), as a share of the rms of each kind of force.
-UNMODELLED = 0.05
+#: Friction missing in a URDF, over the rms torque of the joint.
+FRICTION_TORQUE_SHARE = 0.2
+#: Forces that no parameters explain (flexibility, filters, shape of friction), over the rms of each kind of force.
+UNMODELLED_FORCE_SHARE = 0.05
 #: Successive samples that count as one: of 240 out of ten seconds, errors of friction and flexibility are correlated.
 CORRELATED_SAMPLES = 10.0
-#: Blocks of time that must agree.
+#: Blocks of time whose estimates are compared.
 BLOCKS = 6
 _TINY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class _NormalEquations:
-    """Whitened equations of some samples, by blocks of time.
+    """Normal equations of whitened rows [K, Y], K scaled by the prior's standard deviations, by blocks of time.
 
     Attributes:
-        inside: (BLOCKS, P, P), products of the columns K, each times what its parameter may be off by.
-        across: (BLOCKS, P, k), of these with the terms.
-        terms: (BLOCKS, k, k), of the terms.
-        rows: equations.
+        KtK: (BLOCKS, P, P).
+        KtY: (BLOCKS, P, k).
+        YtY: (BLOCKS, k, k).
+        rows: number of rows.
     """
 
-    inside: FloatArray
-    across: FloatArray
-    terms: FloatArray
+    KtK: FloatArray
+    KtY: FloatArray
+    YtY: FloatArray
     rows: int
 
     def unexplained(self, block: int | None = None) -> FloatArray:
-        """Products (k, k) of what is left of the terms, over all blocks or in one."""
-        chosen = slice(None) if block is None else slice(block, block + 1)
-        H, C, G = (part[chosen].sum(axis=0) for part in (self.inside, self.across, self.terms))
+        """Products (k, k) of the residuals of Y after the fit of the parameters, over all blocks or in one."""
+        blocks = slice(None) if block is None else slice(block, block + 1)
+        H, C, G = (part[blocks].sum(axis=0) for part in (self.KtK, self.KtY, self.YtY))
         H = H + CORRELATED_SAMPLES * np.eye(len(H))
         return np.asarray(G - C.T @ np.linalg.solve(H, C))
 
 
 def _measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
-    """The forces that are known throughout, with what no parameters explain of each kind as their noise."""
+    """The sensors that are read in all samples; their noise is the unmodelled force of each kind."""
     torque = np.zeros(robot.n_dofs, bool)
     wrench = np.zeros((len(contacts), 6), bool)
     size = 0.0
     if all(part.torque is not None for part in samples):
         values = np.concatenate([part.torque.numpy() for part in samples if part.torque is not None])[:, : robot.n]
-        torque[: robot.n] = np.isfinite(values).all(axis=0) & (np.abs(values) > NOTHING).any(axis=0)
+        torque[: robot.n] = np.isfinite(values).all(axis=0) & (np.abs(values) > MIN_TORQUE_NM).any(axis=0)
         size = float(np.sqrt(np.square(values[:, torque[: robot.n]]).mean())) if torque.any() else 0.0
     if contacts and all(part.wrench is not None for part in samples):
         for k, contact in enumerate(contacts):
@@ -79,30 +84,30 @@ def _measured_sensors(samples: Sequence[Samples], robot: Robot, contacts: Sequen
             wrench[k, list(contact.components)] = np.isfinite(np.concatenate(known)).all()
     weight = -GRAVITY_WORLD[2] * float(robot.nominal[:, parameters.MASS].sum())
     moment = size or 0.1 * weight
-    noise = SensorNoise(*(max(UNMODELLED * x, _TINY) for x in (moment, 0.5 * weight, moment)))
+    noise = SensorNoise(*(max(UNMODELLED_FORCE_SHARE * x, _TINY) for x in (moment, 0.5 * weight, moment)))
     return SensorSet(torque, wrench, noise)
 
 
 def _missing_friction_scale(samples: Sequence[Samples], robot: Robot) -> FloatArray:
-    """Coulomb [N m] and viscous [N m s/rad] friction that joints without a word in the URDF have, (n, 2)."""
+    """Coulomb [N m] and viscous [N m s/rad] friction of joints without friction in the URDF, (n, 2)."""
     out = np.full((robot.n, 2), _TINY)
     if all(part.torque is not None for part in samples):
         torque = np.concatenate([part.torque[:, : robot.n].numpy() for part in samples if part.torque is not None])
         velocity = np.concatenate([part.joint_velocity.numpy() for part in samples])
-        size = FRICTION * np.sqrt(np.square(np.nan_to_num(torque)).mean(axis=0))
+        size = FRICTION_TORQUE_SHARE * np.sqrt(np.square(np.nan_to_num(torque)).mean(axis=0))
         speed = np.sqrt(np.square(velocity).mean(axis=0))
         out = np.stack([size, size / np.maximum(speed, 1e-3)], axis=1)
     return np.maximum(out, _TINY)
 
 
 def _prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]) -> FloatArray:
-    """Matrix (columns, P) from deviations of size 1 to the builder's columns."""
+    """Matrix (columns, P) from parameters in standard deviations of the prior to the builder's columns."""
     scale = URDF_ERROR * parameter_scale(robot.nominal)
     scale[:, parameters.FRICTION] = 0.0
     friction = _missing_friction_scale(samples, robot)
-    for body, found in enumerate(robot.bodies):
-        if found.joint is not None and found.joint.name in robot.joint_names:
-            scale[body, parameters.FRICTION] = friction[robot.joint_names.index(found.joint.name)]
+    for number, body in enumerate(robot.bodies):
+        if body.joint is not None and body.joint.name in robot.joint_names:
+            scale[number, parameters.FRICTION] = friction[robot.joint_names.index(body.joint.name)]
     massless = [body.massless for body in robot.bodies]
     scale[massless, parameters.INERTIAL] = 0.0
     kept = scale.flatten() > 0.0
@@ -111,58 +116,57 @@ def _prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]
 
 @torch.no_grad()
 def _whitened_rows(builder: RowBuilder, samples: Samples) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are equations."""
+    """Whitened rows (N, n_rows, columns + 1), their bases W (N, n_rows, n_rows), and which rows are not zero."""
     n_rows = builder.tree.n_rows
     rows, W = np.zeros((len(samples), n_rows, builder.width + 1)), np.zeros((len(samples), n_rows, n_rows))
     with one_thread():
         for state, index in chunks_by_state(samples):
-            where = index if isinstance(index, slice) else index.numpy()
-            found = builder.rows_by_sample(samples[index], state)
-            rows[where], W[where] = (x.numpy() for x in found)
+            numbers = index if isinstance(index, slice) else index.numpy()
+            rows[numbers], W[numbers] = (x.numpy() for x in builder.rows_by_sample(samples[index], state))
     return rows, W, np.asarray(np.abs(W).any(axis=1))
 
 
-def _accumulate_blocks(K: FloatArray, terms: FloatArray, equations: BoolArray) -> _NormalEquations:
-    """Products by blocks of samples (N, n_rows, P) and (N, n_rows, k)."""
-    inside, across, own = [], [], []
-    for part in np.array_split(np.arange(len(K)), BLOCKS):
-        A, Y = K[part].reshape(-1, K.shape[2]), terms[part].reshape(-1, terms.shape[2])
-        inside.append(A.T @ A)
-        across.append(A.T @ Y)
-        own.append(Y.T @ Y)
-    return _NormalEquations(np.array(inside), np.array(across), np.array(own), int(equations.sum()))
+def _accumulate_blocks(parts: Sequence[tuple[FloatArray, FloatArray, BoolArray]]) -> _NormalEquations:
+    """Normal equations of parts of a log: K (N, n_rows, P), Y (N, n_rows, k) and which rows are not zero."""
+    K, Y, equations = (np.concatenate(part) for part in zip(*parts, strict=True))
+    products = []
+    for block in np.array_split(np.arange(len(K)), BLOCKS):
+        A, B = K[block].reshape(-1, K.shape[2]), Y[block].reshape(-1, Y.shape[2])
+        products.append((A.T @ A, A.T @ B, B.T @ B))
+    KtK, KtY, YtY = (np.array(product) for product in zip(*products, strict=True))
+    return _NormalEquations(KtK, KtY, YtY, int(equations.sum()))
 
 
 # -------------------------------------------------------------------------------------------------------- scale of time
 
-#: Samples compared.
-SAMPLES = 240
-#: A stretch of time after which nothing moves.
-_STILL = 1e4
-#: Share of the power of positions within the band of the motion, the cutoff in that band, the least one in periods over
-#: the log, of which the filter spoils two at each end, and the largest one in the sample rate.
-_SHARE, _ABOVE, _PERIODS, _OF_RATE = 0.99, 6.0, 20.0, 0.2
-#: Stretches that are tried, evenly spread by their logarithm.
-_STRETCHES = np.geomspace(1e-4, 1e4, 1601)
-#: Size of what each joint's torque may hold in a way of its own, in what no parameters explain.
-_LOOSE = 3.0
-#: How far a factor of a torque may be from 1, and a wrench from its point [m], before the torques or wrenches are read.
-_GAIN, _POINT = 0.5, 0.3
+#: Samples that are compared.
+TIME_SCALE_SAMPLES = 240
+#: Factor of time at which accelerations vanish.
+_REST_FACTOR = 1e4
+#: Share of the power of positions within the bandwidth of the motion, the cutoff over that bandwidth, its minimum in
+#: periods per log (the filter spoils two at each end), and its maximum over the sample rate.
+_MOTION_POWER_SHARE, _CUTOFF_BANDWIDTHS, _MIN_CUTOFF_PERIODS, _MAX_CUTOFF_RATE_SHARE = 0.99, 6.0, 20.0, 0.2
+#: Factors of time that are tried.
+_TIME_FACTORS = np.geomspace(1e-4, 1e4, 1601)
+#: Prior of torque terms that the URDF lacks, over the unmodelled force.
+_JOINT_TERM_SCALE = 3.0
+#: Prior standard deviations of a torque's factor about 1, and of the point of wrenches about the contact frame.
+_GAIN_PRIOR_STD, _POINT_PRIOR_STD_M = 0.5, 0.3
 
 
 @dataclass(frozen=True)
 class TimeScale:
-    """What time should be multiplied by, of all samples and of each block, and what stays unexplained.
+    """Factor that time should be multiplied by, of all samples and of each block, and unexplained forces.
 
-    `corrected`, `recorded`, `still`: rms of what no URDF near the given one explains, in `UNMODELLED` of the forces:
-    with time so multiplied, as it is, and if nothing moved.
+    `corrected`, `recorded`, `at_rest`: rms residual of the best URDF near the given one, in `UNMODELLED_FORCE_SHARE` of
+    the forces, with the corrected time, with the recorded time, and for a robot at rest.
     """
 
     factor: float
     blocks: FloatArray
     corrected: float
     recorded: float
-    still: float
+    at_rest: float
 
 
 def _scale_time(log: Log, factor: float) -> Log:
@@ -171,72 +175,73 @@ def _scale_time(log: Log, factor: float) -> Log:
 
 
 def motion_cutoff_hz(log: Log) -> float | None:
-    """A cutoff [Hz] by the log's own motion, whatever its time is worth; None where no joint moves."""
+    """A cutoff [Hz] from the spectrum of the joint positions, for any unit of time; None where no joint moves."""
     position = log.joint_position[: 2 * (len(log) // 2)]
     power = np.square(np.abs(np.fft.rfft(position - position.mean(axis=0), axis=0))).sum(axis=1)
     power[0] = 0.0
     if not power.sum() > 0.0:
         return None
-    last = int(np.searchsorted(np.cumsum(power), _SHARE * power.sum()))
+    last = int(np.searchsorted(np.cumsum(power), _MOTION_POWER_SHARE * power.sum()))
     step = median_step(log)
-    return float(min(max(_ABOVE * last, _PERIODS) / (step * len(position)), _OF_RATE / step))
+    return float(
+        min(max(_CUTOFF_BANDWIDTHS * last, _MIN_CUTOFF_PERIODS) / (step * len(position)), _MAX_CUTOFF_RATE_SHARE / step)
+    )
 
 
 def fit_time_scale(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> TimeScale:
-    """How time would have to be multiplied for gravity and inertia to make up the forces.
+    """The factor of time at which gravity and inertia explain the forces best.
 
-    Derived velocities and accelerations scale with the inverse of time and its square, gravity does not: three
-    scales determine the predicted forces at all others.
+    Velocities and accelerations scale with the inverse of time and its square, gravity is constant: three factors
+    determine the predicted forces at all others.
 
     Raises:
-        InputError: the log cannot be filtered, or does not fit the robot.
+        InputError: the log cannot be filtered, or does not match the robot.
     """
 
-    def at(factor: float) -> list[Samples]:
-        logs = preprocess_pieces(_scale_time(log, factor), cutoff_hz / factor, DIFFERENTIATED_TO_TRY)
-        return bind_some_samples(logs, robot, contacts, SAMPLES)
+    def samples_at(factor: float) -> list[Samples]:
+        logs = preprocess_pieces(_scale_time(log, factor), cutoff_hz / factor, MAX_TRIAL_DIFFERENTIATED_SAMPLES)
+        return bind_some_samples(logs, robot, contacts, TIME_SCALE_SAMPLES)
 
-    now, later, still = at(1.0), at(2.0), at(_STILL)
-    builder = RowBuilder(robot, contacts, _measured_sensors(now, robot, contacts))
+    recorded, doubled, at_rest = samples_at(1.0), samples_at(2.0), samples_at(_REST_FACTOR)
+    builder = RowBuilder(robot, contacts, _measured_sensors(recorded, robot, contacts))
     parts = []
-    columns = _prior_columns(builder, robot, now)
+    columns = _prior_columns(builder, robot, recorded)
     phi = robot.nominal.flatten()[None]
-    for one, two, rest in zip(now, later, still, strict=True):
+    for one, two, rest in zip(recorded, doubled, at_rest, strict=True):
         rows, W, equations = _whitened_rows(builder, rest)
-        first, second, none = (force_series(builder, part, phi)[1][0] for part in (one, two, rest))
-        quadratic = 2.0 * (first - none) - 4.0 * (second - none)
-        terms = [none, first - none - quadratic, quadratic]
+        total, slower, gravity = (force_series(builder, part, phi)[1][0] for part in (one, two, rest))
+        quadratic = 2.0 * (total - gravity) - 4.0 * (slower - gravity)
+        terms = [gravity, total - gravity - quadratic, quadratic]
         projected = [rows[..., -1], *(np.einsum("nvr,nv->nr", W, term) for term in terms)]
         rate = one.joint_velocity
-        loose = _of_joints(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
-        K = np.concatenate([rows[..., :-1] @ columns, *loose], axis=2)
+        extra = _joint_terms(builder, W, torch.sign(rate), rate, one.joint_acceleration, torch.ones_like(rate))
+        K = np.concatenate([rows[..., :-1] @ columns, *extra], axis=2)
         parts.append((K, np.stack(projected, axis=2), equations))
-    found = _accumulate_blocks(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-    return _best(found)
+    return _best_factor(_accumulate_blocks(parts))
 
 
-def _of_joints(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
-    """Columns of what each joint's torque may hold beside the URDF's in proportion to values (N, n), of any size."""
+def _joint_terms(builder: RowBuilder, W: FloatArray, *values: torch.Tensor) -> list[FloatArray]:
+    """Columns of joint torques in proportion to values (N, n), scaled by the prior whatever the size of the values."""
     base = builder.tree.base_rows
     out = []
     for value in values:
         columns = W[:, base : base + value.shape[1]].transpose(0, 2, 1) * value.numpy()[:, None]
         size = np.sqrt(np.square(columns).mean(axis=(0, 1)))
-        out.append(_LOOSE * columns / np.where(size > 0.0, size, 1.0))
+        out.append(_JOINT_TERM_SCALE * columns / np.where(size > 0.0, size, 1.0))
     return out
 
 
-def _best(found: _NormalEquations) -> TimeScale:
-    u = np.stack([np.ones_like(_STRETCHES), -np.ones_like(_STRETCHES), -1 / _STRETCHES, -1 / _STRETCHES**2])
+def _best_factor(equations: _NormalEquations) -> TimeScale:
+    u = np.stack([np.ones_like(_TIME_FACTORS), -np.ones_like(_TIME_FACTORS), -1 / _TIME_FACTORS, -1 / _TIME_FACTORS**2])
 
     def cost(block: int | None) -> FloatArray:
-        return np.asarray(np.einsum("ks,kl,ls->s", u, found.unexplained(block), u))
+        return np.asarray(np.einsum("ks,kl,ls->s", u, equations.unexplained(block), u))
 
-    every = cost(None)
-    blocks = np.array([_STRETCHES[np.argmin(cost(block))] for block in range(BLOCKS)])
-    best, one = int(np.argmin(every)), int(np.argmin(np.abs(np.log(_STRETCHES))))
-    left = np.sqrt(np.maximum(every, 0.0) / max(found.rows, 1))
-    return TimeScale(float(_STRETCHES[best]), blocks, *(float(left[i]) for i in (best, one, -1)))
+    total = cost(None)
+    blocks = np.array([_TIME_FACTORS[np.argmin(cost(block))] for block in range(BLOCKS)])
+    best, unity = int(np.argmin(total)), int(np.argmin(np.abs(np.log(_TIME_FACTORS))))
+    residual = np.sqrt(np.maximum(total, 0.0) / max(equations.rows, 1))
+    return TimeScale(float(_TIME_FACTORS[best]), blocks, *(float(residual[i]) for i in (best, unity, -1)))
 
 
 # -------------------------------------------------------------------------- gains of torques, and the point of wrenches
@@ -244,13 +249,14 @@ def _best(found: _NormalEquations) -> TimeScale:
 
 @dataclass(frozen=True, eq=False)
 class TorqueGains:
-    """Factors of torques, and the point that wrenches are about, that a URDF near the given one needs.
+    """Factors of torques and the reference point of wrenches, by the best URDF near the given one.
 
     Attributes:
         joints: numbers of the m joints whose torque was measured.
-        gain: (m,) factors, `point` (3,) [m] in the contact frames.
+        gain: (m,) factors.
+        point: (3,) [m] in the contact frames.
         spread: (m + 3,) standard deviations of both.
-        blocks: (BLOCKS, m + 3), of blocks of time.
+        blocks: (BLOCKS, m + 3), both by block of time.
     """
 
     joints: np.ndarray
@@ -264,7 +270,7 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
     """Factors of single torques and the point of wrenches; None where neither was measured."""
     sensors = _measured_sensors(samples, robot, contacts)
     joints = np.flatnonzero(sensors.torque[: robot.n])
-    if not len(joints) and not _whole(sensors.wrench):
+    if not len(joints) and not _has_moments(sensors.wrench):
         return None
     builder = RowBuilder(robot, contacts, sensors)
     columns = _prior_columns(builder, robot, samples)
@@ -275,22 +281,21 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
         torque = np.zeros((len(part), builder.tree.base_rows + robot.n_dofs, len(joints)))
         for index, joint in enumerate(joints):
             torque[:, builder.tree.base_rows + joint, index] = builder.recorded_torque(part)[:, joint].numpy()
-        moved = np.concatenate([torque, _about(builder, part, sensors.wrench)], axis=2)
-        through = np.einsum("nvr,nvk->nrk", W, moved)
-        without = rows[..., -1] - through[..., : len(joints)].sum(axis=2)
-        target = rows[..., :-1] @ nominal - without
+        terms = np.concatenate([torque, _point_shift_forces(builder, part, sensors.wrench)], axis=2)
+        projected = np.einsum("nvr,nvk->nrk", W, terms)
+        contact_part = rows[..., -1] - projected[..., : len(joints)].sum(axis=2)
+        target = rows[..., :-1] @ nominal - contact_part
         rate = part.joint_velocity
-        loose = _of_joints(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
-        K = np.concatenate([rows[..., :-1] @ columns, *loose], axis=2)
-        parts.append((K, np.concatenate([target[..., None], through], axis=2), equations))
-    return _solved(_accumulate_blocks(*(np.concatenate(part) for part in zip(*parts, strict=True))), joints)
+        extra = _joint_terms(builder, W, torch.sign(rate), rate, torch.ones_like(rate))
+        K = np.concatenate([rows[..., :-1] @ columns, *extra], axis=2)
+        parts.append((K, np.concatenate([target[..., None], projected], axis=2), equations))
+    return _solve_gains(_accumulate_blocks(parts), joints)
 
 
-def _about(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> FloatArray:
-    """What wrenches about a point one unit off along each axis would add, (N, n_rows, 3)."""
-    n_rows = builder.tree.n_rows
-    out = np.zeros((len(samples), n_rows, 3))
-    if not _whole(measured):
+def _point_shift_forces(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> FloatArray:
+    """Change of the generalized forces with a shift of the wrenches' point along each axis, (N, n_rows, 3) [N/m]."""
+    out = np.zeros((len(samples), builder.tree.n_rows, 3))
+    if not _has_moments(measured):
         return out
     with torch.no_grad():
         terms = builder.dynamics(samples)
@@ -303,24 +308,24 @@ def _about(builder: RowBuilder, samples: Samples, measured: np.ndarray) -> Float
     return out
 
 
-def _whole(measured: np.ndarray) -> bool:
-    """Whether contacts (C, 6) are measured with all their moments."""
+def _has_moments(measured: np.ndarray) -> bool:
+    """Whether all forces and moments of the contacts (C, 6) are measured."""
     return bool(measured.size and measured.all())
 
 
-def _solved(found: _NormalEquations, joints: np.ndarray) -> TorqueGains:
+def _solve_gains(equations: _NormalEquations, joints: np.ndarray) -> TorqueGains:
     m = len(joints)
-    start = np.append(np.ones(m), np.zeros(3))
-    prior = np.append(np.full(m, _GAIN), np.full(3, _POINT)) ** -2.0
+    prior_mean = np.append(np.ones(m), np.zeros(3))
+    precision = np.append(np.full(m, _GAIN_PRIOR_STD), np.full(3, _POINT_PRIOR_STD_M)) ** -2.0
 
     def solve(block: int | None) -> tuple[FloatArray, FloatArray, float]:
-        G = found.unexplained(block)
-        H = G[1:, 1:] + np.diag(10.0 * prior)
-        x = np.linalg.solve(H, G[1:, 0] + 10.0 * prior * start)
-        left = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
-        return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(left)
+        G = equations.unexplained(block)
+        H = G[1:, 1:] + np.diag(CORRELATED_SAMPLES * precision)
+        x = np.linalg.solve(H, G[1:, 0] + CORRELATED_SAMPLES * precision * prior_mean)
+        residual = G[0, 0] - 2.0 * G[0, 1:] @ x + x @ G[1:, 1:] @ x
+        return np.asarray(x), np.asarray(np.diag(np.linalg.inv(H))), float(residual)
 
-    x, variance, left = solve(None)
-    size = max(1.0, left / max(found.rows, 1))
+    x, variance, residual = solve(None)
+    size = max(1.0, residual / max(equations.rows, 1))
     blocks = np.array([solve(block)[0] for block in range(BLOCKS)])
-    return TorqueGains(joints, x[:m], x[m:], np.sqrt(10.0 * size * variance), blocks)
+    return TorqueGains(joints, x[:m], x[m:], np.sqrt(CORRELATED_SAMPLES * size * variance), blocks)

@@ -1,4 +1,4 @@
-"""Time stamps, and samples that were not measured or cannot have been."""
+"""Time stamps, missing values, and values that no sensor can have measured."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from torchid.errors import format_count, join_names
 from torchid.log_checks.findings import (
     CONDEMNED,
-    LONG_STEP,
-    NO_SIGNALS,
+    MIN_GAP_STEPS,
+    NON_SIGNAL_FIELDS,
     NOTE,
     SUSPICIOUS,
     Finding,
@@ -25,40 +25,42 @@ from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_
 
 # --------------------------------------------------------------------------------------------------------------- values
 
-#: Share of NaN above which a channel counts as one that was not recorded, and not as one with holes.
-MOSTLY_THERE = 0.2
-#: Size in any unit that no quantity of a robot has: uninitialised memory, or an overflow.
-ABSURD = 1e12
+#: Share of NaN up to which a channel has holes; above it, the channel was not recorded.
+MAX_MISSING_SHARE = 0.2
+#: Size of a value in any unit; larger ones are uninitialised memory or an overflow.
+MAX_MAGNITUDE = 1e12
 
 
 def check_magnitudes(log: Log) -> Iterator[Finding]:
     """Findings about values larger than any quantity of a robot."""
     for field in log.arrays():
-        if field in NO_SIGNALS:
+        if field in NON_SIGNAL_FIELDS:
             continue
         values: FloatArray = getattr(log, field)
         flat = values.reshape(len(log), -1)
         with np.errstate(invalid="ignore"):
-            bad = np.abs(flat) > ABSURD
+            bad = np.abs(flat) > MAX_MAGNITUDE
         if not bad.any():
             continue
         names = channel_names(log, field)
         columns = np.flatnonzero(bad.any(axis=0))
         channels = tuple(names[column] for column in columns)
-        text = f"{join_names(channels)}: beyond {ABSURD:g}, in {format_count(int(bad.any(axis=1).sum()), 'sample')}"
-        rare = bad.any(axis=1).mean() <= MOSTLY_THERE
+        text = (
+            f"{join_names(channels)}: beyond {MAX_MAGNITUDE:g}, in {format_count(int(bad.any(axis=1).sum()), 'sample')}"
+        )
+        rare = bad.any(axis=1).mean() <= MAX_MISSING_SHARE
         spans = tuple(span for column in columns for span in find_spans(bad[:, column], names[column])) if rare else ()
         yield Finding("absurd", CONDEMNED, field, text, "look for uninitialised memory or an overflow", channels, spans)
 
 
 def check_missing_values(log: Log) -> Iterator[Finding]:
-    """Findings about NaN; of a contact, while it is active. Motion has to be known throughout, a force has not."""
+    """Findings about NaN, in wrenches while the contact is active. Motion must be known throughout, forces need not."""
     for field in log.arrays():
-        if field not in NO_SIGNALS:
-            yield from _missing(log, field)
+        if field not in NON_SIGNAL_FIELDS:
+            yield from _missing_findings(log, field)
 
 
-def _missing(log: Log, field: str) -> Iterator[Finding]:
+def _missing_findings(log: Log, field: str) -> Iterator[Finding]:
     array: FloatArray = getattr(log, field)
     names = channel_names(log, field)
     nan = np.isnan(array)
@@ -73,7 +75,7 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
     gone: dict[str, tuple[int, float]] = {}
     for column in np.flatnonzero(counts):
         share = counts[column] / relevant[column]
-        (holes if share <= MOSTLY_THERE else gone)[names[column]] = (int(column), share)
+        (holes if share <= MAX_MISSING_SHARE else gone)[names[column]] = (int(column), share)
     if holes:
         spans: tuple[Span, ...] = tuple(
             span for name, (column, _) in holes.items() for span in find_spans(nan[:, column], name)
@@ -87,28 +89,28 @@ def _missing(log: Log, field: str) -> Iterator[Finding]:
         yield Finding("not measured", CONDEMNED, field, text, advice, tuple(holes), spans)
     if gone:
         entire = all(share == 1.0 for _, share in gone.values())
-        how = "throughout" if entire else f"in {100 * max(share for _, share in gone.values()):.3g} % at most"
+        extent = "throughout" if entire else f"in {100 * max(share for _, share in gone.values()):.3g} % at most"
         needed = field not in NAN_ALLOWED
         if needed:
-            advice = "record it throughout, or leave the field out if something else gives this motion"
+            advice = "record it throughout, or leave the field out if other fields give this motion"
         else:
-            advice = "none, as long as it is not among the sensors" if entire else "leave it out of the sensors"
+            advice = "none, unless it is one of the sensors" if entire else "leave it out of the sensors"
         severity = CONDEMNED if needed else NOTE
-        yield Finding("not measured", severity, field, f"{join_names(list(gone))}: NaN {how}", advice, tuple(gone))
+        yield Finding("not measured", severity, field, f"{join_names(list(gone))}: NaN {extent}", advice, tuple(gone))
 
 
 # ---------------------------------------------------------------------------------------------------------- time stamps
 
-#: A median step [s] above which accelerations cannot be derived: robots move at 0.5 to 5 Hz.
-SLOWEST_STEP = 0.5
-#: Units that stamps are mistaken in, by how many there are in a second.
-_TICKS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
-#: Jitter, in median steps, that is not reported: 1e-3 of a step at 1 rad/s and 1 kHz is 1e-6 rad.
-WORTH_A_NOTE = 1e-3
-#: Deviations of a step, in rms deviations, by which samples are chosen to ask whether the motion follows the stamps.
-_STRONG = 3.0
-#: Share of the misfit against the stamps below which positions that were taken as uniform in time fit better.
-_BETTER = 0.5
+#: Median step above which accelerations cannot be derived: robots move at 0.5 to 5 Hz.
+MAX_MEDIAN_STEP_S = 0.5
+#: Wrong units of stamps, and their number per second.
+_TICKS_PER_S = {"ms": 1e3, "us": 1e6, "ns": 1e9}
+#: Rms jitter that is reported: 1e-3 of a step at 1 rad/s and 1 kHz is 1e-6 rad.
+MIN_JITTER_STEPS = 1e-3
+#: Change of a step, in rms deviations, at which motion and stamps are compared, and the samples that this needs.
+_MIN_DEVIATION_RMS, _MIN_COMPARED_SAMPLES = 3.0, 10
+#: Residual of positions with uniform stamps over that with the recorded stamps, below which the stamps jitter.
+_MAX_RESIDUAL_SHARE = 0.5
 
 
 def check_time_stamps(log: Log) -> Iterator[Finding]:
@@ -121,59 +123,59 @@ def check_time_stamps(log: Log) -> Iterator[Finding]:
         return
     steps = np.diff(log.time)
     median = float(np.median(steps))
-    if median > SLOWEST_STEP:
-        yield _slow(median)
-    long, short = steps > LONG_STEP * median, steps < SHORTEST_STEP * median
+    if median > MAX_MEDIAN_STEP_S:
+        yield _unit_finding(median)
+    long, short = steps > MIN_GAP_STEPS * median, steps < SHORTEST_STEP * median
     deviation = (steps - median)[~long] / median
     rms = float(np.sqrt(np.mean(np.square(deviation))))
-    if rms > WORTH_A_NOTE:
-        yield _jitter(log, steps / median, rms, float(np.max(np.abs(deviation))), long)
+    if rms > MIN_JITTER_STEPS:
+        yield _jitter_finding(log, steps / median, rms, float(np.max(np.abs(deviation))), long)
     if long.any():
-        yield _gaps(steps, median, long)
+        yield _gap_finding(steps, median, long)
     if short.any():
-        where = np.flatnonzero(short)
-        first = int(where[0])
-        below = f"{format_count(len(where), 'step')} below {SHORTEST_STEP:g} of the median"
-        text = f"{below}, the first of {steps[first]:.3g} s after sample {first}: noise is multiplied there"
-        spans = tuple(Span(int(i) + 1, int(i) + 1) for i in where)
+        numbers = np.flatnonzero(short)
+        first = int(numbers[0])
+        below = f"{format_count(len(numbers), 'step')} below {SHORTEST_STEP:g} of the median"
+        text = f"{below}, the first of {steps[first]:.3g} s after sample {first}: noise is amplified there"
+        spans = tuple(Span(int(i) + 1, int(i) + 1) for i in numbers)
         yield Finding("coincident stamps", CONDEMNED, "time", text, "drop one sample of each pair", spans=spans)
 
 
-def _slow(median: float) -> Finding:
-    likely = [unit for unit, ticks in _TICKS.items() if median / ticks <= SLOWEST_STEP]
-    guess = f"; are these {likely[0]}? Then {_TICKS[likely[0]] / median:.4g} Hz" if likely else ""
+def _unit_finding(median: float) -> Finding:
+    likely = [unit for unit, ticks in _TICKS_PER_S.items() if median / ticks <= MAX_MEDIAN_STEP_S]
+    guess = f"; are these {likely[0]}? Then {_TICKS_PER_S[likely[0]] / median:.4g} Hz" if likely else ""
     return Finding("unit", CONDEMNED, "time", f"median step {median:.4g} s{guess}", "convert the stamps to seconds")
 
 
-def _jitter(log: Log, steps: FloatArray, rms: float, largest: float, long: BoolArray) -> Finding:
-    found = f"rms {100 * rms:.2g} % of the median step, at most {100 * largest:.2g} %"
+def _jitter_finding(log: Log, steps: FloatArray, rms: float, largest: float, long: BoolArray) -> Finding:
+    text = f"rms {100 * rms:.2g} % of the median step, at most {100 * largest:.2g} %"
     advice = "none: a filter (preprocessing.cutoff_hz) interpolates to a uniform grid"
-    if _motion_ignores(log, steps, _STRONG * rms, long):
-        found += "; the positions do not follow: the stamps jitter, not the sampling"
+    if _is_uniformly_sampled(log, steps, _MIN_DEVIATION_RMS * rms, long):
+        text += "; the positions do not follow: the stamps jitter, not the sampling"
         advice = "replace the stamps by uniform ones, at the median rate"
-    return Finding("jitter", NOTE, "time", found, advice)
+    return Finding("jitter", NOTE, "time", text, advice)
 
 
-def _motion_ignores(log: Log, steps: FloatArray, strong: float, long: BoolArray) -> bool:
-    """Whether joint positions are smoother in the sample number than in the time stamps, where stamps are off most."""
+def _is_uniformly_sampled(log: Log, steps: FloatArray, deviation: float, long: BoolArray) -> bool:
+    """Whether joint positions are smoother by sample number than by time stamp, where steps change by `deviation`."""
     before, after = steps[:-1], steps[1:]
-    where = 1 + np.flatnonzero((np.abs(before - after) > strong) & ~long[:-1] & ~long[1:])
-    if len(where) < 10:  # too few to judge
+    numbers = 1 + np.flatnonzero((np.abs(before - after) > deviation) & ~long[:-1] & ~long[1:])
+    if len(numbers) < _MIN_COMPARED_SAMPLES:
         return False
-    ahead, behind = (log.joint_position[where + k] - log.joint_position[where] for k in (1, -1))
-    left, right = steps[where - 1, None], steps[where, None]
+    ahead, behind = (log.joint_position[numbers + k] - log.joint_position[numbers] for k in (1, -1))
+    left, right = steps[numbers - 1, None], steps[numbers, None]
     by_number = np.abs(ahead + behind)
     by_stamp = np.abs(2.0 * (ahead * left + behind * right) / (left + right))
-    return bool(by_number.sum() < _BETTER * by_stamp.sum())
+    return bool(by_number.sum() < _MAX_RESIDUAL_SHARE * by_stamp.sum())
 
 
-def _gaps(steps: FloatArray, median: float, long: BoolArray) -> Finding:
-    where, longest = np.flatnonzero(long), int(np.argmax(steps))
-    lost = int(np.round(steps[where] / median - 1.0).sum())
-    missing = f"{format_count(len(where), 'gap')}, {format_count(lost, 'sample')} missing"
-    found = f"{missing}; longest {steps[longest]:.4g} s after sample {longest}"
+def _gap_finding(steps: FloatArray, median: float, long: BoolArray) -> Finding:
+    numbers, longest = np.flatnonzero(long), int(np.argmax(steps))
+    lost = int(np.round(steps[numbers] / median - 1.0).sum())
+    missing = f"{format_count(len(numbers), 'gap')}, {format_count(lost, 'sample')} missing"
+    text = f"{missing}; longest {steps[longest]:.4g} s after sample {longest}"
     if steps[longest] > LONGEST_STEP * median:
-        advice = f"split the log after sample {longest}: no spline is drawn across more than {LONGEST_STEP:g} steps"
-        return Finding("gap", CONDEMNED, "time", found, advice)
+        advice = f"split the log after sample {longest}: no spline crosses more than {LONGEST_STEP:g} steps"
+        return Finding("gap", CONDEMNED, "time", text, advice)
     advice = f"keep preprocessing.cutoff_hz well below {0.5 / steps[longest]:.3g}: half a period fits in the gap then"
-    return Finding("gap", SUSPICIOUS, "time", found, advice, spans=tuple(Span(int(i), int(i) + 1) for i in where))
+    return Finding("gap", SUSPICIOUS, "time", text, advice, spans=tuple(Span(int(i), int(i) + 1) for i in numbers))

@@ -34,11 +34,11 @@ from torchid.logs.tables import table_blocks, table_size
 GIGABYTE = 1e9
 _ACCEPTED = "a plain array of numbers, truth values or text"
 _SAMPLE = re.compile(r"\bsample (\d+)")
-_SMALL = 4  # a cell of a table takes two characters at least, a number eight bytes
+_BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a number eight bytes
 
 
 def log_bytes(path: Path, limit: float) -> int:
-    """Bytes of a log's arrays, at most for a CSV file if that is below a limit, 0 for a bag, which is read whole.
+    """Bytes of a log's arrays: an upper bound for CSV files below a limit, 0 for bags, which are read whole.
 
     Raises:
         LogError: the file cannot be read.
@@ -48,27 +48,27 @@ def log_bytes(path: Path, limit: float) -> int:
         return 0
     with about_file(path):
         if kind is LogKind.TABLE:
-            most = _SMALL * path.stat().st_size
+            most = _BYTES_PER_LETTER * path.stat().st_size
             return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
         with open_container(path, whole=False) as container:
             return sum(container.declared_bytes().values())
 
 
 def count_samples_from(start: int, error: LogError) -> LogError:
-    """An error in a part of a log, with samples counted from the log's beginning."""
+    """An error in a part of a log, with samples counted from the start of the log."""
     found = _SAMPLE.sub(lambda match: f"sample {int(match[1]) + start}", error.found)
     return LogError(error.source, error.field, found.replace(" in all)", " near it)"), error.accepted)
 
 
 @dataclass
 class LogBlocks:
-    """An open log, of which nothing but the stamps is in memory.
+    """An open log; only its stamps are in memory.
 
     Attributes:
         source: the log's file name.
         names: arrays of text, by field.
         time: (N,) [s].
-        fields: everything else that has samples.
+        fields: all other fields with samples.
     """
 
     source: str
@@ -86,12 +86,12 @@ class LogBlocks:
         return 8 + sum(int(np.prod(x.shape[1:])) * x.dtype.itemsize for x in self.fields.values())
 
     def read(self, samples: slice, only: tuple[str, ...] | None = None) -> Log:
-        """Some samples as a log of their own, or just some fields of them with positions of 0.
+        """Some samples as a log, or only the fields `only` of them with positions of 0.
 
-        Signs of quaternions go on from those of the samples that were read before, if these reach up to them.
+        Signs of quaternions continue those of the samples before, if these were read last.
 
         Raises:
-            LogError: an invalid value; the message counts samples from the beginning.
+            LogError: an invalid value; the message counts samples from the start of the log.
         """
         with about_file(self.source):
             raw = self._raw(samples, only)
@@ -115,7 +115,7 @@ class LogBlocks:
         return raw
 
     def _continue_signs(self, quat: FloatArray, samples: slice) -> None:
-        """Give quaternions (M, 4) of some samples the sign that goes with those before."""
+        """Flip quaternions (M, 4) where their sign is not that of the samples before."""
         if self._last is not None:
             index, before = self._last
             if samples.start <= index + 1 and quat[max(index - samples.start, 0)] @ before < 0.0:
@@ -127,23 +127,23 @@ class LogBlocks:
 def open_log_blocks(path: Path, folder: Path) -> Iterator[LogBlocks]:
     """Open a log (.h5, .npz, .csv or .parquet).
 
-    An .h5 file is read where it is; others are unpacked, to files without a name in `folder`.
+    An .h5 file is read in place; others are unpacked to temporary files in `folder`.
 
     Raises:
-        LogError: the file is not what it should be.
+        LogError: the file is invalid.
         SpillError: there is no room in the folder.
     """
     with ExitStack() as stack:
         with about_file(path):
             if existing_log_kind(path) is LogKind.TABLE:
-                found = _of_table(path, folder)
+                names, fields = _open_table(path, folder)
             else:
-                found = _of_container(stack.enter_context(open_container(path, whole=False)), folder)
-            blocks = _checked(str(path), *found)
+                names, fields = _open_arrays(stack.enter_context(open_container(path, whole=False)), folder)
+            blocks = _check_blocks(str(path), names, fields)
         yield blocks
 
 
-def _of_container(container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
+def _open_arrays(container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a container."""
     given = list(container.declared_bytes())
     check_fields_given(given)
@@ -158,8 +158,8 @@ def _of_container(container: Container, folder: Path) -> tuple[dict[str, NDArray
     return names, fields
 
 
-def _of_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
-    """Text and arrays of a table, which is read once, from its beginning to its end."""
+def _open_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
+    """Text and arrays of a table, which is read once."""
     names: dict[str, NDArray[Any]] = {}
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
     for number, block in enumerate(table_blocks(path)):
@@ -181,8 +181,8 @@ def _is_text(name: str) -> bool:
     return name in NAME_FIELDS or SHAPES.get(name) == ()
 
 
-def _checked(source: str, names: dict[str, NDArray[Any]], fields: dict[str, LazyArray]) -> LogBlocks:
-    """The log, after all checks that need no values but the stamps."""
+def _check_blocks(source: str, names: dict[str, NDArray[Any]], fields: dict[str, LazyArray]) -> LogBlocks:
+    """The log, after all checks of names, shapes and stamps."""
     time = fields.pop("time")
     check_shape("time", _empty(time), SHAPES["time"], {})
     with reader_errors_explained("time", _ACCEPTED):

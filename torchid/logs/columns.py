@@ -19,7 +19,7 @@ from torchid.parameters import WRENCH_COMPONENTS
 #: The one column of text: the same in every row.
 TEXT_COLUMN = "imu_frame"
 _COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
-#: Characters in the name of a column, which holds that of a joint.
+#: Characters in the name of a column, which contains that of a joint.
 MAX_LETTERS = 2 * MAX_NAME
 
 _UNIT = re.compile(r"\[.*\]$|\(.*\)$")
@@ -40,7 +40,7 @@ class _Column:
 
 @dataclass(frozen=True)
 class TableLayout:
-    """Which columns make up which field.
+    """Columns of each field of a table.
 
     Attributes:
         names: names of joints, contacts and sensors, by field.
@@ -51,7 +51,7 @@ class TableLayout:
     columns: dict[str, tuple[str, ...]]
 
     def fields(self, samples: int, take: Callable[[str], NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """The arrays of a log file: `take` gives the values (N,) of a column, once."""
+        """The arrays of a log file; `take` returns the values (N,) of a column and is called once for each."""
         out: dict[str, NDArray[Any]] = {name: np.array(names, dtype=np.str_) for name, names in self.names.items()}
         for field, columns in self.columns.items():
             if field == TEXT_COLUMN:
@@ -72,7 +72,7 @@ def parse_header(texts: Sequence[str]) -> TableLayout:
     Joints, contacts and sensors are named by the columns of the first of their fields; the others have the same.
 
     Raises:
-        LogError: a column that is unknown, given twice, missing or too many.
+        LogError: a column is unknown, duplicate or missing, or there are too many.
     """
     if len(texts) > MAX_COLUMNS:
         raise LogError.at_field("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
@@ -102,10 +102,10 @@ def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, _Co
     if missing:
         accepted = f"every column of {_column_pattern(field)}; a cell may be empty where nothing was measured"
         raise LogError.at_field(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
-    stray = list(given.keys() - set(expected))
-    if stray:
+    extra = list(given.keys() - set(expected))
+    if extra:
         found = f"a {_KIND[_names_of(field)]} that the first field of its kind does not name"
-        raise LogError.at_field(f"column '{stray[0]}'", found, "the same names in all fields")
+        raise LogError.at_field(f"column '{extra[0]}'", found, "the same names in all fields")
 
 
 def _parse_column(text: str) -> _Column:
@@ -141,7 +141,7 @@ def column_names(field: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str,
 
 
 def _component_names(field: str) -> tuple[str, ...]:
-    """The values that the last part of a column's name may have; none for fields without components."""
+    """Possible last parts of a column's name; none for fields without components."""
     size = field_shape(field)[-1] if len(field_shape(field)) > 1 else None
     if size == 6:
         return WRENCH_COMPONENTS
@@ -151,12 +151,12 @@ def _component_names(field: str) -> tuple[str, ...]:
 
 
 def _column_pattern(field: str) -> str:
-    """The names of a field's columns in general, such as `ft_wrench.<sensor>.{fx, fy, fz, mx, my, mz}`."""
+    """Pattern of a field's column names, such as `ft_wrench.<sensor>.{fx, fy, fz, mx, my, mz}`."""
     of, components = _names_of(field), _component_names(field)
     return str(_Column(field, f"<{_KIND[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))
 
 
 def _names_of(field: str) -> str:
-    """The field with the names of a field's columns (`joint_names`, ...), or nothing."""
+    """The field with the names of a field's columns (`joint_names`, ...), or ""."""
     letter = next((x for x in field_shape(field)[1:2] if isinstance(x, str)), None)
     return next((name for name, of in NAME_FIELDS.items() if of == letter), "")

@@ -1,4 +1,4 @@
-"""Kinds of log files; containers of named arrays (.npz and HDF5), opened within limits and written whole."""
+"""Kinds of log files; containers of named arrays (.npz and HDF5): opening within limits, atomic writing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ READABLE = (*WRITABLE, *BAGS)
 
 
 class LogKind(Enum):
-    """What a file holds: named arrays, one column per scalar, or messages."""
+    """Content of a file: named arrays, one column per scalar, or messages."""
 
     ARRAYS = "arrays"
     TABLE = "table"
@@ -44,12 +44,12 @@ def existing_log_kind(path: Path) -> LogKind:
     """The kind of an existing log.
 
     Raises:
-        LogError: there is none, or its extension is unknown.
+        LogError: the file does not exist, or its extension is unknown.
     """
     if os.path.isdir(path):  # Path.is_dir raises where a name is too long
         if list_bag_files(path):
             return LogKind.BAG
-        raise LogError(path, "file", "a folder", f"a log ({', '.join(READABLE)}), or a folder that ROS 2 recorded")
+        raise LogError(path, "file", "a folder", f"a log ({', '.join(READABLE)}), or a folder recorded by ROS 2")
     kind = _kind(path, READABLE)
     if not os.path.isfile(path):
         found = "a pipe, a device or a socket" if os.path.exists(path) else "no such file"
@@ -58,16 +58,16 @@ def existing_log_kind(path: Path) -> LogKind:
 
 
 def new_log_kind(path: Path) -> LogKind:
-    """The kind of a log to be written.
+    """The kind of a new log.
 
     Raises:
-        LogError: no log with this extension is written.
+        LogError: its extension is unknown.
     """
     return _kind(path, WRITABLE)
 
 
 def list_bag_files(path: Path) -> list[Path]:
-    """The files of a bag: `path` itself, or those in the folder that ROS 2 recorded to."""
+    """The files of a bag: `path` itself, or those in a folder recorded by ROS 2."""
     if not os.path.isdir(path):
         return [path] if path.suffix.lower() in BAGS else []
     return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS[1:] and file.is_file())
@@ -82,12 +82,12 @@ def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:
 
 # ------------------------------------------------------------------------------------------------- containers of arrays
 
-#: Characters of another package's message that a message of ours repeats.
-_LONGEST_TEXT = 200
+#: Characters of another package's message that an error message quotes.
+_MAX_QUOTED = 200
 
 
 class Container(Protocol):
-    """An open file: what it declares, and its arrays one at a time."""
+    """An open file with named arrays."""
 
     def declared_bytes(self) -> dict[str, int]:
         """Declared bytes of each array, by name."""
@@ -96,18 +96,18 @@ class Container(Protocol):
         """The array `name`; text is an array of str or of UTF-8 bytes."""
 
     def lazy(self, name: str, folder: Path) -> LazyArray:
-        """The array `name`, not read before it is sliced; what has to be unpacked goes to a file in `folder`."""
+        """The array `name`, read where it is sliced; compressed arrays are unpacked to a file in `folder`."""
 
 
 @contextlib.contextmanager
 def reader_errors_explained(field: str, accepted: str) -> Iterator[None]:
-    """Turn whatever the readers raise on a damaged file, which no list covers, into a LogError."""
+    """Turn all exceptions of readers on a damaged file into a LogError."""
     try:
         yield
     except (TorchidError, Warning):
         raise
     except Exception as error:
-        text = excerpt(" ".join(str(error).split()), _LONGEST_TEXT)  # some readers quote the file
+        text = excerpt(" ".join(str(error).split()), _MAX_QUOTED)  # some readers quote the file
         raise LogError.at_field(field, f"cannot be read ({type(error).__name__}: {text})", accepted) from error
 
 
@@ -120,11 +120,11 @@ def _suffix(path: Path) -> str:
 
 @contextlib.contextmanager
 def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
-    """Open a .npz, .h5 or .hdf5 file; LogError where it is absent, of another kind, damaged or declares too much.
+    """Open a .npz, .h5 or .hdf5 file; LogError where it is missing, of another kind, damaged or too large.
 
     Args:
         path: the file.
-        whole: whether its arrays are to be read whole, and are refused if no memory holds them.
+        whole: whether its arrays will be read whole, which limits their size to `MAX_ARRAYS`.
     """
     suffix = _suffix(path)
     if not path.is_file():
@@ -148,7 +148,7 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
 
 @contextlib.contextmanager
 def atomic_output(path: Path) -> Iterator[Path]:
-    """A temporary name that becomes `path` when the block ends without an error: no half-written file is left.
+    """A temporary file that is renamed to `path` at the end of the block, unless an error occurs.
 
     Raises:
         LogError: the file cannot be written.
@@ -175,15 +175,16 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 # --------------------------------------------------------------------------------------------------- the container .npz
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-
-_PIECE = 2**22  # bytes that are unpacked at a time
-_ENTRY, _DIRECTORY = b"PK\x01\x02", 2**20  # how entries begin; bytes at the end of a file, that hold those of a log
+#: Bytes that are unpacked at a time, and bytes at the end of a file that contain the entries of a log's directory.
+_PIECE_BYTES, _DIRECTORY_BYTES = 2**22, 2**20
+#: First bytes of a directory entry.
+_ENTRY = b"PK\x01\x02"
 
 
 def _open_archive(path: Path) -> zipfile.ZipFile:
-    """Open a zip archive; ValueError if it has far too many entries, which `zipfile` takes seconds to list."""
+    """Open a zip archive; ValueError if it has too many entries, for which `zipfile` takes seconds."""
     with path.open("rb") as stream:
-        stream.seek(max(0, path.stat().st_size - _DIRECTORY))
+        stream.seek(max(0, path.stat().st_size - _DIRECTORY_BYTES))
         check_fields((), stream.read().count(_ENTRY))
     return zipfile.ZipFile(path)
 
@@ -206,10 +207,8 @@ class _Npz:
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`."""
         entry = self._entry(name)
-        with self._archive.open(entry) as stream:
-            array: NDArray[Any]
-            with _of_python_2():
-                array = np.lib.format.read_array(stream, allow_pickle=False)
+        with self._archive.open(entry) as stream, _python_2_headers_allowed():
+            array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
         return array
 
     def lazy(self, name: str, folder: Path) -> LazyArray:
@@ -220,7 +219,7 @@ class _Npz:
             if dtype.hasobject or not shape:
                 return self.load(name)
             unpacked = Spill(self._archive.filename, folder)
-            while data := stream.read(_PIECE):
+            while data := stream.read(_PIECE_BYTES):
                 unpacked.write(data)
         return unpacked.mapped(shape, dtype, fortran_order)
 
@@ -235,27 +234,27 @@ class _Npz:
 
 
 @contextlib.contextmanager
-def _of_python_2() -> Iterator[None]:
-    """Without a warning of headers that Python 2 wrote."""
+def _python_2_headers_allowed() -> Iterator[None]:
+    """Suppress warnings about headers written by Python 2."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         yield
 
 
 def _read_header(stream: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether in Fortran's order, and type of an array."""
+    """Shape, Fortran order and type of an array."""
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
-        raise ValueError(f"version {version} of the format, which numbers and names do not need")
-    with _of_python_2():
+        raise ValueError(f"version {version} of the format, which is not supported")
+    with _python_2_headers_allowed():
         return _HEADERS[version](stream)
 
 
 def _check_header(stream: Any, size: int) -> None:
-    """Refuse an array that is not as large as its entry: NumPy allocates what the header declares."""
+    """Raise ValueError unless the size in the header, which NumPy allocates, is that of the entry."""
     shape, _, dtype = _read_header(stream)
-    left = size - stream.tell()
-    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != left:
-        raise ValueError(f"{left} bytes for an array of shape {shape}, {dtype.itemsize} bytes each")
+    content = size - stream.tell()
+    if not dtype.hasobject and math.prod(shape) * dtype.itemsize != content:
+        raise ValueError(f"{content} bytes for an array of shape {shape}, {dtype.itemsize} bytes each")
     if dtype.kind in "US":
         check_names(shape)

@@ -1,4 +1,4 @@
-"""The log format: every field's name, shape and check, and a recording of them in memory."""
+"""The log format: name, shape and checks of every field; a recording in memory."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SHAPES: dict[str, FieldShape] = {
     "imu_angular_acceleration": ("N", 3),
 }
 
-#: Fields a file may hold in place of a `Log`'s own: another quaternion order or another frame.
+#: Fields of a file that are converted to those of a `Log`: another quaternion order or another frame.
 VARIANTS: dict[str, str] = {
     "base_quat_wxyz": "base_quat_xyzw",
     "base_linear_velocity_base": "base_linear_velocity_world",
@@ -64,14 +64,14 @@ NAN_ALLOWED = ("joint_torque", *WRENCHES, "ft_wrench")
 
 IMU_FIELDS = ("imu_frame", "imu_specific_force", "imu_angular_velocity")
 
-#: Fields that a field needs beside it.
+#: Fields that a field requires.
 REQUIRED_WITH: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("contact_active", *WRENCHES), ("contact_names", "contact_active")),
     "ft_wrench": ("ft_names",),
     **dict.fromkeys((*IMU_FIELDS, "imu_angular_acceleration"), IMU_FIELDS),
 }
 
-#: Pairs with the same content: a file gives at most one of each.
+#: Pairs with the same content: a file may have only one of each.
 EXCLUSIVE = (*VARIANTS.items(), WRENCHES)
 
 
@@ -84,7 +84,7 @@ class Log:
     Attributes:
         source: file name, for messages.
         time: (N,) [s], strictly increasing.
-        joint_names: n names; the joints' order is the file's.
+        joint_names: n names in the order of the file.
         joint_position: (N, n) [rad or m].
         joint_velocity: (N, n) [rad/s or m/s].
         joint_acceleration: (N, n) [rad/s^2 or m/s^2].
@@ -155,9 +155,9 @@ class Log:
         sizes = {"N": len(self.time)} | {NAME_FIELDS[name]: len(labels) for name, labels in self.names.items()}
         for name, array in self.arrays().items():
             check_shape(name, array, SHAPES[name], sizes)
-            wanted = np.dtype(np.bool_ if name == "contact_active" else np.float64)
-            if array.dtype != wanted:
-                raise LogError.at_field(name, f"values of type {array.dtype}", str(wanted))
+            accepted = np.dtype(np.bool_ if name == "contact_active" else np.float64)
+            if array.dtype != accepted:
+                raise LogError.at_field(name, f"values of type {array.dtype}", str(accepted))
         if all(getattr(self, name) is not None for name in WRENCHES):
             raise LogError.at_field(WRENCHES[1], f"given together with {WRENCHES[0]}", "one of the two")
 
@@ -198,11 +198,11 @@ class Log:
 
 
 class UnknownFieldError(LogError, UnknownNameError):
-    """A field of a log file that the log format does not know; the message lists the nearest that it knows."""
+    """An unknown field of a log file; the message lists similar known fields."""
 
 
 def field_shape(name: str) -> FieldShape:
-    """Shape of a field of a file, a `Log`'s own or one in its place."""
+    """Shape of a field of a file, variants included."""
     return SHAPES[VARIANTS.get(name, name)]
 
 
@@ -212,7 +212,7 @@ def is_quaternion(name: str) -> bool:
 
 
 def column_labels(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """The names of the columns of the field `name`, or nothing where they are plain components.
+    """Names of the columns of the field `name`; empty for fields without named columns.
 
     Args:
         name: the field.
@@ -222,11 +222,11 @@ def column_labels(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str,
     return names[of] if of in NAME_FIELDS else ()
 
 
-#: How far a quaternion's norm may be from 1 before it is refused rather than renormalised.
+#: Deviation of a quaternion's norm from 1 up to which it is normalised.
 QUATERNION_TOLERANCE = 1e-3
-#: How far the norm of a quaternion that was normalised may be from 1.
+#: Deviation of the norm of a normalised quaternion from 1.
 ROUNDING = 4.0 * np.finfo(np.float64).eps
-#: Size of a number in any unit, beyond all that anyone measures: products of several stay what float64 can hold.
+#: Size of a value in any unit: products of several stay within the range of float64.
 LARGEST = 1e30
 
 
@@ -234,7 +234,7 @@ def check_shape(name: str, array: NDArray[Any], letters: FieldShape, sizes: Mapp
     """Raise LogError unless `array` has the shape `letters`, whose known sizes are `sizes`."""
     expected = [sizes.get(letter, letter) if isinstance(letter, str) else letter for letter in letters]
     fits = array.ndim == len(expected) and all(
-        isinstance(want, str) or want == have for want, have in zip(expected, array.shape, strict=True)
+        isinstance(size, str) or size == actual for size, actual in zip(expected, array.shape, strict=True)
     )
     if not fits:
         named, sized = (f"({', '.join(map(str, shape))})" for shape in (letters, expected))
@@ -251,7 +251,7 @@ def to_float64(name: str, array: NDArray[Any]) -> FloatArray:
 
 
 def describe_element(index: tuple[int, ...], labels: tuple[str, ...]) -> str:
-    """An element of a field in words: its sample and, if it has one, its channel.
+    """An element of a field as text: sample and, if any, channel.
 
     Args:
         index: sample number, column, wrench component; as many as the field has axes.
@@ -280,9 +280,9 @@ def check_time(time: FloatArray) -> None:
     if not len(time):
         raise LogError.at_field("time", "no samples", "at least one sample")
     check_finite("time", time)
-    still = time[1:] <= time[:-1]
-    if still.any():
-        i = int(np.argmax(still))
+    not_increasing = time[1:] <= time[:-1]
+    if not_increasing.any():
+        i = int(np.argmax(not_increasing))
         found = f"{time[i + 1]} at sample {i + 1}, after {time[i]} at sample {i}"
         raise LogError.at_field("time", found, "strictly increasing seconds")
 
@@ -290,17 +290,17 @@ def check_time(time: FloatArray) -> None:
 def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) -> FloatArray:
     """The quaternions (N, 4) with a norm of exactly one, LogError at the first whose norm is not one.
 
-    With `allow_nan`, one that is NaN in part is NaN as a whole.
+    With `allow_nan`, quaternions with a NaN component become NaN.
     """
     check_finite(name, quat, allow_nan=allow_nan)
-    with np.errstate(over="ignore"):  # to a norm that is refused
+    with np.errstate(over="ignore"):  # an infinite norm is refused below
         norm = np.linalg.norm(quat, axis=1)
     bad = ~((np.abs(norm - 1.0) <= QUATERNION_TOLERANCE) | np.isnan(norm))
     if bad.any():
         i = int(np.argmax(bad))
         found = f"norm {norm[i]:.6g} at sample {i}"
         raise LogError.at_field(name, found, f"unit quaternions, to {QUATERNION_TOLERANCE:g}")
-    norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # what was normalised before stays as it is, to the last bit
+    norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # normalised quaternions stay bit for bit
     return np.asarray(quat / norm[:, None], dtype=np.float64)
 
 

@@ -1,4 +1,4 @@
-"""Preprocessing of a log: filter, differentiate and resample all channels alike; contact changes and missing data."""
+"""Preprocessing of a log: filter, differentiate and resample all channels; contact changes and missing data."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DERIVATIVE_CHAINS = (
     ("imu_angular_velocity", "imu_angular_acceleration"),
 )
 _ANGULAR = DERIVATIVE_CHAINS[2]
-#: A filtered quaternion whose norm falls below this turns faster than the filter lets pass.
+#: Norm of a filtered quaternion: below, the filter removes the rotation of the base.
 _MIN_QUATERNION_NORM = 0.5
 
 
@@ -52,9 +52,9 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
 
     Where a log is filtered or resampled, `contact_active` is held from the previous sample, a wrench counts as 0
     while its contact is inactive, and a torque or wrench channel that is NaN in some samples becomes NaN throughout.
-    In a filtered log a contact is active from 1/cutoff_hz before it truly is until 1/cutoff_hz after, for the filter
-    spreads its force that far: to project out a force that is 0 costs data, to overlook one that is not costs truth.
-    What a contact's sensor reads while nothing touches, its offset, is kept as recorded (`contact_unloaded`).
+    In a filtered log a contact is active from 1/cutoff_hz before its recorded start until 1/cutoff_hz after its end, as
+    the filter spreads its force over that time: an ignored force would bias the fit, a projected force of 0 would not.
+    Readings of contact sensors without contact, their offsets, are kept as recorded (`contact_unloaded`).
 
     Args:
         log: the log.
@@ -62,7 +62,7 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
         sample_rate_hz: sample rate [Hz] of the result, at most ten times the median one; None for the log's own.
 
     Returns:
-        The preprocessed log, sharing the memory of what did not change: `log` itself where nothing has to be done.
+        The preprocessed log, which shares the memory of unchanged fields: `log` itself where nothing has to be done.
 
     Raises:
         InputError: `cutoff_hz` or `sample_rate_hz` does not suit the log.
@@ -84,33 +84,33 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
 def make_timeline(
     time: FloatArray, differentiates: bool, cutoff_hz: float | None, sample_rate_hz: float | None
 ) -> Timeline | None:
-    """How samples move in `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
+    """The timeline of `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
     if cutoff_hz is None and sample_rate_hz is None and not differentiates:
         return None
     return lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates)
 
 
 def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
-    """Fields whose channels are to be without a gap, for they are filtered or resampled."""
+    """Fields that are filtered or resampled, and whose channels must therefore have no gap."""
     if timeline.low_pass is None and timeline.output is None:
         return []
     return [name for name in NAN_ALLOWED if getattr(log, name) is not None]
 
 
 def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> Log:
-    """What `preprocess` makes of a log, or of a part of one.
+    """A log, or a part of one, preprocessed to a timeline.
 
     Args:
         log: the log.
         timeline: stamps of it and of the result.
-        coverage: by field, of those that have to be gapless.
+        coverage: of fields that must have no gap.
     """
     with about_file(log.source):
         return dataclasses.replace(log, **_fields_on_timeline(log, timeline, coverage))
 
 
 def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:
-    """All that differs in the preprocessed log."""
+    """Fields that change in the preprocessed log."""
     fields: dict[str, Any] = {
         "time": log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.output_stamps,
     }
@@ -145,7 +145,7 @@ def lacks_derivatives(log: Log) -> bool:
 
 
 def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, FloatArray]:
-    """The quantities of a chain at the output's stamps: those given, and the derivatives that fill the gaps above."""
+    """The quantities of a chain at the output's stamps: the recorded ones, and derivatives for missing ones."""
     out: dict[str, FloatArray] = {}
     for i, name in enumerate(chain):
         values = getattr(log, name)
@@ -161,7 +161,7 @@ def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, Fl
 
 
 def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, FloatArray]:
-    """The orientation at the output's stamps, and the angular rates that the log does not give."""
+    """The orientation at the output's stamps, and angular rates that were not recorded."""
     check_finite("base_quat_xyzw", quat)
     smoothed = timeline.smooth(quat)
     if log.base_angular_velocity_base is not None:
@@ -183,7 +183,7 @@ def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, Fl
 
 # -------------------------------------------------------------------------------------------- fields that may have gaps
 
-#: Channels that are filtered together: as many as make the copies of a long log small against it.
+#: Channels that are filtered together: few, so that copies are small compared with a long log.
 _CHANNELS_TOGETHER = 4
 
 
@@ -204,7 +204,7 @@ class Coverage:
 
     @classmethod
     def empty(cls, channels: tuple[int, ...]) -> Coverage:
-        """Of no samples yet."""
+        """Coverage of no samples."""
         return cls(0, *(np.zeros(channels, dtype=np.intp) for _ in range(5)))
 
     def add(self, values: FloatArray, active: BoolArray | None) -> None:
@@ -223,7 +223,7 @@ class Coverage:
 
     @property
     def complete(self) -> BoolArray:
-        """Channels with a value wherever there is something to measure, unless there are none at all."""
+        """Channels with a value in all measurable samples, and in at least one sample."""
         return np.asarray((self.missing == 0) & (self.values > 0))
 
     @property

@@ -8,10 +8,10 @@ from torchid.logs.log import FloatArray
 
 
 def make_sign_continuous(quat: FloatArray) -> FloatArray:
-    """The same rotations without sign flips between neighbours, (N, 4) in any order; itself where it has none.
+    """The same rotations without sign flips between samples, (N, 4) in any order; `quat` itself where it has none.
 
-    q and -q are one rotation, but components that jump sign cannot be interpolated or filtered. Rows of NaN are passed
-    over.
+    q and -q are the same rotation, but components that change sign cannot be interpolated or filtered. Rows of NaN are
+    skipped.
     """
     known = ~np.isnan(quat).any(axis=1)
     if not known.all():
@@ -34,7 +34,7 @@ def rotate_to_world(quat_xyzw: FloatArray, vector_base: FloatArray) -> FloatArra
 
 
 def inverse_rotation(quat_xyzw: FloatArray) -> FloatArray:
-    """The rotations back, (N, 4), of unit quaternions (N, 4)."""
+    """Inverse rotations, (N, 4), of unit quaternions (N, 4)."""
     return quat_xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
 
 

@@ -1,4 +1,4 @@
-"""Read a log file, check everything in it, bring it to canonical frames and orders; write one."""
+"""Read a log file, check it, convert it to canonical frames and orders; write a log file."""
 
 from __future__ import annotations
 
@@ -62,20 +62,20 @@ def read_log(
 
     Args:
         path: the file; of a ROS 2 bag also its folder.
-        topics: of a bag (.bag, .mcap, .db3), which holds what; nothing else needs them.
+        topics: topics of a bag (.bag, .mcap, .db3).
         progress: called with the share of a bag that has been read.
-        allow_gaps: take NaN in poses and their derivatives too, for `torchid.check` to find.
+        allow_gaps: accept NaN in poses and their derivatives, which `torchid.check` reports.
 
     Raises:
-        LogError: one line that names the file, the field, what was found and what is accepted.
+        LogError: one line with the file, the field, its value and the accepted values.
 
     Warns:
-        TorchidWarning: of a bag, that messages carry no time or come twice, or that a channel is NaN in some of them.
+        TorchidWarning: messages of a bag without time stamps, duplicate messages, or channels that are NaN in some.
     """
     with during("reading", os.fspath(path)):
         kind = existing_log_kind(Path(path))
         if kind is LogKind.ARRAYS:
-            raw = _arrays(Path(path))
+            raw = _read_arrays(Path(path))
         else:
             raw = read_table(Path(path)) if kind is LogKind.TABLE else read_bag(Path(path), topics, progress)
             check_fields_given(raw)
@@ -83,18 +83,18 @@ def read_log(
 
 
 def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
-    """The log of the fields of a file, in canonical frames and orders, LogError where one is not what it should be."""
-    return _canonical(_checked(raw, allow_gaps))
+    """The log of the fields of a file, in canonical frames and orders; LogError for invalid fields."""
+    return _to_canonical(_check_values(raw, allow_gaps))
 
 
 def check_fields_given(names: Collection[str]) -> None:
-    """Raise LogError unless the names of a file's fields are known and go together."""
+    """Raise LogError for unknown or missing fields, and for invalid combinations."""
     _check_names(names)
     _check_combination(names)
 
 
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a .npz or HDF5 file, none of them before all names are known to be right."""
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a .npz or HDF5 file; all names are checked first."""
     with open_container(path) as container:
         names = list(container.declared_bytes())
         check_fields_given(names)
@@ -118,11 +118,11 @@ def _check_names(names: Collection[str]) -> None:
 
 def _check_combination(names: Collection[str]) -> None:
     """Raise LogError on fields that exclude each other, or that need a field that is missing."""
-    for one, other in EXCLUSIVE:
-        if one in names and other in names:
-            raise LogError.at_field(one, f"given together with {other}", "one of the two")
-    for name, others in REQUIRED_WITH.items():
-        missing = [other for other in others if other not in names]
+    for first, second in EXCLUSIVE:
+        if first in names and second in names:
+            raise LogError.at_field(first, f"given together with {second}", "one of the two")
+    for name, required in REQUIRED_WITH.items():
+        missing = [field for field in required if field not in names]
         if name in names and missing:
             raise LogError.at_field(name, f"given without {missing[0]}", f"{name} together with {missing[0]}")
     for name, canonical in VARIANTS.items():
@@ -131,8 +131,8 @@ def _check_combination(names: Collection[str]) -> None:
             raise LogError.at_field(name, "given without the base's orientation", accepted)
 
 
-def _checked(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:
-    """Every field of the file in its canonical type, each checked by itself and against the sizes N, n, C."""
+def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:
+    """All fields of the file in their canonical types, with shapes and values checked."""
     names = {name: parse_names(name, raw[name]) if name in raw else () for name in NAME_FIELDS}
     check_shape("time", raw["time"], SHAPES["time"], {})
     sizes = {"N": len(raw["time"])} | {NAME_FIELDS[name]: len(labels) for name, labels in names.items()}
@@ -155,8 +155,8 @@ def _checked(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, Any]:
     return fields
 
 
-def _canonical(fields: dict[str, Any]) -> Log:
-    """The log with the file's variants brought to canonical order and frames."""
+def _to_canonical(fields: dict[str, Any]) -> Log:
+    """The log with the variants of the file converted to canonical order and frames."""
     if "base_quat_wxyz" in fields:
         fields["base_quat_xyzw"] = np.roll(fields.pop("base_quat_wxyz"), -1, axis=1)
     if "base_quat_xyzw" in fields:
@@ -164,15 +164,15 @@ def _canonical(fields: dict[str, Any]) -> Log:
         fields["base_quat_xyzw"] = quat
         for name, canonical in VARIANTS.items():
             if name in fields:
-                turn = rotate_to_world if name.endswith("_base") else rotate_to_base
-                fields[canonical] = turn(quat, fields.pop(name))
+                rotate = rotate_to_world if name.endswith("_base") else rotate_to_base
+                fields[canonical] = rotate(quat, fields.pop(name))
     return Log(source=current_file(), **fields)
 
 
 def write_log(log: Log, path: str | os.PathLike[str]) -> None:
-    """Write `log` to a .npz, .h5, .hdf5, .csv or .parquet file that `read_log` gives back unchanged.
+    """Write `log` to a .npz, .h5, .hdf5, .csv or .parquet file, from which `read_log` returns the same log.
 
-    The file appears complete or not at all: it is written under a temporary name in its folder, then renamed.
+    The file is written under a temporary name in its folder, then renamed.
 
     Raises:
         LogError: the extension is unknown or the file cannot be written.
@@ -181,7 +181,7 @@ def write_log(log: Log, path: str | os.PathLike[str]) -> None:
     arrays: dict[str, NDArray[Any]] = {
         name: array
         for name, array in log.arrays().items()
-        if 0 not in array.shape[1:] or name == "joint_position"  # what there is none of needs no field
+        if 0 not in array.shape[1:] or name == "joint_position"  # empty fields are not written
     }
     for name, names in log.names.items():
         if names or name == "joint_names":

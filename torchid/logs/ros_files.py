@@ -1,4 +1,4 @@
-"""Readers of the files of bags, ROS 1, SQLite and MCAP: channels and records, within limits on what they cost."""
+"""Readers of bag files (ROS 1, SQLite, MCAP): channels and records, with limits on time and memory."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from torchid.guards import MAX_RECORD, MAX_TOPICS, Budget, require_plain_name
 
 @dataclass(frozen=True)
 class Channel:
-    """What a topic carries: a message type such as `sensor_msgs/msg/Imu`, and how it is serialized (cdr, ros1)."""
+    """A topic with its message type, such as `sensor_msgs/msg/Imu`, and its serialization (cdr, ros1)."""
 
     topic: str
     type: str
     encoding: str
 
     def __post_init__(self) -> None:
-        """Refuse what no message can show."""
+        """Refuse unprintable and too long names."""
         for text in (self.topic, self.type, self.encoding):
             require_plain_name(text)
 
 
 @dataclass(frozen=True)
 class Record:
-    """One message as it lies in the file: when it was received [ns], and the share of the file read up to it."""
+    """One serialized message: its time of receipt [ns], and the share of the file read so far."""
 
     topic: str
     received: int
@@ -58,7 +58,7 @@ class BagFile(Protocol):
         """Close the file."""
 
     def channels(self) -> list[Channel]:
-        """All topics, some of them perhaps several times."""
+        """All topics, possibly with duplicates."""
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
         """The messages of some topics, in any order."""
@@ -70,7 +70,7 @@ _KNOWN: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: McapChannel, Op
 
 
 class McapFile:
-    """An MCAP file, read from front to back: it needs no index, and its chunks are never expanded unchecked."""
+    """An MCAP file, read sequentially without its index; the size of each unpacked chunk is limited."""
 
     def __init__(self, path: Path) -> None:
         """Open the file."""
@@ -96,15 +96,15 @@ class McapFile:
 
     def records(self, topics: Collection[str]) -> Iterator[Record]:
         """The messages of some topics."""
-        wanted: dict[int, str] = {}
+        selected: dict[int, str] = {}
         budget = Budget(self._size)
         for record in self._scan(True, budget):
             if isinstance(record, McapChannel) and record.topic in topics:
-                wanted[record.id] = record.topic
-            elif isinstance(record, Message) and record.channel_id in wanted:
+                selected[record.id] = record.topic
+            elif isinstance(record, Message) and record.channel_id in selected:
                 budget.spend_message()
                 share = self._stream.tell() / self._size
-                yield Record(wanted[record.channel_id], record.log_time, record.data, share)
+                yield Record(selected[record.channel_id], record.log_time, record.data, share)
 
     def _scan(self, messages: bool, budget: Budget) -> Iterator[Schema | McapChannel | Message]:
         """The records of the file and of its chunks."""
@@ -122,9 +122,9 @@ class McapFile:
 
 
 def _records(stream: BinaryIO, whole: bool, messages: bool, budget: Budget) -> Iterator[Any]:
-    """Schemas, channels, chunks and, with `messages`, messages, but no other records; of a file, up to the footer.
+    """Schemas, channels, chunks and, with `messages`, messages; `whole` files must end with a footer.
 
-    mcap's own loop also reads attachments, and takes minutes for the zeros that a crash may leave in a file.
+    The reader of mcap also reads attachments, and takes minutes for zeros that a crash may leave in a file.
     """
     while head := stream.read(_HEAD.size):
         budget.spend_record()
@@ -148,7 +148,7 @@ def _records(stream: BinaryIO, whole: bool, messages: bool, budget: Budget) -> I
 
 
 def _full_name(name: str) -> str:
-    """A message type as ROS 2 spells it; ROS 1 leaves the `msg` out."""
+    """A message type in the notation of ROS 2; ROS 1 omits `msg`."""
     package, _, message = name.partition("/")
     return f"{package}/msg/{message}" if message and "/" not in message else name
 
@@ -157,17 +157,17 @@ _ROS1_MAGIC = b"#ROSBAG V2.0\n"
 
 
 class _Reader(rosbag1.Reader):
-    """The reader of rosbags, which has no limits, with limits on the size of an unpacked chunk and of the index."""
+    """The reader of rosbags with limits on the size of unpacked chunks and of the index."""
 
     _index_bytes = 0
 
     def __init__(self, path: Path) -> None:
-        """Start with nothing unpacked."""
+        """Prepare the reader; `open` reads the index."""
         super().__init__(path)
         self.budget = Budget(path.stat().st_size)
 
     def read_chunk(self) -> Any:
-        """As before, with a decompressor that stops."""
+        """As in rosbags, with a limited decompressor."""
         stream: Any = self.bio
         start = stream.tell()
         chunk = super().read_chunk()
@@ -180,7 +180,7 @@ class _Reader(rosbag1.Reader):
         )
 
     def read_index_data(self, pos: int, indexes: Any) -> None:
-        """As before, but every part of the index once."""
+        """As in rosbags, with a limit on the total size of the index."""
         stream: Any = self.bio
         start = stream.tell()
         super().read_index_data(pos, indexes)
@@ -194,7 +194,7 @@ class Ros1File:
 
     def __init__(self, path: Path) -> None:
         """Open the file and read its index."""
-        with path.open("rb") as stream:  # of which the reader would read a whole line, however long
+        with path.open("rb") as stream:  # the reader would read a whole line of any length
             if stream.read(len(_ROS1_MAGIC)) != _ROS1_MAGIC:
                 raise ValueError("no bag of ROS 1 in version 2.0")
         self._reader = _Reader(path)
@@ -214,14 +214,14 @@ class Ros1File:
         """The messages of some topics."""
         connections = [x for x in self._reader.connections if x.topic in topics]
         total = max(sum(x.msgcount for x in connections), 1)
-        if connections:  # rosbags takes none for all
+        if connections:  # for an empty list, rosbags reads all
             for i, (connection, received, data) in enumerate(self._reader.messages(connections)):
                 self._reader.budget.spend_message()
                 yield Record(connection.topic, received, data, i / total)
 
 
 class SqliteFile:
-    """A .db3 file: tables of topics and messages; views and computed columns, which could run forever, are refused."""
+    """A .db3 file: tables of topics and messages; views and computed columns, which may never end, are refused."""
 
     def __init__(self, path: Path) -> None:
         """Open the file, which may be on a read-only disk."""
@@ -237,10 +237,10 @@ class SqliteFile:
         self._connection.close()
 
     def _check_plain(self, table: str) -> None:
-        """Refuse what only looks like a table: a view or a computed column could go on forever."""
+        """Refuse views and computed columns, which may never end."""
         query = "SELECT type, sql FROM sqlite_master WHERE name = ?"
-        found = self._connection.execute(query, (table,)).fetchone()
-        if found is None or found[0] != "table" or not str(found[1]).upper().startswith("CREATE TABLE"):
+        entry = self._connection.execute(query, (table,)).fetchone()
+        if entry is None or entry[0] != "table" or not str(entry[1]).upper().startswith("CREATE TABLE"):
             raise ValueError(f"no table '{table}'")
         columns = self._connection.execute(f"PRAGMA table_xinfo({table})").fetchall()
         if any(hidden for *_, hidden in columns):
@@ -270,10 +270,10 @@ class SqliteFile:
 
 
 def _decompress_chunk(data: bytes, compression: str, budget: Budget) -> bytes:
-    """The chunk as it was before compression by `compression`: bz2, lz4, zstd, or nothing for none.
+    """The unpacked chunk; `compression` is bz2, lz4, zstd, or "" or none.
 
     Raises:
-        ValueError: another compression, or more bytes than the budget of the file has left.
+        ValueError: another compression, or more bytes than the remaining budget of the file.
     """
     limit = budget.next_chunk_bytes()
     if compression in ("", "none"):

@@ -1,4 +1,4 @@
-"""Decoders of each message type to rows of numbers, and the messages of one topic as a time series."""
+"""Decoders of message types to rows of numbers, and time series of the messages of a topic."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Decoder(Protocol):
 
 
 def make_deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
-    """The function that deserializes the messages of a channel, by the definitions of ROS, never those in the bag.
+    """The function that deserializes the messages of a channel, by the definitions of ROS, not those in the bag.
 
     Raises:
-        LogError: they are not serialized as ROS does.
+        LogError: an unknown serialization.
     """
     store = _typestore(channel.encoding)
     if store is None:
@@ -63,7 +63,7 @@ def _typestore(encoding: str) -> Any:
 
 
 class _Constant:
-    """A text that all messages of a topic have to share."""
+    """A text that must be the same in all messages of a topic."""
 
     def __init__(self, topic: str, field: str) -> None:
         self._topic, self._field, self.value = topic, field, ""
@@ -82,7 +82,7 @@ class JointStates:
     types: tuple[str, ...] = ("sensor_msgs/msg/JointState",)
 
     def __init__(self, topic: str, joints: list[str] | None) -> None:
-        """Take the given joints, or those of the first message."""
+        """Use the given joints, or those of the first message."""
         self.names = tuple(joints or ())
         self._given, self._topic = joints is not None, topic
         self._parts: tuple[str, ...] = ()
@@ -90,12 +90,12 @@ class JointStates:
 
     @property
     def other_joints(self) -> tuple[str, ...]:
-        """Joints of messages that were left out."""
+        """Joints of skipped messages."""
         left_out = (names for names, order in self._orders.items() if order is None)
         return tuple(dict.fromkeys(name for names in left_out for name in names))
 
     def row(self, message: Any) -> FloatArray | None:
-        """Position, then velocity and effort where there are any, of every joint; None for other joints' messages."""
+        """Position, velocity and effort, as far as present, of every joint; None for messages of other joints."""
         names = tuple(message.name)
         if names not in self._orders:
             check_names([len(names)])
@@ -133,7 +133,7 @@ class JointStates:
             accepted = f"all {len(self.names)} joints in every message, or joint_states.joints with those that are"
             raise LogError.at_field(self._topic, found, accepted)
         order = [known[name] for name in self.names]
-        return slice(None) if order == list(range(len(names))) else order  # which need not be copied
+        return slice(None) if order == list(range(len(names))) else order  # a slice avoids a copy
 
     def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
         """Fields (N, n)."""
@@ -197,7 +197,7 @@ class Wrench:
     types: tuple[str, ...] = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 
     def __init__(self, topic: str, sign: int) -> None:
-        """With the sign that makes it the environment's or the parent side's action."""
+        """With the sign that turns it into the action of the environment or of the parent side."""
         self.frame, self._sign = _Constant(topic, "header.frame_id"), sign
 
     def row(self, message: Any) -> FloatArray:
@@ -238,7 +238,7 @@ Stamps = NDArray[np.int64]
 class TopicSeries:
     """The messages of one topic: stamps (N,) [ns], strictly increasing, and the fields of a log (N, ...).
 
-    `stamped`: whether the stamps are the messages' own, and not the times of receipt.
+    `stamped`: whether the stamps are those of the messages, not the times of receipt.
     """
 
     topic: str
@@ -248,15 +248,15 @@ class TopicSeries:
 
 
 class TopicMessages:
-    """Messages of a topic as they arrive."""
+    """Messages of a topic in the order of receipt."""
 
     def __init__(self, topic: str, decoder: Decoder) -> None:
-        """Start without any."""
+        """Start without messages."""
         self.topic, self._decoder = topic, decoder
         self._stamps, self._received, self._values = array("q"), array("q"), array("d")
 
     def add(self, message: Any, received: int) -> None:
-        """Take a message in that was received at a time [ns]."""
+        """Add a message with its time of receipt [ns]."""
         row = self._decoder.row(message)
         if row is None:
             return
@@ -268,14 +268,14 @@ class TopicMessages:
             raise LogError.at_field(self.topic, "more messages than fit", f"{MAX_ARRAYS} bytes")
 
     def to_series(self) -> TopicSeries:
-        """All messages in the order of their stamps, each once.
+        """All messages in the order of their stamps, without duplicates.
 
         Raises:
-            LogError: there are none, or some have the same stamp and different content.
+            LogError: there are no messages, or several with the same stamp and different content.
             UnknownNameError: no message has the joints of `logs.topics.joint_states.joints`.
 
         Warns:
-            TorchidWarning: messages come twice.
+            TorchidWarning: duplicate messages.
         """
         if not self._stamps and isinstance(self._decoder, JointStates) and self._decoder.other_joints:
             index, (name, *_) = "logs.topics.joint_states.joints", self._decoder.names

@@ -1,4 +1,4 @@
-"""Read a bag: pick topics, decode their messages, bring them to common stamps, name them as a log does."""
+"""Read a bag: decode the messages of its topics, align them to common stamps, return the fields of a log."""
 
 from __future__ import annotations
 
@@ -37,30 +37,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class _CommonClock:
-    """The stamps (N,) [ns] of a log: those of one topic within the time that all topics cover."""
+    """The stamps (N,) [ns] of a log: those of one topic in the interval that all topics cover."""
 
     stamps: Stamps
 
     @property
     def time(self) -> FloatArray:
-        """Stamps (N,) [s], counted from the first: a float64 since 1970 would resolve no less than 0.2 us."""
+        """Stamps (N,) [s] from the first on: float64 seconds since 1970 would have a resolution of 0.2 us."""
         return self.seconds(self.stamps)
 
     def seconds(self, stamps: Stamps) -> FloatArray:
-        """Other stamps (K,) [ns] in seconds of this clock."""
+        """Stamps (K,) [ns] of a topic in seconds of this clock."""
         return (stamps - self.stamps[0]) / 1e9
 
     def align(self, series: TopicSeries) -> dict[str, FloatArray]:
-        """The fields of a topic at the log's stamps: as they are where it has these, by a quintic spline elsewhere.
+        """The fields of a topic at the log's stamps: unchanged for equal stamps, else by a quintic spline.
 
         Quaternions are interpolated as in `preprocess`, component by component without sign flips, then normalised.
-        What is NaN throughout stays so; what is NaN in part becomes NaN throughout.
+        A channel with any NaN becomes NaN throughout.
 
         Raises:
-            LogError: too long a gap in a topic that has to be interpolated.
+            LogError: too long a gap in a topic that must be interpolated.
 
         Warns:
-            TorchidWarning: a field is NaN in part.
+            TorchidWarning: a field is NaN in some samples.
         """
         first, last = np.searchsorted(series.stamps, self.stamps[[0, -1]])
         if np.array_equal(series.stamps[first : last + 1], self.stamps):
@@ -73,7 +73,7 @@ class _CommonClock:
         return np.asarray(values[np.searchsorted(series.stamps, self.stamps, side="right") - 1])
 
     def _unbroken(self, series: TopicSeries) -> slice:
-        """The samples around the log's time without a gap across which an interpolation would invent what happened."""
+        """The samples around the log's time, checked for gaps that are too long to be interpolated."""
         steps = np.diff(series.stamps)
         long = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) if len(steps) else steps
         inside = long[(series.stamps[long + 1] > self.stamps[0]) & (series.stamps[long] < self.stamps[-1])]
@@ -114,12 +114,12 @@ def _make_common_clock(
     Raises:
         LogError: there are none.
     """
-    everyone = {**others, **events}
-    start = max(series.stamps[0] for series in everyone.values())
+    topics = {**others, **events}
+    start = max(series.stamps[0] for series in topics.values())
     stop = min(series.stamps[-1] for series in others.values())
     stamps = rate.stamps[(rate.stamps >= start) & (rate.stamps <= stop)]
     if not len(stamps):
-        late = max(everyone.values(), key=lambda series: int(series.stamps[0]))
+        late = max(topics.values(), key=lambda series: int(series.stamps[0]))
         early = min(others.values(), key=lambda series: int(series.stamps[-1]))
         found = (
             f"{late.topic} starts at {late.stamps[0] / 1e9:.3f} s, {early.topic} ends at {early.stamps[-1] / 1e9:.3f} s"
@@ -128,10 +128,8 @@ def _make_common_clock(
     return _CommonClock(stamps)
 
 
-#: What bags of any kind are read with.
+#: Packages that read bags.
 _PACKAGES = ("rosbags", "mcap", "lz4", "zstandard")
-
-
 _EVENT = "contact_active"
 #: Messages between two reports of progress, and topics that a message lists.
 _REPORT_EVERY, _LISTED = 1000, 30
@@ -139,7 +137,7 @@ _REPORT_EVERY, _LISTED = 1000, 30
 
 @dataclass
 class _Bag:
-    """A bag with what its topics are used for; several roles may share a topic."""
+    """A bag with the roles of its topics; several roles may share a topic."""
 
     topics: Topics
     channels: Mapping[str, Channel]
@@ -147,7 +145,7 @@ class _Bag:
     rows: dict[str, TopicMessages] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Look every topic up."""
+        """Check that every topic exists and has a suitable type."""
         for role, topic in self.topics.by_role.items():
             if topic.topic is None:
                 continue
@@ -167,7 +165,7 @@ def read_bag(
 
     Args:
         path: a .bag, .mcap or .db3 file, or the folder of several.
-        topics: which hold what.
+        topics: roles of the topics.
         progress: called with the share that has been read.
 
     Raises:
@@ -175,8 +173,8 @@ def read_bag(
         UnknownNameError: it has no such topic.
 
     Warns:
-        TorchidWarning: messages without stamps, messages that come twice, channels that are NaN in part, a frame that
-            is not the one expected, or where none is configured.
+        TorchidWarning: messages without stamps, duplicate messages, channels that are NaN in some messages, a frame
+            that is not the expected one, or a frame without an expected one.
     """
     files = list_bag_files(path)
     if topics is not None:
@@ -196,8 +194,8 @@ def read_bag(
     series = {role: rows.to_series() for role, rows in bag.rows.items()}
     unstamped = dict.fromkeys(x.topic for x in series.values() if not x.stamped)
     if unstamped:
-        what = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
-        warn_about_file(f"{', '.join(unstamped)}: {what}")
+        problem = "no stamps in the messages: the log takes the times of receipt, which are late and uneven"
+        warn_about_file(f"{', '.join(unstamped)}: {problem}")
     sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
     events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
     clock = _make_common_clock(sampled[topics.rate_topic], sampled, events)
@@ -214,11 +212,11 @@ def _open_bag_file(path: Path) -> Iterator[BagFile]:
     """Open a .bag, .mcap or .db3 file.
 
     Raises:
-        LogError: it is damaged, and so does what is read later; or its reader is not installed.
+        LogError: it is damaged, also where this shows in later reads; or its reader is not installed.
     """
     suffix = path.suffix.lower()
     try:
-        # here: only those who read bags need the libraries of its readers
+        # imported here: the libraries are an optional extra
         from torchid.logs.ros_files import McapFile, Ros1File, SqliteFile
     except ImportError as error:
         absent = [name for name in _PACKAGES if name == error.name or find_spec(name) is None]
@@ -300,12 +298,12 @@ def _contacts(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries])
 
 
 def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
-    """Whether a contact touches, (N,), by its last flag or its last force."""
+    """Whether a contact is active, (N,), by its last flag or its last force."""
     if name in bag.topics.contact_active:
-        said = series.get(f"contact_active.{name}")
-        if said is None:
+        flags = series.get(f"contact_active.{name}")
+        if flags is None:
             return np.ones(len(clock.stamps), dtype=np.bool_)
-        return clock.hold(said, said.fields["active"])[:, 0] != 0.0
+        return clock.hold(flags, flags.fields["active"])[:, 0] != 0.0
     measured, threshold = series[f"contact_wrenches.{name}"], bag.topics.contact_force_threshold
     with np.errstate(over="ignore"):  # infinite is above any threshold
         force = np.linalg.norm(measured.fields["wrench"][:, :3], axis=1)
@@ -332,10 +330,10 @@ def _ft_sensors(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries
 
 
 def _check_frame(bag: _Bag, role: str, expected: str | None, otherwise: str = "") -> None:
-    """Warn of a pose or wrench in another frame than it is taken for, since nothing here can transform it.
+    """Warn of a pose or wrench whose frame is not confirmed; it is not transformed.
 
-    The base link and the child links of fixed joints are in the URDF, which is not known here: where the map of topics
-    expects no frame, `otherwise` names the frame that is assumed, for the user to compare.
+    The base link and the child links of fixed joints are defined by the URDF, which is not read here: without an
+    expected frame, the warning names the assumed frame, `otherwise`.
     """
     decoder = bag.decoders[role]
     if not isinstance(decoder, (Odometry, Wrench)):
@@ -343,5 +341,5 @@ def _check_frame(bag: _Bag, role: str, expected: str | None, otherwise: str = ""
     found = decoder.frame.value
     if found and (expected is None or found.removeprefix("/") != expected.removeprefix("/")):
         taken_for = otherwise if expected is None else f"'{expected}'"
-        what = f"frame '{found}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
-        warn_about_file(f"{bag.rows[role].topic}: {what}")
+        text = f"frame '{found}', taken to be {taken_for}; logs.topics.{role}.frame says that this is meant"
+        warn_about_file(f"{bag.rows[role].topic}: {text}")

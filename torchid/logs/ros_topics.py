@@ -1,4 +1,4 @@
-"""Which topics of a bag hold what: the `logs.topics` of an experiment file."""
+"""Roles of the topics of a bag: `logs.topics` of an experiment file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _Force = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 @dataclass(config=_STRICT, frozen=True)
 class JointTopic:
-    """`sensor_msgs/JointState`: `joints` are those to take, by default all of the first message."""
+    """`sensor_msgs/JointState`: `joints` are the joints to read, by default all of the first message."""
 
     topic: _Name
     joints: Annotated[list[_Name], Field(min_length=1)] | None = None
@@ -25,7 +25,7 @@ class JointTopic:
 
 @dataclass(config=_STRICT, frozen=True)
 class ImuTopic:
-    """`sensor_msgs/Imu`: `frame` is that of the URDF it sits at, by default the messages' `header.frame_id`."""
+    """`sensor_msgs/Imu`: `frame` is its frame in the URDF, by default the `header.frame_id` of the messages."""
 
     topic: _Name
     frame: _Name | None = None
@@ -35,8 +35,8 @@ class ImuTopic:
 class OdometryTopic:
     """`nav_msgs/Odometry` of the base link.
 
-    `twist` is the frame its twist is expressed in, `none` to derive it from the pose. `frame` is the `child_frame_id`
-    to expect, that of the base link.
+    `twist` is the frame in which its twist is expressed, `none` to derive it from the pose. `frame` is the expected
+    `child_frame_id`, that of the base link.
     """
 
     topic: _Name
@@ -49,8 +49,7 @@ class WrenchTopic:
     """`geometry_msgs/WrenchStamped` or `Wrench`.
 
     `sign` is -1 where it is the robot's action on the environment, or the child side's on the parent side. `frame` is
-    the `header.frame_id` to expect, by default the contact's frame; in a limb it says that this is the fixed joint's
-    child frame.
+    the expected `header.frame_id`, by default the contact's frame; in a limb, the name of the joint's child frame.
     """
 
     topic: _Name
@@ -87,10 +86,10 @@ class Topics:
         imu: specific force and angular velocity.
         odometry: pose and twist of the base link.
         contact_wrenches: by contact, the environment's action on the robot at the contact frame, along its axes.
-        contact_active: by contact, whether it touches; those with a wrench may do without.
-        contact_force_threshold: [N], force above which a contact that is not in `contact_active` touches.
-        ft_wrenches: by fixed joint, what the parent side exerts on the child side, in the joint's child frame.
-        rate_topic: whose stamps the log takes: `joint_states`, `contact_wrenches.l_sole`, ...
+        contact_active: by contact, its flag; optional for contacts with a wrench.
+        contact_force_threshold: [N], force above which a contact that is not in `contact_active` is active.
+        ft_wrenches: by fixed joint, the wrench of the parent side on the child side, in the joint's child frame.
+        rate_topic: topic whose stamps the log takes: `joint_states`, `contact_wrenches.l_sole`, ...
     """
 
     joint_states: Annotated[JointTopic, BeforeValidator(_topic)]
@@ -120,19 +119,19 @@ class Topics:
 
 
 def check_topics(topics: Topics) -> None:
-    """Make sure that a map of topics is complete.
+    """Check that a map of topics is complete.
 
     Raises:
         ConfigError: a contact without a flag, a threshold or `always`.
-        UnknownNameError: the rate topic is none of the topics.
+        UnknownNameError: the rate topic is not one of the topics.
     """
     for name, contact in topics.contact_active.items():
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
             raise ConfigError.at_field(f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
-    unsaid = [name for name in topics.contact_wrenches if name not in topics.contact_active]
-    if unsaid and topics.contact_force_threshold is None:
-        found = f"missing, though nothing else says when {unsaid[0]} touches"
+    unflagged = [name for name in topics.contact_wrenches if name not in topics.contact_active]
+    if unflagged and topics.contact_force_threshold is None:
+        found = f"missing, though nothing else says when {unflagged[0]} touches"
         raise ConfigError.at_field("logs.topics.contact_force_threshold", found, "a force [N], or contact_active")
     stamped = [role for role in topics.by_role if not role.startswith("contact_active.")]
     if topics.rate_topic not in stamped:

@@ -1,4 +1,4 @@
-"""Arrays larger than memory: in files without a name, which vanish with the process however that ends."""
+"""Arrays larger than memory, in anonymous temporary files that vanish with the process."""
 
 from __future__ import annotations
 
@@ -18,32 +18,31 @@ class LazyArray(Protocol):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of all of it."""
+        """Shape of the array."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of its elements."""
+        """Type of its elements."""
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         """Some rows."""
 
 
 class SpillError(InputError):
-    """No room on the disk for what does not fit into memory."""
+    """The disk has no room for arrays that exceed the memory."""
 
 
 class Spill:
     """An array that grows by rows on a disk.
 
-    Its file has no name, so that it is gone when nothing refers to the array any longer, whether by success, an error,
-    an interrupt or a kill.
+    Its file has no name: it vanishes with the last reference to the array, or with the process, however that ends.
     """
 
     def __init__(self, source: object, folder: Path) -> None:
         """Start empty; `source` is named in errors."""
         self.source, self.folder = source, folder
         self._rows, self._like = 0, np.zeros(0)
-        try:  # not closed before the object that it belongs to is gone
+        try:  # closed when this object is deleted
             self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
         except OSError as error:
             raise self._failure(error) from error
@@ -64,10 +63,10 @@ class Spill:
         Raises:
             SpillError: the disk is full.
         """
-        left = memoryview(data)
+        rest = memoryview(data)
         try:
-            while left:
-                left = left[self._file.write(left) :]
+            while rest:
+                rest = rest[self._file.write(rest) :]
         except OSError as error:
             raise self._failure(error) from error
 
@@ -76,10 +75,10 @@ class Spill:
         return self.mapped((self._rows, *self._like.shape[1:]), self._like.dtype)
 
     def mapped(self, shape: tuple[int, ...], dtype: np.dtype[Any], fortran_order: bool = False) -> NDArray[Any]:
-        """The bytes as an array, mapped to the file: what is read stays in memory only while nobody else needs it."""
+        """The bytes as an array, mapped to the file: the system may drop its pages from memory."""
         if not np.prod(shape):
             return np.empty(shape, dtype)
-        # shared and writable, though nobody writes: private pages count against the memory, and torch warns of others
+        # shared, as private pages count as memory of the process; writable, as torch warns of read-only arrays
         return np.memmap(self._file, dtype, "r+", shape=shape, order="F" if fortran_order else "C")
 
     def _failure(self, error: OSError) -> SpillError:

@@ -1,4 +1,4 @@
-"""Logs as tables, CSV and Parquet: the only module that imports pyarrow."""
+"""Logs as tables, CSV and Parquet (the only module that imports pyarrow)."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ from torchid.logs.log import NAME_FIELDS
 _BLOCK = 2**22
 #: Rows that are converted at a time.
 _ROWS = 2**16
-#: What one Parquet file may declare of itself (bytes of names and statistics, entries of its lists), and that damage
-#: shows where the file has checksums.
+#: Limits on the metadata of a Parquet file (bytes of names and statistics, entries of lists); checksums are verified.
 _PARQUET = {
     "thrift_string_size_limit": 2**26,
     "thrift_container_size_limit": MAX_SCHEMA,
@@ -37,21 +36,21 @@ _NUMBERS = "numbers, or empty cells where nothing was measured"
 
 
 def read_table(path: Path) -> dict[str, NDArray[Any]]:
-    """The fields of a .csv or .parquet file, names of joints, contacts and sensors among them.
+    """The fields of a .csv or .parquet file, including names of joints, contacts and sensors.
 
     Raises:
-        LogError: one line that names the file and the column.
+        LogError: one line with the file and the column.
     """
     pa = _pyarrow(path)
     with _complete(path):
-        (layout, _), *found = _batches(pa, path)
-        batches = [batch for _, batch in found]
-        del found
+        (layout, _), *rest = _batches(pa, path)
+        batches = [batch for _, batch in rest]
+        del rest
         return _fields(pa, layout, batches)
 
 
 def table_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
-    """As `read_table`, of some rows at a time, none first."""
+    """As `read_table`, some rows at a time, after a block without rows."""
     pa = _pyarrow(path)
     with _complete(path):
         for layout, batch in _batches(pa, path, whole=False):
@@ -63,7 +62,7 @@ def _complete(path: Path) -> AbstractContextManager[None]:
 
 
 def _fields(pa: Any, layout: TableLayout, batches: list[Any]) -> dict[str, NDArray[Any]]:
-    """The fields of some rows; forgets the batches."""
+    """The fields of some rows; releases the batches."""
     table = pa.Table.from_batches(batches) if batches else None
     samples = 0 if table is None else table.num_rows
     columns = {} if table is None else dict(zip(table.column_names, table.columns, strict=True))
@@ -71,17 +70,17 @@ def _fields(pa: Any, layout: TableLayout, batches: list[Any]) -> dict[str, NDArr
     batches.clear()
 
     def take(column: str) -> NDArray[Any]:
-        # popped, which frees the memory of what has been taken
+        # popped, to release its memory
         return _values(pa, column, columns.pop(column)) if columns else np.zeros(0)
 
     return layout.fields(samples, take)
 
 
 def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write the arrays of a log file as a .csv or .parquet file, which appears complete or not at all.
+    """Write the arrays of a log as a .csv or .parquet file, atomically.
 
     Raises:
-        LogError: a name that no column can carry, or the file cannot be written.
+        LogError: a name is not valid in a column, or the file cannot be written.
     """
     pa = _pyarrow(path)
     columns = _columns(arrays)
@@ -96,7 +95,7 @@ def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _pyarrow(path: Path) -> Any:
-    """The module pyarrow, or a LogError: only those who use tables need it."""
+    """The module pyarrow; LogError where it is not installed."""
     try:
         import pyarrow
     except ImportError as error:
@@ -106,7 +105,7 @@ def _pyarrow(path: Path) -> Any:
 
 
 def _batches(pa: Any, path: Path, whole: bool = True) -> Iterator[tuple[TableLayout, Any]]:
-    """The layout of a table, with None first, then with some of its rows after the other."""
+    """The layout of a table, first with None, then with each batch of rows."""
     return (_read_csv if path.suffix.lower() == ".csv" else _read_parquet)(pa, path, whole)
 
 
@@ -124,7 +123,7 @@ def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayout, A
         try:
             reader = pyarrow.csv.open_csv(
                 stream,
-                # one thread, for else no message says which row is wrong
+                # one thread: else error messages have no row number
                 pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=texts),
                 convert_options=pyarrow.csv.ConvertOptions(
                     column_types=types, null_values=_EMPTY, strings_can_be_null=True
@@ -143,7 +142,7 @@ def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayout, A
 
 
 def _header(path: Path) -> tuple[list[str], bool]:
-    """Names of a CSV file's columns, and whether nothing follows."""
+    """Names of a CSV file's columns, and whether it has no rows."""
     with path.open("rb") as stream:
         line = stream.readline(_BLOCK)
         empty = not stream.read(_BLOCK).strip()
@@ -167,7 +166,7 @@ def _read_parquet(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayou
     with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
         texts = file.schema_arrow.names
         layout = parse_header(texts)
-    # as a dictionary, else one long text could fill the memory by being repeated
+    # as a dictionary: one long text, repeated in every row, could fill the memory
     with pyarrow.parquet.ParquetFile(
         path, read_dictionary=[TEXT_COLUMN] if TEXT_COLUMN in texts else None, **_PARQUET
     ) as file:
@@ -184,7 +183,7 @@ def _read_parquet(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayou
 
 
 def _bounded(path: Path, batches: Iterable[Any], columns: int, whole: bool) -> Iterator[Any]:
-    """The batches, as long as they fit: a file may hold more rows than it declares."""
+    """The batches, with their total size checked: a file may contain more rows than it declares."""
     rows = 0
     for batch in batches:
         rows += batch.num_rows
@@ -219,12 +218,12 @@ def _check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
 
 
 def _is_text(column: str) -> bool:
-    """Whether a CSV file may hold words there: the IMU's frame, and `true` and `false`."""
+    """Whether a column may contain text: the IMU's frame, and flags as `true` and `false`."""
     return column == TEXT_COLUMN or column.startswith("contact_active.")
 
 
 def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
-    """A column's values (N,), NaN where a cell is empty; of text the one word that all rows hold."""
+    """A column's values (N,), NaN for empty cells; for text, the common value of all rows."""
     if not pa.types.is_dictionary(values.type):
         if pa.types.is_boolean(values.type) and values.null_count:
             values = values.cast(pa.float64())
@@ -273,7 +272,7 @@ def _columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _save_csv(pa: Any, path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Numbers as the shortest text that reads back the same, NaN as an empty cell."""
+    """Write numbers as the shortest exact text, NaN as an empty cell."""
     import pyarrow.csv
 
     def rows(first: int) -> Any:

@@ -24,11 +24,18 @@ from torchid.sensor_planning.demands import Candidate
 from torchid.sensor_planning.observability import BaseObservability, LostBase, PostureSummary
 from torchid.sensor_planning.planner import PartPlan, SensorPlan
 
+#: Columns of text.
 _WIDTH = 100
+#: Sets and remedies that are listed, and directions of the base.
+_MAX_SETS, _MAX_REMEDIES, _BASE_DIRECTIONS = 5, 8, 6
+#: Smallest singular value of S_b V_x: below, the noise of the base's rows is a thousand times that of the sensors.
+_MIN_SINGULAR_VALUE = 1e-3
+#: Markers and colors of expected and measured errors.
+_MODEL, _EXPECTED, _MEASURED = ("o", "tab:blue"), ("s", "0.6"), ("D", "black")
 
 
 def sensor_plan_document(plan: SensorPlan) -> dict[str, Any]:
-    """Everything the planner found, sensors by name."""
+    """The sensor plan for `analysis.json`, sensors by name."""
     problem = plan.problem
     frames = [contact.frame for contact in problem.contacts]
     return {
@@ -89,8 +96,16 @@ def observability_document(states: Sequence[BaseObservability]) -> list[dict[str
     ]
 
 
+def _names(chosen: Iterable[Candidate]) -> list[str]:
+    return [candidate.name for candidate in chosen]
+
+
+def _values(values: PostureSummary) -> dict[str, float | int]:
+    return {"rank": values.rank, "median": values.median, "low": values.low, "least": values.least}
+
+
 def base_parameters_document(base: BaseParameters, body_names: Sequence[str]) -> dict[str, Any]:
-    """Base parameters: rank, formulas, and what is in none of them."""
+    """Base parameters: rank, formulas, and unobservable parameters."""
     return {
         "rank": base.rank,
         "parameters": int(base.free.sum()),
@@ -101,7 +116,7 @@ def base_parameters_document(base: BaseParameters, body_names: Sequence[str]) ->
 
 
 def base_parameters_text(title: str, base: BaseParameters, body_names: Sequence[str]) -> str:
-    """Base parameters to read, in 100 columns."""
+    """Base parameters as text of 100 columns."""
     count = f"{base.rank} combinations of {int(base.free.sum())} parameters can be determined, SI units:"
     lines = [title, "=" * len(title), "", count, ""]
     for formula in format_base_parameters(base, body_names):
@@ -111,33 +126,21 @@ def base_parameters_text(title: str, base: BaseParameters, body_names: Sequence[
     return "\n".join(lines) + "\n"
 
 
-def _names(chosen: Iterable[Candidate]) -> list[str]:
-    return [candidate.name for candidate in chosen]
-
-
-def _values(values: PostureSummary) -> dict[str, float | int]:
-    return {"rank": values.rank, "median": values.median, "low": values.low, "least": values.least}
-
-
-_MOST, _CURES, _BASE = 5, 8, 6
-_NEARLY = 1e-3  # of S_b V_x: the noise of the base's rows is a thousand times that of the sensors
-
-
 def join_names(chosen: Sequence[Candidate]) -> str:
     """Names of sensors, joined by commas."""
     return ", ".join(candidate.name for candidate in chosen) or "none"
 
 
 def branch_table(plan: SensorPlan) -> Table:
-    """Branches of the robot, which contacts constrain them, and what each group of contacts needs."""
+    """Branches of the robot, the contacts that constrain them, and the sensors that each group of contacts needs."""
     table = _table("Branches", "branch", "contacts beyond it", "sensors needed")
-    nothing = "" if plan.problem.robot.fixed_base else "none"
+    no_sensors = "" if plan.problem.robot.fixed_base else "none"
     for branch in plan.branches:
         needed = [
             f"{n.fewest_readings} for {' + '.join(n.contacts)}" for n in plan.requirements if branch.name in n.branches
         ]
         contacts = ", ".join(branch.contacts) or "free"
-        table.add_row(Text(branch.name), Text(contacts), Text("; ".join(needed) or nothing))
+        table.add_row(Text(branch.name), Text(contacts), Text("; ".join(needed) or no_sensors))
     for group in plan.requirements:
         if not group.branches:
             table.add_row("(base)", Text(", ".join(group.contacts)), str(group.fewest_readings))
@@ -148,17 +151,17 @@ def sets_table(parts: Sequence[PartPlan]) -> Table:
     """The cheapest sets of every part of the robot, most informative first."""
     table = _table("Smallest sets, most informative first", "contacts", "minimal sets", "bits", "sensors")
     for part in parts:
-        for index, (bits, chosen) in enumerate(part.ranked[:_MOST]):
+        for index, (bits, chosen) in enumerate(part.ranked[:_MAX_SETS]):
             first = index == 0
             count = "" if not first else "not counted" if part.sets is None else str(len(part.sets))
             table.add_row(Text(", ".join(part.frames) if first else ""), count, f"{bits:.1f}", Text(join_names(chosen)))
-        if len(part.ranked) > _MOST:
-            table.add_row("", "", "", f"({len(part.ranked) - _MOST} more in analysis.json)")
+        if len(part.ranked) > _MAX_SETS:
+            table.add_row("", "", "", f"({len(part.ranked) - _MAX_SETS} more in analysis.json)")
     return table
 
 
 def observability_table(title: str, states: Sequence[BaseObservability]) -> Table:
-    """rank(S_b V_x) and its smallest singular value over random postures, at position zero and over the logs'."""
+    """rank(S_b V_x) and its smallest singular value over random postures, at position zero and over the logs."""
     table = _table(f"{title}: rank(S_b V_x), its smallest singular value", "in contact")
     table.columns[0].ratio = 1
     for heading in ("rank", "median", "5 %", "zero\nposture", "logs\nmedian", "logs\nleast"):
@@ -172,52 +175,48 @@ def observability_table(title: str, states: Sequence[BaseObservability]) -> Tabl
 
 
 def describe_losses(states: Sequence[BaseObservability]) -> list[str]:
-    """What of the base is lost and what would bring it back, and where a set is singular."""
+    """Lost directions of the base with remedies, and postures at which a set is singular or nearly so."""
     lines = []
-    by_loss: dict[tuple[object, ...], list[BaseObservability]] = {}
-    for state in states:
-        if state.lost is not None:
-            by_loss.setdefault((state.lost.descriptions, state.lost.unmet_groups, state.lost.remedies), []).append(
-                state
-            )
-    for same in by_loss.values():
-        lost, where = same[0].lost, f"{len(same)} of {len(states)} contact states"
-        if lost is not None:
-            short = " and ".join(f"{' + '.join(frames)} lacks {_count(count)}" for frames, count in lost.unmet_groups)
-            lines.append(f"{short} in {where}; lost is the {_words(lost)}")
-            remedies = join_names(lost.remedies[:_CURES]) if lost.remedies else "no single candidate"
-            lines.append(f"  any of these would help: {remedies}")
-    near = [state for state in states if state.lost is None and state.recorded and state.recorded.least < _NEARLY]
+    by_loss: dict[tuple[object, ...], list[LostBase]] = {}
+    for lost in (state.lost for state in states if state.lost is not None):
+        by_loss.setdefault((lost.descriptions, lost.unmet_groups, lost.remedies), []).append(lost)
+    for alike in by_loss.values():
+        lost, count = alike[0], f"{len(alike)} of {len(states)} contact states"
+        lacking = [
+            f"{' + '.join(frames)} lacks {number} sensor{'s' * (number != 1)}" for frames, number in lost.unmet_groups
+        ]
+        whole = len(lost.descriptions) == _BASE_DIRECTIONS
+        directions = "whole base" if whole else f"base's {' and '.join(lost.descriptions)}"
+        lines.append(f"{' and '.join(lacking)} in {count}; lost is the {directions}")
+        remedies = join_names(lost.remedies[:_MAX_REMEDIES]) if lost.remedies else "no single candidate"
+        lines.append(f"  any of these would help: {remedies}")
+    near = [
+        state
+        for state in states
+        if state.lost is None and state.recorded and state.recorded.least < _MIN_SINGULAR_VALUE
+    ]
     if near:
         least = min(state.recorded.least for state in near if state.recorded)
         lines.append(
-            f"warning: at some postures of the logs the base is all but lost (smallest singular value {least:.2g})"
+            f"warning: at some postures of the logs the base is nearly lost (smallest singular value {least:.2g})"
         )
     rare = sum(state.lost is None and state.generic.low < BASE_RANK_TOLERANCE for state in states)
     if rare:
         where = f"{rare} of {len(states)} contact states"
         lines.append(f"warning: in {where} the base is nearly lost at one random posture in twenty or more")
-    falling = [state for state in states if state.lost is None and state.zero.rank < state.generic.rank]
-    if falling:
-        alike = dict.fromkeys(names for state in falling for names in state.dependent)
-        cause = "; ".join(" = ".join(names) for names in alike)
+    singular = [state for state in states if state.lost is None and state.zero.rank < state.generic.rank]
+    if singular:
+        dependent = dict.fromkeys(names for state in singular for names in state.dependent)
+        cause = "; ".join(" = ".join(names) for names in dependent)
         lines.append(
-            "warning: the base is lost where all joints are at zero, and all but lost near it"
-            + (f"; sensors that read alike there: {cause}" if cause else "")
+            "warning: the base is lost where all joints are at zero, and nearly lost close to it"
+            + (f"; sensors with dependent readings there: {cause}" if cause else "")
         )
     return lines
 
 
-def _words(lost: LostBase) -> str:
-    return "whole base" if len(lost.descriptions) == _BASE else f"base's {' and '.join(lost.descriptions)}"
-
-
-def _count(sensors: int) -> str:
-    return "1 sensor" if sensors == 1 else f"{sensors} sensors"
-
-
 def removal_table(plan: SensorPlan) -> Table:
-    """Ranks without one sensor, by the criterion of each sample and by the stack of all."""
+    """Ranks without one sensor, of each sample and of the stack of all samples."""
     title = (
         f"Without one sensor (inertial combinations: {plan.stack_rank} with this set, "
         f"{plan.stack_full} with every candidate)"
@@ -236,12 +235,9 @@ def _table(title: str, *headings: str) -> Table:
     return table
 
 
-_MODEL, _EXPECTED, _MEASURED = ("o", "tab:blue"), ("s", "0.6"), ("D", "black")
-
-
 @dataclass(frozen=True)
 class SetAccuracy:
-    """Of a fit with one sensor set: expected errors, and those measured on the test logs, if there are any."""
+    """Errors of a fit with one sensor set: expected, and measured on the test logs, if any."""
 
     channels: int
     rank: int
@@ -277,13 +273,13 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
             ("with noise", found.expected.total),
             ("measured", {} if found.measured is None else found.measured.rms),
         ):
-            table.add_row(*first, label, *(_figure(errors.get(group)) for group in ROW_GROUPS))
+            table.add_row(*first, label, *(_number(errors.get(group)) for group in ROW_GROUPS))
             first = ["", "", ""]
         table.add_section()
     return table
 
 
-def _figure(x: float | None) -> str:
+def _number(x: float | None) -> str:
     return "-" if x is None else f"{x:.3g}"
 
 

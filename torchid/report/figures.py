@@ -1,4 +1,4 @@
-"""Figures of a run and of a robot's tree (matplotlib's style is set here)."""
+"""Figures of a run and of a robot's tree; style of all figures."""
 
 from __future__ import annotations
 
@@ -42,12 +42,23 @@ STYLE: dict[Any, Any] = {
     "axes.spines.right": False,
     "legend.frameon": False,
 }
+#: Colors of forces and parameters: measured, by the URDF, and identified.
+_MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
+#: Extra parameters: rows of a panel (`parameters.json` has all), longest error bar over the largest value, and vertical
+#: offsets for logs in one row.
+_MAX_PANEL_ROWS, _MAX_ERROR_RATIO, _LANES = 40, 4, 5
+#: Colors of sensors and links in the tree, and its column width, row height and legend width [inches].
+_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = "tab:blue", "tab:green", "tab:purple", "0.75", "0.3"
+_COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4
+
+Position = tuple[float, int]
+"""Column and row in the figure of a tree."""
 
 
 def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
-    """Write a figure as a file, its texts without control characters.
+    """Write a figure to a file, with control characters in its texts escaped.
 
-    In the same style as it was made, for labels of ticks are made now, and may hold dollar signs as well.
+    The style is that of the figure: matplotlib creates tick labels only now, and they may contain dollar signs.
     """
     with during("drawing", path), matplotlib.rc_context(STYLE):
         for text in figure.findobj(Text):
@@ -55,7 +66,7 @@ def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
         figure.savefig(path, dpi=130, format=kind)
 
 
-_MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
+# ---------------------------------------------------------------------------------------------------- forces and errors
 
 
 @dataclass(frozen=True)
@@ -70,9 +81,9 @@ class ForceSeries:
 
 
 @matplotlib.rc_context(STYLE)
-def force_figure(series: ForceSeries, dof_names: Sequence[str], base_rows: int, most: int = 6) -> Figure:
+def force_figure(series: ForceSeries, dof_names: Sequence[str], base_rows: int, max_rows: int = 6) -> Figure:
     """Measured and predicted forces over time: the largest base force and moment, then the largest of the others."""
-    rows = _rows_to_show(series, base_rows, most)
+    rows = _largest_rows(series, base_rows, max_rows)
     figure = Figure(figsize=(9.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
     axes = figure.subplots(max(len(rows), 1), 1, sharex=True, squeeze=False)[:, 0]
     for axis, row in zip(axes, rows, strict=False):
@@ -92,13 +103,14 @@ def force_figure(series: ForceSeries, dof_names: Sequence[str], base_rows: int, 
     return figure
 
 
-def _rows_to_show(series: ForceSeries, base_rows: int, most: int) -> list[int]:
+def _largest_rows(series: ForceSeries, base_rows: int, max_rows: int) -> list[int]:
+    """Numbers of the rows to plot: by rms of the measured force."""
     size = np.sqrt(np.nanmean(np.square(np.nan_to_num(series.measured)), axis=0))
     size[~np.isfinite(series.measured).any(axis=0)] = -1.0
     base = [max(rows, key=lambda row: size[row]) for rows in (range(3), range(3, 6))] if base_rows else []
     base = [row for row in base if size[row] >= 0.0]
     joints = sorted((row for row in range(base_rows, len(size)) if size[row] >= 0.0), key=lambda row: -size[row])
-    return base + sorted(joints[: most - len(base)])
+    return base + sorted(joints[: max_rows - len(base)])
 
 
 @matplotlib.rc_context(STYLE)
@@ -123,9 +135,19 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
     return figure
 
 
+# ----------------------------------------------------------------------------------------------------------- parameters
+
+
+_QUANTITIES = {
+    "mass": lambda phi: phi[:, parameters.MASS],
+    "first moment, length": lambda phi: np.linalg.norm(phi[:, parameters.FIRST_MOMENT], axis=1),
+    "inertia about origin, trace": lambda phi: np.trace(parameters.inertia_matrix(phi), axis1=1, axis2=2),
+}
+
+
 @matplotlib.rc_context(STYLE)
 def parameter_figure(body_names: Sequence[str], nominal: Array, identified: Array, standard_error: Array) -> Figure:
-    """Mass, first moment and inertia of every body with mass; bars on the masses the data determine: standard error."""
+    """Mass, first moment and inertia of every body with mass, and standard errors of the masses."""
     shown = np.flatnonzero(nominal[:, parameters.INERTIAL].any(axis=1))
     nominal, identified, standard_error = nominal[shown], identified[shown], standard_error[shown]
     index = np.arange(len(shown))
@@ -144,81 +166,6 @@ def parameter_figure(body_names: Sequence[str], nominal: Array, identified: Arra
     axes[0].set_ylim(len(shown) - 0.4, -0.6)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     return figure
-
-
-_QUANTITIES = {
-    "mass": lambda phi: phi[:, parameters.MASS],
-    "first moment, length": lambda phi: np.linalg.norm(phi[:, parameters.FIRST_MOMENT], axis=1),
-    "inertia about origin, trace": lambda phi: np.trace(parameters.inertia_matrix(phi), axis1=1, axis2=2),
-}
-
-
-@matplotlib.rc_context(STYLE)
-def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], most: int = 20) -> Figure:
-    """Bits that would be lost without each member of some groups, by name, those with most first."""
-    shown = {group: sorted(found, key=lambda pair: -pair[1])[:most] for group, found in groups.items() if found}
-    counts = [len(found) for found in shown.values()]
-    figure = Figure(figsize=(9.0, 0.24 * sum(counts) + 0.6 * len(shown) + 0.6), layout="constrained")
-    axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
-    for axis, (group, found) in zip(axes, shown.items(), strict=True):
-        names, bits = zip(*found, strict=True)
-        bars = axis.barh(range(len(found)), bits, 0.7, color=_IDENTIFIED)
-        axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
-        axis.set_yticks(range(len(found)), [fill(name, 60) for name in names], fontsize=7)
-        axis.set_ylim(len(found) - 0.4, -0.6)
-        axis.grid(visible=False, axis="y")
-        hidden = len(groups[group]) - len(found)
-        axis.set_title(group + (f", {hidden} more not shown" if hidden else ""), loc="left", fontsize=9)
-    axes[-1].set_xlabel("information lost without it [bits]")
-    return figure
-
-
-_ROWS = 40  # in a panel; the rest is in parameters.json
-_MOST = 4  # standard errors beyond this many times the largest value are cut off
-_LANES = 5  # logs side by side in a row; more start again at its top
-
-
-@matplotlib.rc_context(STYLE)
-def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
-    """Extra parameters: a panel for each unit, a row for each, a point for each log with its 95 % interval.
-
-    Hollow points are confounded with other parameters.
-    """
-    units = list(dict.fromkeys(x.extra.unit for x in extras))
-    logs = list(dict.fromkeys(x.log for x in extras))
-    rows = {unit: list(dict.fromkeys(x.extra.label for x in extras if x.extra.unit == unit))[:_ROWS] for unit in units}
-    height = 1.2 + 0.24 * sum(map(len, rows.values())) + 0.6 * len(units)
-    figure = Figure(figsize=(9.0, max(height, 2.4)), layout="constrained")
-    heights = [len(rows[unit]) + 1 for unit in units]
-    axes = figure.subplots(len(units), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
-    colors = {log: f"C{number}" for number, log in enumerate(logs)}
-    for axis, unit in zip(axes[:, 0], units, strict=True):
-        in_panel = [x for x in extras if x.extra.unit == unit and x.extra.label in rows[unit]]
-        _draw_panel(axis, in_panel, rows[unit], colors)
-        axis.set_xlabel(f"[{unit}]" if unit != "1" else "scale less 1 [1]")
-    axes[0, 0].set_title("95 % intervals; hollow: confounded with other parameters", loc="left", fontsize=8)
-    # of all panels, and never hollow: a log need not have a point in every one of them
-    keys = [Line2D([], [], marker="o", linestyle="", color=color) for color in colors.values()]
-    names = [Path(log).name or "all logs" for log in logs]
-    figure.legend(keys, names, loc="outside upper right", ncols=min(len(logs), 4))
-    return figure
-
-
-def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
-    """Values with their intervals, the logs of a row below each other around its middle."""
-    reach = _MOST * max(abs(x.value) for x in extras) or 1.0
-    logs = [log for log in colors if any(x.log == log for x in extras)]
-    for number, log in enumerate(logs):
-        points = [x for x in extras if x.log == log]
-        below = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
-        values, index = [x.value for x in points], [rows.index(x.extra.label) + below for x in points]
-        error = [min(1.96 * x.standard_error, reach) if math.isfinite(x.standard_error) else reach for x in points]
-        axis.errorbar(values, index, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
-        fill = [colors[log] if x.separable else "white" for x in points]
-        axis.scatter(values, index, c=fill, edgecolors=colors[log], s=22, zorder=3)
-    axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
-    axis.set_yticks(range(len(rows)), rows, fontsize=8)
-    axis.set_ylim(len(rows) - 0.5, -0.5)
 
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False})
@@ -249,11 +196,73 @@ def identifiability_figure(body_names: Sequence[str], estimate: Estimate) -> Fig
     return figure
 
 
-_TORQUE, _WRENCH, _LIMB, _PLAIN, _LOADED = "tab:blue", "tab:green", "tab:purple", "0.75", "0.3"
-_COLUMN, _ROW, _LEGEND = 2.1, 0.3, 7.4  # inches
+@matplotlib.rc_context(STYLE)
+def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], max_rows: int = 20) -> Figure:
+    """Bits lost without each log, contact state or sensor, by group: pairs of name and bits, the largest first."""
+    shown = {group: sorted(pairs, key=lambda pair: -pair[1])[:max_rows] for group, pairs in groups.items() if pairs}
+    counts = [len(pairs) for pairs in shown.values()]
+    figure = Figure(figsize=(9.0, 0.24 * sum(counts) + 0.6 * len(shown) + 0.6), layout="constrained")
+    axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
+    for axis, (group, pairs) in zip(axes, shown.items(), strict=True):
+        names, bits = zip(*pairs, strict=True)
+        bars = axis.barh(range(len(pairs)), bits, 0.7, color=_IDENTIFIED)
+        axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
+        axis.set_yticks(range(len(pairs)), [fill(name, 60) for name in names], fontsize=7)
+        axis.set_ylim(len(pairs) - 0.4, -0.6)
+        axis.grid(visible=False, axis="y")
+        hidden = len(groups[group]) - len(pairs)
+        axis.set_title(group + (f", {hidden} more not shown" if hidden else ""), loc="left", fontsize=9)
+    axes[-1].set_xlabel("information lost without it [bits]")
+    return figure
 
-Place = tuple[float, int]
-"""Column and row."""
+
+@matplotlib.rc_context(STYLE)
+def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
+    """Extra parameters: a panel for each unit, a row for each, a point for each log with its 95 % interval.
+
+    Hollow points are confounded with other parameters.
+    """
+    units = list(dict.fromkeys(x.extra.unit for x in extras))
+    logs = list(dict.fromkeys(x.log for x in extras))
+    rows = {
+        unit: list(dict.fromkeys(x.extra.label for x in extras if x.extra.unit == unit))[:_MAX_PANEL_ROWS]
+        for unit in units
+    }
+    height = 1.2 + 0.24 * sum(map(len, rows.values())) + 0.6 * len(units)
+    figure = Figure(figsize=(9.0, max(height, 2.4)), layout="constrained")
+    heights = [len(rows[unit]) + 1 for unit in units]
+    axes = figure.subplots(len(units), 1, squeeze=False, gridspec_kw={"height_ratios": heights})
+    colors = {log: f"C{number}" for number, log in enumerate(logs)}
+    for axis, unit in zip(axes[:, 0], units, strict=True):
+        in_panel = [x for x in extras if x.extra.unit == unit and x.extra.label in rows[unit]]
+        _draw_panel(axis, in_panel, rows[unit], colors)
+        axis.set_xlabel(f"[{unit}]" if unit != "1" else "scale less 1 [1]")
+    axes[0, 0].set_title("95 % intervals; hollow: confounded with other parameters", loc="left", fontsize=8)
+    # made by hand: a log need not have a point in every panel, nor a filled one
+    keys = [Line2D([], [], marker="o", linestyle="", color=color) for color in colors.values()]
+    names = [Path(log).name or "all logs" for log in logs]
+    figure.legend(keys, names, loc="outside upper right", ncols=min(len(logs), 4))
+    return figure
+
+
+def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
+    """Values with their intervals; the logs of a row have vertical offsets around its middle."""
+    longest = _MAX_ERROR_RATIO * max(abs(x.value) for x in extras) or 1.0
+    logs = [log for log in colors if any(x.log == log for x in extras)]
+    for number, log in enumerate(logs):
+        points = [x for x in extras if x.log == log]
+        offset = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
+        values, index = [x.value for x in points], [rows.index(x.extra.label) + offset for x in points]
+        error = [min(1.96 * x.standard_error, longest) if math.isfinite(x.standard_error) else longest for x in points]
+        axis.errorbar(values, index, xerr=error, fmt="none", ecolor=colors[log], elinewidth=1.0)
+        faces = [colors[log] if x.separable else "white" for x in points]
+        axis.scatter(values, index, c=faces, edgecolors=colors[log], s=22, zorder=3)
+    axis.axvline(0.0, color="0.7", linewidth=0.8, zorder=0)
+    axis.set_yticks(range(len(rows)), rows, fontsize=8)
+    axis.set_ylim(len(rows) - 0.5, -0.5)
+
+
+# ------------------------------------------------------------------------------------- tree of a robot with its sensors
 
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False})
@@ -271,26 +280,27 @@ def tree_figure(
         title: of the figure.
         robot: the robot.
         contacts: those of the scenario.
-        measured: those of the robot's `dof_names` that are.
+        measured: names of measured readings, of the robot's `dof_names`.
         wrenches: measured components by contact frame.
         constrained: joints between the base and a contact.
     """
     constrained = {*constrained, *_loaded_welds(robot, contacts)}
-    places = _places(robot, contacts)
-    hanging = _contact_rows(robot, contacts, places)
-    right = max(x for x, _ in places)
-    deepest = max(y for _, y in [*places, *hanging.values()])
+    positions = _body_positions(robot, contacts)
+    contact_positions = _contact_positions(robot, contacts, positions)
+    right = max(x for x, _ in positions)
+    deepest = max(y for _, y in [*positions, *contact_positions.values()])
     width = _COLUMN * (right + 1.0)
     figure = Figure(figsize=(max(width, _LEGEND) + 0.2, _ROW * (deepest + 1) + 1.3), layout="constrained")
     axes = figure.subplots()
     for body, link in enumerate(robot.bodies):
         if link.joint is not None:
-            _draw_joint(axes, link.joint, places[link.parent], places[body], measured, constrained)
+            _draw_joint(axes, link.joint, positions[link.parent], positions[body], measured, constrained)
     for contact in contacts:
         body, _ = robot.link(contact.frame)
-        _draw_contact(axes, contact, places[body], hanging[contact.frame], wrenches.get(contact.frame, ()))
-    axes.plot(*places[0], "s", color="black", markersize=9)
-    _label(axes, robot.body_names[0], places[0], fontsize=8)
+        position = contact_positions[contact.frame]
+        _draw_contact(axes, contact, positions[body], position, wrenches.get(contact.frame, ()))
+    axes.plot(*positions[0], "s", color="black", markersize=9)
+    _label(axes, robot.body_names[0], positions[0], fontsize=8)
     axes.set(xlim=(-0.15, right + 0.95), ylim=(deepest + 0.6, -0.6))
     axes.axis("off")
     figure.suptitle(title, x=0.01, ha="left")
@@ -309,12 +319,12 @@ def _loaded_welds(robot: Robot, contacts: Sequence[Contact]) -> set[str]:
     return welds
 
 
-def _places(robot: Robot, contacts: Sequence[Contact]) -> list[Place]:
-    """Column and row of every body: leaves side by side, bodies above their contacts and their children's middle."""
-    hanging = Counter(robot.link(contact.frame)[0] for contact in contacts)
+def _body_positions(robot: Robot, contacts: Sequence[Contact]) -> list[Position]:
+    """Position of every body: leaves side by side, other bodies above their contacts, centred over their children."""
+    contact_count = Counter(robot.link(contact.frame)[0] for contact in contacts)
     children, row = robot.children, [0] * len(robot.bodies)
     for body, link in enumerate(robot.bodies[1:], start=1):
-        row[body] = row[link.parent] + 1 + hanging[link.parent]
+        row[body] = row[link.parent] + 1 + contact_count[link.parent]
     column, free = [0.0] * len(robot.bodies), 0
     for body in reversed(range(len(robot.bodies))):  # children come after their parents
         if children[body]:
@@ -324,48 +334,53 @@ def _places(robot: Robot, contacts: Sequence[Contact]) -> list[Place]:
     return [(max(column) - x, y) for x, y in zip(column, row, strict=True)]
 
 
-def _contact_rows(robot: Robot, contacts: Sequence[Contact], places: Sequence[Place]) -> dict[str, Place]:
-    """Places of contacts, one below the other beneath their body."""
-    hanging: dict[str, Place] = {}
+def _contact_positions(robot: Robot, contacts: Sequence[Contact], bodies: Sequence[Position]) -> dict[str, Position]:
+    """Positions of contacts, one below the other under their body."""
+    positions: dict[str, Position] = {}
     count: Counter[int] = Counter()
     for contact in contacts:
         body, _ = robot.link(contact.frame)
         count[body] += 1
-        column, row = places[body]
-        hanging[contact.frame] = (column, row + count[body])
-    return hanging
+        column, row = bodies[body]
+        positions[contact.frame] = (column, row + count[body])
+    return positions
 
 
 def _draw_joint(
-    axes: Axes, joint: BodyJoint, parent: Place, index: Place, readings: Collection[str], constrained: Collection[str]
+    axes: Axes,
+    joint: BodyJoint,
+    parent: Position,
+    position: Position,
+    readings: Collection[str],
+    constrained: Collection[str],
 ) -> None:
     name = joint.name if joint.mimic is None else joint.mimic.master
     weld = [k for k in WRENCH_COMPONENTS if f"{name}.{k}" in readings] if joint.kind == "fixed" else []
     loaded, measured = name in constrained, bool(weld) or name in readings
-    (x, y), turn = index, parent[1] + 0.5
+    (x, y), bend = position, parent[1] + 0.5
     style: dict[str, Any] = {"color": _LOADED if loaded else _PLAIN, "linewidth": 2.2 if loaded else 1.4, "zorder": 0}
-    axes.plot([parent[0], parent[0], x, x], [parent[1], turn, turn, y], **style)
+    axes.plot([parent[0], parent[0], x, x], [parent[1], bend, bend, y], **style)
     color, part = _LIMB if weld else _TORQUE, 0 < len(weld) < len(WRENCH_COMPONENTS)
     face = color if measured else "white"
     style = {"color": color if measured else "0.5", "markerfacecolor": face, "fillstyle": "left" if part else "full"}
     axes.plot(x, y, "h" if joint.kind == "fixed" else "o", markersize=8 if joint.kind == "fixed" else 7, **style)
     label = joint.name if joint.mimic is None else f"{joint.name} (follows)"
     label += f": {', '.join(weld)}" if part else ""
-    _label(axes, label, index, measured, fontsize=6.5, color="black" if measured or loaded else "0.45")
+    _label(axes, label, position, measured, fontsize=6.5, color="black" if measured or loaded else "0.45")
 
 
-def _draw_contact(axes: Axes, contact: Contact, body: Place, index: Place, measured: Sequence[str]) -> None:
-    axes.plot([index[0], index[0]], [body[1], index[1]], color=_LOADED, linewidth=2.2, zorder=0)
+def _label(axes: Axes, text: str, position: Position, bold: bool = False, **style: Any) -> None:
+    weight = "bold" if bold else "normal"
+    axes.annotate(text, position, (8, 0), textcoords="offset points", va="center", fontweight=weight, **style)
+
+
+def _draw_contact(axes: Axes, contact: Contact, body: Position, position: Position, measured: Sequence[str]) -> None:
+    axes.plot([position[0], position[0]], [body[1], position[1]], color=_LOADED, linewidth=2.2, zorder=0)
     part = bool(measured) and not set(measured) >= set(contact.component_names)
     color, face = (_WRENCH, _WRENCH) if measured else ("0.5", "white")
-    axes.plot(*index, "D", color=color, markerfacecolor=face, fillstyle="left" if part else "full", markersize=8)
+    axes.plot(*position, "D", color=color, markerfacecolor=face, fillstyle="left" if part else "full", markersize=8)
     components = f": {', '.join(measured)}" if part else ""
-    _label(axes, f"{contact.frame} ({contact.kind}){components}", index, bool(measured), fontsize=7)
-
-
-def _label(axes: Axes, text: str, index: Place, bold: bool = False, **style: Any) -> None:
-    weight = "bold" if bold else "normal"
-    axes.annotate(text, index, (8, 0), textcoords="offset points", va="center", fontweight=weight, **style)
+    _label(axes, f"{contact.frame} ({contact.kind}){components}", position, bool(measured), fontsize=7)
 
 
 def _legend(welds: bool) -> list[Line2D]:

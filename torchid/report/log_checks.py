@@ -1,4 +1,4 @@
-"""Findings of the log checks as a table, a JSON document, and a figure of all channels."""
+"""Results of the log checks as a figure of all channels, a table, and a JSON document."""
 
 from __future__ import annotations
 
@@ -24,23 +24,30 @@ from torchid.logs.log import FloatArray
 from torchid.report.figures import STYLE
 
 COLORS = {CONDEMNED: "tab:red", SUSPICIOUS: "tab:orange", NOTE: "tab:blue"}
-_ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0  # inches
-_LETTERS, _LONGEST = 130, 600  # of size 9 in a line, and in a title
-_POINTS = 2000
-_NARROW = 1.0 / 600.0  # of the width: a single sample of a long log stays visible
-_RANGE = (0.5, 99.5)  # percentiles that fill a row
+#: Height of a row and of a panel's title, and width of the figure [inches].
+_ROW, _HEAD, _WIDTH = 0.16, 1.0, 10.0
+#: Characters of a title's line at font size 9, and of a title.
+_LINE_LETTERS, _TITLE_LETTERS = 130, 600
+#: Points of a curve.
+_MAX_POINTS = 2000
+#: Width of a mark over that of the panel: a single sample of a long log stays visible.
+_MIN_MARK_SHARE = 1.0 / 600.0
+#: Percentiles of a channel that fill its row.
+_RANGE = (0.5, 99.5)
+#: Spans that a cell of the table lists.
+_MAX_SPANS = 3
 
 
 @matplotlib.rc_context(STYLE | {"axes.grid": False})
 def log_check_figure(logs: Sequence[Checked]) -> Figure:
-    """One panel per log, one row per channel, each with its range beside it; findings are marked in their color."""
-    rows = [len(_rows(one.log)) for one in logs]
-    heights = [_ROW * (count + _title(one).count("\n")) + _HEAD for count, one in zip(rows, logs, strict=True)]
+    """One panel per log and one row per channel, with its range; findings are marked by the color of their severity."""
+    lines = [len(_channels(checked.log)) + _title(checked).count("\n") for checked in logs]
+    heights = [_ROW * count + _HEAD for count in lines]
     figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
     panels = figure.subplots(len(logs), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
-    for axes, one in zip(panels, logs, strict=True):
-        _panel(axes, one)
-    marked = {finding.severity for one in logs for finding in _marked(one)}
+    for axes, checked in zip(panels, logs, strict=True):
+        _draw_panel(axes, checked)
+    marked = {finding.severity for checked in logs for finding in _marked_findings(checked)}
     marks = [Patch(color=color, alpha=0.6, label=name) for name, color in COLORS.items() if name in marked]
     if marks:
         panels[0].legend(handles=marks, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(marks))
@@ -48,104 +55,91 @@ def log_check_figure(logs: Sequence[Checked]) -> Figure:
 
 
 def _title(checked: Checked) -> str:
-    """Name and verdict, wrapped here: matplotlib takes a text that it wraps for a formula, whatever it is told."""
-    return fill(excerpt(f"{Path(checked.log.source).name}: {checked.verdict}", _LONGEST), _LETTERS)
+    """Name and verdict, wrapped here: matplotlib parses texts that it wraps as formulas, whatever its settings."""
+    return fill(excerpt(f"{Path(checked.log.source).name}: {checked.verdict}", _TITLE_LETTERS), _LINE_LETTERS)
 
 
-def _marked(checked: Checked) -> list[Finding]:
-    """Findings that concern some samples, and more than a note."""
+def _marked_findings(checked: Checked) -> list[Finding]:
+    """Condemned and suspicious findings about some samples."""
     return [finding for finding in checked.findings if finding.severity != NOTE and finding.spans]
 
 
-def _rows(log: Log) -> dict[tuple[str, str], FloatArray]:
-    """Channels in rows, by field and name; those that hold nothing are left out."""
-    rows = {}
+def _channels(log: Log) -> dict[tuple[str, str], FloatArray]:
+    """Channels by field and name, without those that are 0 or NaN throughout."""
+    channels = {}
     for field in log.arrays():
         if field == "time":
             continue
         flat = np.asarray(getattr(log, field), dtype=np.float64).reshape(len(log), -1)
         for name, values in zip(channel_names(log, field), flat.T, strict=True):
             if np.isfinite(values).any() and np.nanmax(np.abs(values)) > 0.0:
-                rows[field, name] = values
-    return rows
+                channels[field, name] = values
+    return channels
 
 
-def _panel(axes: Axes, checked: Checked) -> None:
-    log, rows = checked.log, _rows(checked.log)
-    time = log.time - log.time[0]
-    places = {channel: -row for row, channel in enumerate(rows)}
-    every = slice(None, None, max(1, len(time) // _POINTS))
+def _draw_panel(axes: Axes, checked: Checked) -> None:
+    channels = _channels(checked.log)
+    heights = [-row for row in range(len(channels))]
+    time = checked.log.time - checked.log.time[0]
+    step = slice(None, None, max(1, len(time) // _MAX_POINTS))
     lines = [
-        np.column_stack([time[every], _scaled(values)[every] + index])
-        for (values, index) in zip(rows.values(), places.values(), strict=True)
+        np.column_stack([time[step], _scale_to_row(values)[step] + height])
+        for values, height in zip(channels.values(), heights, strict=True)
     ]
     axes.add_collection(LineCollection(lines, colors="0.35", linewidths=0.6))
-    for finding in _marked(checked):
+    for finding in _marked_findings(checked):
+        style: dict[str, Any] = {"color": COLORS[finding.severity], "alpha": 0.6, "linewidth": 0}
         for span in finding.spans:
-            inside = [
-                index
-                for (field, name), index in places.items()
-                if finding.field in (field, "time") and span.channel in ("", name)
-            ]
-            _mark(axes, float(time[span.first]), float(time[span.last]), inside, time[-1], finding.severity)
-    axes.set(xlim=(time[0], max(time[-1], 1e-9)), ylim=(-len(rows) + 0.4, 0.6), xlabel="time [s]")
-    axes.set_yticks(list(places.values()), [f"{field} {name}" for field, name in places], fontsize=6)
+            start, end = float(time[span.first]), float(time[span.last])
+            width = max(end - start, _MIN_MARK_SHARE * time[-1])
+            for (field, name), height in zip(channels, heights, strict=True):
+                if finding.field in (field, "time") and span.channel in ("", name):
+                    axes.broken_barh([(0.5 * (start + end) - 0.5 * width, width)], (height - 0.5, 1.0), **style)
+    axes.set(xlim=(time[0], max(time[-1], 1e-9)), ylim=(-len(channels) + 0.4, 0.6), xlabel="time [s]")
+    axes.set_yticks(heights, [f"{field} {name}" for field, name in channels], fontsize=6)
     axes.tick_params(axis="y", length=0)
-    beside = axes.secondary_yaxis("right")
-    beside.set_yticks(list(places.values()), [_range_text(*channel, rows[channel]) for channel in places], fontsize=6)
-    beside.tick_params(axis="y", length=0)
-    beside.set_ylabel(f"range that fills a row: {_RANGE[0]:g} % to {_RANGE[1]:g} % of the values")
+    ranges = axes.secondary_yaxis("right")
+    ranges.set_yticks(heights, [_range_text(*channel, values) for channel, values in channels.items()], fontsize=6)
+    ranges.tick_params(axis="y", length=0)
+    ranges.set_ylabel(f"range that fills a row: {_RANGE[0]:g} % to {_RANGE[1]:g} % of the values")
     axes.set_title(_title(checked), loc="left", fontsize=9)
 
 
-def _mark(axes: Axes, start: float, end: float, places: Sequence[int], lasts: float, severity: str) -> None:
-    width = max(end - start, _NARROW * lasts)
-    middle = 0.5 * (start + end)
-    for index in places:
-        axes.broken_barh(
-            [(middle - 0.5 * width, width)], (index - 0.5, 1.0), color=COLORS[severity], alpha=0.6, linewidth=0
-        )
-
-
-def _range_text(field: str, name: str, values: FloatArray) -> str:
-    """What a row spans, with its unit."""
-    low, high = (f"{x:.3g}" for x in np.nanpercentile(values, _RANGE))
-    return f"{low} to {high} {channel_unit(field, name)}".rstrip()
-
-
-def _scaled(values: FloatArray) -> FloatArray:
-    """The values in a row of height 0.8, those beyond its range at the edge."""
+def _scale_to_row(values: FloatArray) -> FloatArray:
+    """The values in a row of height 0.8, clipped to its range."""
     low, high = np.nanpercentile(values, _RANGE)
     return np.clip((values - low) / max(high - low, 1e-300), 0.0, 1.0) * 0.8 - 0.4
 
 
-_SPANS = 3
+def _range_text(field: str, name: str, values: FloatArray) -> str:
+    """Range of a row with its unit."""
+    low, high = (f"{x:.3g}" for x in np.nanpercentile(values, _RANGE))
+    return f"{low} to {high} {channel_unit(field, name)}".rstrip()
 
 
 def log_heading(checked: Checked) -> str:
     """Name, length and duration of a log."""
     log = checked.log
-    lasts = log.time[-1] - log.time[0]
-    return f"{Path(log.source).name}: {len(log)} samples, {lasts:.4g} s"
+    return f"{Path(log.source).name}: {len(log)} samples, {log.time[-1] - log.time[0]:.4g} s"
 
 
 def finding_table(findings: Sequence[Finding]) -> Table:
-    """Findings about one log, the gravest first."""
+    """Findings about one log, in the given order."""
     table = Table(show_lines=True, expand=True)
     table.add_column("", no_wrap=True)
     table.add_column("samples", overflow="fold", max_width=12)
     table.add_column("found", overflow="fold", ratio=8)
     table.add_column("what to do", overflow="fold", ratio=5)
-    for finding, *others in _alike(findings):
-        found = f"{finding.field}, {finding.name}: {finding.found}"
+    for finding, *others in _group_alike(findings):
+        text = f"{finding.field}, {finding.name}: {finding.found}"
         if others:
-            found += f"; likewise {join_names([other.field for other in others])}"
-        table.add_row(finding.severity, Text(_places(finding)), Text(found), Text(finding.advice))
+            text += f"; likewise {join_names([other.field for other in others])}"
+        table.add_row(finding.severity, Text(_samples_text(finding)), Text(text), Text(finding.advice))
     return table
 
 
-def _alike(findings: Sequence[Finding]) -> list[list[Finding]]:
-    """Findings, those together that say the same of several fields at the same samples."""
+def _group_alike(findings: Sequence[Finding]) -> list[list[Finding]]:
+    """Findings in groups of the same kind and samples in several fields."""
     rows: dict[object, list[Finding]] = {}
     for finding in findings:
         same = (finding.name, finding.severity, finding.advice, _ranges(finding) or finding)
@@ -154,29 +148,30 @@ def _alike(findings: Sequence[Finding]) -> list[list[Finding]]:
 
 
 def _ranges(finding: Finding) -> tuple[tuple[int, int], ...]:
-    """First and last samples of its spans in ascending order; empty if it concerns all."""
+    """First and last samples of the spans in ascending order; empty for the whole log."""
     return tuple(sorted({(span.first, span.last) for span in finding.spans}))
 
 
-def skipped_checks_text(checked: Checked) -> str:
-    """Checks that could not be made, and why; empty if there are none."""
-    reasons: dict[str, list[str]] = {}
-    for skip in checked.skipped:
-        reasons.setdefault(skip.name, []).append(skip.reason)
-    return "; ".join(f"{name} ({', '.join(why)})" for name, why in reasons.items())
-
-
-def _places(finding: Finding) -> str:
+def _samples_text(finding: Finding) -> str:
     spans = [str(Span(first, last)) for first, last in _ranges(finding)]
     if not spans:
         return "all"
-    some = ", ".join(spans[:_SPANS]) + (f" and {len(spans) - _SPANS} more" if len(spans) > _SPANS else "")
-    return f"all; seen at {some}" if finding.whole else some
+    more = f" and {len(spans) - _MAX_SPANS} more" if len(spans) > _MAX_SPANS else ""
+    text = ", ".join(spans[:_MAX_SPANS]) + more
+    return f"all; shown at {text}" if finding.whole else text
+
+
+def skipped_checks_text(checked: Checked) -> str:
+    """Checks that could not be made, with the reasons; empty if there are none."""
+    reasons: dict[str, list[str]] = {}
+    for skip in checked.skipped:
+        reasons.setdefault(skip.name, []).append(skip.reason)
+    return "; ".join(f"{name} ({', '.join(texts)})" for name, texts in reasons.items())
 
 
 def log_check_document(checked: Sequence[Checked]) -> dict[str, Any]:
-    """Everything that was found, for JSON."""
-    return {"logs": [_log_entry(one) for one in checked]}
+    """Results of all checks, for JSON."""
+    return {"logs": [_log_entry(log) for log in checked]}
 
 
 def _log_entry(checked: Checked) -> dict[str, Any]:

@@ -31,16 +31,16 @@ MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNOBSERVABLE: ".", FIXED: "
 
 
 class PlainConsole(Console):
-    """A console whose own control codes pass, and none that stand in the texts it shows."""
+    """A console that escapes control characters in texts; its own control codes pass."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """The segments of what is shown, of plain text."""
+        """The segments of a renderable, with plain text."""
         for text, style, control in super().render(renderable, options):
             yield Segment(text, style, control) if control else Segment(escape(text, "\n"), style)
 
 
 def terminal_console(stderr: bool = False) -> Console:
-    """A console on standard output or error, past the boundary's escaping, which would also undo its colors."""
+    """A console on standard output or error without the escaping of `boundary`, which would remove its colors."""
     return PlainConsole(file=raw_stream(sys.stderr if stderr else sys.stdout))
 
 
@@ -61,9 +61,9 @@ def table_text(table: Table) -> str:
 
 
 def error_tables(columns: Mapping[str, Comparison[Metrics]]) -> list[Table]:
-    """Errors of predicted forces, nominal against identified, two named sets of logs to a table."""
-    named = list(columns.items())
-    return [_error_table(dict(named[i : i + 2])) for i in range(0, len(named), 2)]
+    """Errors of predicted forces, nominal against identified, two sets of logs to a table."""
+    sets = list(columns.items())
+    return [_error_table(dict(sets[i : i + 2])) for i in range(0, len(sets), 2)]
 
 
 def _error_table(columns: Mapping[str, Comparison[Metrics]]) -> Table:
@@ -73,8 +73,8 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]]) -> Table:
     )
     table.add_column("", no_wrap=True)
     for name in columns:
-        for which in ("URDF", "identified"):
-            table.add_column(Text(f"{name}\n{which}"), justify="right", overflow="fold")
+        for parameter_set in ("URDF", "identified"):
+            table.add_column(Text(f"{name}\n{parameter_set}"), justify="right", overflow="fold")
     for group, label in ERROR_GROUPS.items():
         errors = [_error_cell(m, group) for pair in columns.values() for m in pair]
         table.add_row(Text(label), *errors)
@@ -103,34 +103,13 @@ def state_table(states: Sequence[Mapping[str, Any]]) -> Table:
             str(state["samples"]),
             str(state["rows"]),
             "fixed base" if rank is None else f"{rank} of 6",
-            _shares(state),
+            _rank_share_cell(state),
             "" if smallest is None else f"{smallest:.2g}",
         )
     return table
 
 
-def noise_table(groups: Sequence[Mapping[str, Any]]) -> Table:
-    """Standard deviations that rows were weighed with, by group: fields of `GroupNoise`."""
-    table = Table(title="Noise that rows are weighed with: standard deviations", title_justify="left")
-    for heading in ("", "used", "", "residuals show"):
-        table.add_column(heading, justify="left" if not heading else "right")
-    for one in groups:
-        shown = "-" if one["residual"] is None else f"{one['residual']:.3g}"
-        table.add_row(one["group"], f"{one['used']:.3g} {one['unit']}", one["origin"], shown)
-    return table
-
-
-def noise_advice(suggested: Mapping[str, Any]) -> str:
-    """Noise to state instead of values that residuals contradict."""
-
-    def text(x: float | Sequence[float]) -> str:
-        return f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{one:g}" for one in x) + "]"
-
-    keys = ", ".join(f"{key}: {text(x)}" for key, x in suggested.items())
-    return f"noise         stated values contradict the residuals: state sensors.noise {{{keys}}}, or none of these"
-
-
-def _shares(state: Mapping[str, Any]) -> str:
+def _rank_share_cell(state: Mapping[str, Any]) -> str:
     """Share of the samples with the base at full rank, and the least rank of the others."""
     full, ranks = state["base_full_share"], state["base_rank_shares"]
     if full is None:
@@ -139,20 +118,41 @@ def _shares(state: Mapping[str, Any]) -> str:
     return f"{100 * full:.3g} %" + (f" (least: {lowest})" if lowest < 6 else "")
 
 
+def noise_table(groups: Sequence[Mapping[str, Any]]) -> Table:
+    """Standard deviations that weight the rows, by group: fields of `GroupNoise`."""
+    table = Table(title="Noise that weights the rows: standard deviations", title_justify="left")
+    for heading in ("", "used", "", "residuals show"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for group in groups:
+        residual = "-" if group["residual"] is None else f"{group['residual']:.3g}"
+        table.add_row(group["group"], f"{group['used']:.3g} {group['unit']}", group["origin"], residual)
+    return table
+
+
+def noise_advice(suggested: Mapping[str, Any]) -> str:
+    """A line with the noise that should replace stated values, where residuals contradict them."""
+
+    def text(x: float | Sequence[float]) -> str:
+        return f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{value:g}" for value in x) + "]"
+
+    keys = ", ".join(f"{key}: {text(x)}" for key, x in suggested.items())
+    return f"noise         stated values contradict the residuals: state sensors.noise {{{keys}}}, or none of these"
+
+
 def marks_legend() -> str:
     """The meaning of the marks of verdicts."""
     return ", ".join(f"{mark} {verdict}" for verdict, mark in MARKS.items() if mark)
 
 
 def verdict_table(body_names: Sequence[str], verdicts: np.ndarray) -> Table:
-    """A mark for the verdict, (12 L,), on every parameter of the bodies with any that is free."""
+    """Marks of the verdicts (12 L,) on the parameters, of bodies with a free parameter."""
     table = Table(title=f"Parameters: {marks_legend()}", title_justify="left", box=box.SIMPLE_HEAD)
     table.add_column("body", overflow="fold")
     for name in PARAMETERS:
         table.add_column(name, justify="center")
-    for name, found in zip(body_names, verdicts.reshape(-1, PER_BODY), strict=True):
-        if (found != FIXED).any():
-            table.add_row(Text(name), *(MARKS[verdict] for verdict in found))
+    for name, body_verdicts in zip(body_names, verdicts.reshape(-1, PER_BODY), strict=True):
+        if (body_verdicts != FIXED).any():
+            table.add_row(Text(name), *(MARKS[verdict] for verdict in body_verdicts))
     return table
 
 
@@ -171,7 +171,7 @@ def verdict_counts_table(by_state: Mapping[str, Estimate], together: Estimate) -
     return table
 
 
-def contribution_table(contributions: Contributions, most: int = 12) -> Table:
+def contribution_table(contributions: Contributions, max_rows: int = 12) -> Table:
     """Information that each log, contact state and sensor contributes, the largest of each kind."""
     table = Table(title="What each log, contact state and sensor adds: lost without it", title_justify="left")
     for heading in ("", "samples", "rank alone", "rank lost", "combinations lost", "bits lost"):
@@ -179,37 +179,37 @@ def contribution_table(contributions: Contributions, most: int = 12) -> Table:
     kinds: dict[str, Sequence[Contribution]] = {
         "logs": contributions.logs, "contact states": contributions.states, "sensors": contributions.sensors
     }  # fmt: skip
-    for kind, each in kinds.items():
-        for one in sorted(each, key=lambda x: -x.bits)[:most]:
+    for kind, members in kinds.items():
+        for member in sorted(members, key=lambda x: -x.bits)[:max_rows]:
             counts = ("", "", "")
-            if isinstance(one, PartContribution):
-                counts = (str(one.samples), str(one.rank), str(one.rank_lost))
-            name = Path(one.name).name if kind == "logs" else one.name
-            table.add_row(Text(name), *counts, f"{one.determined:.1f}", f"{one.bits:.1f}")
-        if len(each) > most:
-            table.add_row(f"and {len(each) - most} more {kind}")
+            if isinstance(member, PartContribution):
+                counts = (str(member.samples), str(member.rank), str(member.rank_lost))
+            name = Path(member.name).name if kind == "logs" else member.name
+            table.add_row(Text(name), *counts, f"{member.determined:.1f}", f"{member.bits:.1f}")
+        if len(members) > max_rows:
+            table.add_row(f"and {len(members) - max_rows} more {kind}")
         table.add_section()
     total = contributions.total
     table.add_row("everything", "", "", "", f"{total.determined:.1f}", f"{total.bits:.1f}")
     return table
 
 
-def violation_table(violations: Sequence[Mapping[str, Any]], most: int = 12) -> Table:
-    """Conditions that parameters break, by body, the first of them."""
+def violation_table(violations: Sequence[Mapping[str, Any]], max_rows: int = 12) -> Table:
+    """The first of the conditions that parameters break, by body."""
     title = "Conditions that the identified parameters break"
-    if len(violations) > most:
-        title += f", the first {most} of {len(violations)}"
+    if len(violations) > max_rows:
+        title += f", the first {max_rows} of {len(violations)}"
     table = Table(title=title, title_justify="left")
     for heading in ("body", "condition", "off by"):
         table.add_column(heading, justify="right" if heading == "off by" else "left")
-    for found in violations[:most]:
-        amount = Text(f"{found['amount']:.3g} {found['unit']}")
-        table.add_row(Text(found["body"] or "all"), Text(str(found["condition"])), amount)
+    for violation in violations[:max_rows]:
+        amount = Text(f"{violation['amount']:.3g} {violation['unit']}")
+        table.add_row(Text(violation["body"] or "all"), Text(str(violation["condition"])), amount)
     return table
 
 
 def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
-    """How a simulated robot stood: fields of `Stability` by motion."""
+    """Stability of a simulated robot: fields of `Stability` by motion."""
     table = Table(title="Standing", title_justify="left")
     for heading in (
         "motion",
@@ -219,41 +219,43 @@ def stability_table(motions: Mapping[str, Mapping[str, Any]]) -> Table:
         "effort [%]",
         "feet up [%]",
     ):
-        table.add_column(Text(heading), justify="left" if heading == "motion" else "right")  # [m] is no markup
-    for name, found in motions.items():
-        low, high = found["base_height"]
+        table.add_column(
+            Text(heading), justify="left" if heading == "motion" else "right"
+        )  # as Text: [m] is not markup
+    for name, stability in motions.items():
+        low, high = stability["base_height"]
         table.add_row(
             Text(name),
             f"{low:.3f} to {high:.3f}",
-            f"{1e3 * found['slip']:.1f}",
-            f"{1e3 * found['zmp_margin']:.0f}",
-            f"{100 * found['effort']:.0f}",
-            ", ".join(f"{100 * share:.0f}" for share in found["unloaded"]),
+            f"{1e3 * stability['slip']:.1f}",
+            f"{1e3 * stability['zmp_margin']:.0f}",
+            f"{100 * stability['effort']:.0f}",
+            ", ".join(f"{100 * share:.0f}" for share in stability["unloaded"]),
         )
     return table
 
 
-_COLUMNS, _ROWS = 4, 30
+_MAX_COLUMNS, _MAX_ROWS = 4, 30
 
 
 def extra_table(extras: Sequence[ExtraEstimate]) -> Table:
-    """Extra parameters with standard errors, a row for each, a column for each log; a run's files have all of them."""
+    """Extra parameters with standard errors, a row for each, a column for each log; `parameters.json` has them all."""
     title = "Offsets, scales and actuators, with standard errors; ?: confounded with other parameters"
     table = Table(title=title, title_justify="left")
-    logs = sorted(dict.fromkeys(x.log for x in extras), key=bool)  # what holds for all logs comes first
+    logs = sorted(dict.fromkeys(x.log for x in extras), key=bool)  # terms common to all logs come first
     labels = list(dict.fromkeys(x.extra.label for x in extras))
-    by_place = {(x.extra.label, x.log): x for x in extras}
+    by_label = {(x.extra.label, x.log): x for x in extras}
     table.add_column("", overflow="fold")
     table.add_column("unit", no_wrap=True)
-    shown = logs[:_COLUMNS]
+    shown = logs[:_MAX_COLUMNS]
     for log in shown:
         table.add_column(Text(Path(log).name or "all logs"), justify="right", overflow="fold")
-    for label in labels[:_ROWS]:
+    for label in labels[:_MAX_ROWS]:
         unit = next(x.extra.unit for x in extras if x.extra.label == label)
-        of_logs = (by_place.get((label, log)) for log in shown)
-        table.add_row(Text(label), unit, *("" if x is None else _extra_cell(x) for x in of_logs))
-    hidden = {"row": len(labels) - _ROWS, "log": len(logs) - _COLUMNS}
-    rest = " and ".join(f"{count} {what}{'s' * (count > 1)}" for what, count in hidden.items() if count > 0)
+        cells = (by_label.get((label, log)) for log in shown)
+        table.add_row(Text(label), unit, *("" if x is None else _extra_cell(x) for x in cells))
+    hidden = {"row": len(labels) - _MAX_ROWS, "log": len(logs) - _MAX_COLUMNS}
+    rest = " and ".join(f"{count} {noun}{'s' * (count > 1)}" for noun, count in hidden.items() if count > 0)
     if rest:
         table.add_row(f"and {rest} more: parameters.json")
     return table
@@ -263,13 +265,13 @@ def _extra_cell(extra: ExtraEstimate) -> str:
     mark = "" if extra.separable else " ?"
     if not math.isfinite(extra.standard_error):
         return f"{extra.value:.4g}{mark}"
-    size = float(f"{extra.standard_error:.1e}")  # rounded first: 0.0998 is 0.10, with as many decimals
+    size = float(f"{extra.standard_error:.1e}")  # rounded first: 0.0998 becomes 0.10, with two decimals
     digits = max(0, 1 - math.floor(math.log10(size))) if size > 0.0 else 6
     return f"{extra.value:.{digits}f} ± {size:.{digits}f}{mark}"
 
 
 def progress_bars() -> Progress:
-    """Bars that vanish when their work is done and stay silent where standard error is not a terminal."""
+    """Progress bars that vanish at the end and are not shown where standard error is not a terminal."""
     console = terminal_console(stderr=True)
     columns = (
         SpinnerColumn(),

@@ -33,7 +33,7 @@ class RunEvents:
             folder: where it goes.
             bodies: names of the bodies.
             descent: whether steps are epochs.
-            since: step from which on the contents of earlier event files in the folder are void.
+            since: first step of earlier event files in the folder that is overwritten.
         """
         self._writer = SummaryWriter(str(folder), purge_step=since)
         groups = {
@@ -54,7 +54,7 @@ class RunEvents:
         self._writer.close()
 
     def flush(self) -> None:
-        """Write what is still held in memory."""
+        """Write buffered events."""
         self._writer.flush()
 
     def write_errors(self, step: int, sets: Mapping[str, Metrics], groups: Sequence[str] = tuple(ERROR_GROUPS)) -> None:
@@ -81,7 +81,7 @@ class RunEvents:
         if epoch.held_out is not None:
             scalars["loss_held_out/data"] = epoch.held_out
         scalars |= {f"share_of_force/{name}": value for name, value in epoch.shares.items()}
-        if epoch.closed_form:  # 0 where data without noise are explained in full
+        if epoch.closed_form:  # 0 for a perfect fit of data without noise
             scalars["closed_form/objective_above_least"] = epoch.objective / epoch.closed_form - 1.0
         scalars["closed_form/distance"] = epoch.distance
         scalars["descent/learning_rate"] = epoch.learning_rate
@@ -115,7 +115,7 @@ class RunEvents:
             self._writer.add_scalar(f"fit/{name}", value, step)
 
     def write_identifiability(self, step: int, estimate: Estimate, gain: InformationGain, table: str) -> None:
-        """What the data determine; in the chart of singular values, steps are their places.
+        """Verdicts, information and singular values; in the chart of the latter, steps are their numbers.
 
         Args:
             step: of all other charts.
@@ -139,13 +139,13 @@ class RunEvents:
         figures: Mapping[str, Path],
         step: int,
     ) -> None:
-        """What a finished run adds.
+        """Settings, final metrics and figures of a finished run.
 
         Args:
             settings: resolved configuration, YAML.
             hyperparameters: for the HParams tab.
             final: metrics beside them.
-            figures: PNG files by tag; drawing is what a run's end spends most time on.
+            figures: PNG files by tag, which are not drawn again.
             step: of the figures.
         """
         self._writer.add_text("config", _preformatted(settings))
@@ -157,7 +157,7 @@ class RunEvents:
 
 
 def _preformatted(text: str) -> str:
-    """As a block that Markdown leaves alone."""
+    """The text as a preformatted block of Markdown."""
     return "    " + text.replace("\n", "\n    ")
 
 
