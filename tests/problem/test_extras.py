@@ -8,12 +8,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from misread import CONTACTS, WIDTH, World, with_actuators, world
+from misread import WIDTH, World, with_actuators, world
 from recordings import Miscalibration, with_imu
 from synthetic import G1, Oracle, load, make_log, random_states
 from true_robots import predicted, true_parameters, worst
 from unknowns import Fit, fit
-from welded import SENSORS
+from welded import CONTACTS, SENSORS
 
 from torchid.estimators import Consistent
 from torchid.identifiability.base_parameters import base_parameters

@@ -8,11 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from misread import CONTACTS, world
+from misread import world
 from motions import value
 from recordings import Miscalibration
 from synthetic import Array
 from unknowns import fit
+from welded import CONTACTS
 
 from torchid.identifiability.confounding import disagreements
 from torchid.logs import Log

@@ -13,7 +13,7 @@ from regressors import base_kinds, by_joints_of, seen_from, tensors
 from synthetic import Array, Oracle, load, make_log, random_states
 from true_robots import hide, true_parameters, worst
 from urdfs import BASE, inertial, joint, link, write
-from welded import REAL, SENSORS, machine
+from welded import CONTACTS, REAL, SENSORS, STATES, machine
 
 from torchid import parameters
 from torchid.errors import LogError, UnknownNameError
@@ -21,11 +21,10 @@ from torchid.estimators import LeastSquares
 from torchid.identifiability.base_parameters import state_reports
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
-from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import force_series
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
-from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
+from torchid.sensing import SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
 EXACT = 1e-14  # of the largest number; 3e-15 measured
 
@@ -118,8 +117,6 @@ def test_a_sensor_reads_the_same_wrench_whichever_link_is_the_base(urdf: Path, b
 
 # ------------------------------------------------------------------------------------------------ rows and fits
 
-CONTACTS = (Contact("sole", "flat"), Contact("thigh", "point"), Contact("fin", "line", "z"))
-STATES = [[True, False, False], [False, True, True], [True, True, True], [False, False, False]]
 SETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "limbs alone": ("none", SENSORS),
     "the base's and the tail's": ("none", ("mount_ft", "tail_ft")),
@@ -145,52 +142,6 @@ def recorded(robot: Robot, seed: int, samples: int = 200) -> tuple[Oracle, Sampl
     oracle.perturb(rng, 0.2)
     contacts = [(contact.frame, len(contact.components)) for contact in CONTACTS]
     return oracle, bind_log(make_log(oracle, contacts, STATES, samples, rng), robot, CONTACTS)
-
-
-def jacobian(oracle: Oracle, samples: Samples, contact: Contact) -> Array:
-    """Of the components that a contact can exert, (B, k, nv + 6 F)."""
-    q = samples.coordinates()[0].numpy()
-    return oracle.jacobian(q, contact.frame)[:, list(contact.components)]
-
-
-@base_kinds
-@pytest.mark.parametrize("seed", range(2))
-def test_rows_are_whitened_combinations_of_k_that_no_unmeasured_force_enters(
-    urdf: Path, fixed_base: bool, seed: int
-) -> None:
-    robot = load(urdf, None, fixed_base, SENSORS)
-    oracle, samples = recorded(robot, 4, 40)
-    rng = np.random.default_rng(seed)  # components of sensors in limbs, one by one
-    sensors = SensorSet(rng.random(robot.n_dofs) < 0.7, rng.random((3, 6)) < 0.5)
-    builder = RowBuilder(robot, CONTACTS, sensors)
-    M, base, noise = builder.columns.parameter_map(), robot.base_rows, sensors.noise
-    std = np.append(noise.base_std[:base], noise.dof_std(robot.n, robot.n_dofs))
-    for state, index in chunks_by_state(hide(samples, sensors)):
-        part = hide(samples, sensors)[index]
-        rows, W = (x.numpy() for x in builder.rows_by_sample(part, state))
-        K = dense(robot, *(x.numpy() for x in part.coordinates())).reshape(len(part), len(std), -1)
-        np.testing.assert_allclose(rows[..., :-1] @ M, W.transpose(0, 2, 1) @ K, rtol=0.0, atol=1e-12 * np.abs(K).max())
-        f, cov = np.zeros(K.shape[:2]), np.tile(np.diag(std**2), (len(part), 1, 1))
-        assert samples.torque is not None
-        assert samples.wrench is not None
-        f[:, base:] = np.where(sensors.torque, samples.torque[index], 0.0)
-        unmeasured = [np.tile(np.eye(len(std))[base:][~sensors.torque], (len(part), 1, 1))]
-        for c, contact in enumerate(CONTACTS):
-            if state[c]:
-                J = jacobian(oracle, part, contact)
-                seen = sensors.wrench[c, list(contact.components)]
-                force = samples.wrench[index][:, c, list(contact.components)].numpy()
-                f += np.einsum("bki,bk->bi", J[:, seen], force[:, seen])
-                var = noise.wrench_std[list(contact.components)][seen] ** 2
-                cov += np.einsum("bki,k,bkj->bij", J[:, seen], var, J[:, seen])
-                unmeasured.append(J[:, ~seen])
-        A = np.concatenate(unmeasured, axis=1)
-        np.testing.assert_allclose(A @ W, 0.0, rtol=0.0, atol=1e-11)
-        np.testing.assert_allclose(rows[..., -1], (W.transpose(0, 2, 1) @ f[..., None])[..., 0], rtol=1e-9, atol=1e-9)
-        kept = np.abs(W).max(axis=1) > 0.0
-        assert (kept.sum(1) == len(std) - np.linalg.matrix_rank(A)).all()
-        white = W.transpose(0, 2, 1) @ cov @ W
-        np.testing.assert_allclose(white, kept[:, None] * np.eye(len(std)), rtol=0.0, atol=1e-10)
 
 
 @base_kinds
