@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from intervals import covered
 from scipy import stats
 from scipy.spatial.transform import Rotation
 from synthetic import SOLO12, Array, Oracle, load, make_log
@@ -30,7 +31,6 @@ STATES = [[True] * 4, [False, True, True, True], [True, True, False, True]]
 SAMPLES = 300
 HORIZONTAL, VERTICAL = 2.3, 0.1  # N: of differentiated odometry, 0.9 and 0.04 m/s^2 of a robot of 2.5 kg
 TRUE = SensorNoise(0.1, 0.2, 0.02, (HORIZONTAL, HORIZONTAL, VERTICAL), (0.1, 0.2, 0.05))
-NORMAL = 1.959964
 QUICK, MANY = 8, 200
 
 
@@ -172,16 +172,9 @@ def mass_errors(estimates: list[Estimate], true: Array) -> Array:
     return masses / true.reshape(-1, PER_BODY)[:, MASS].sum() - 1.0
 
 
-def covered(estimates: list[Estimate], true: Array) -> Array:
-    """Share of repeats in which each identified parameter's 95 % interval holds the truth."""
-    known = estimates[0].verdict == "identified"
-    off = np.array([(estimate.phi - true) / estimate.standard_error for estimate in estimates])
-    return (np.abs(off[:, known]) <= NORMAL).mean(axis=0)
-
-
 def check_intervals(scene: Scene, sensors: str, repeats: int) -> None:
     found = fits(scene, sensors, pushed, repeats)
-    after, before = (covered(x, scene.true) for x in (found.estimated, found.guessed))
+    after, before = (covered(x, scene.true).mean(axis=0) for x in (found.estimated, found.guessed))
     assert len(after) > 50
     allowed = stats.binom.ppf([1e-5, 1.0 - 1e-5], repeats, 0.95) / repeats
     assert 0.92 < after.mean() < 0.98

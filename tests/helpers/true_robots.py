@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from synthetic import G1, ROBOTS, Array, Oracle, load, make_log, random_states
+from synthetic import G1, ROBOTS, TALOS_FULL, Array, Oracle, load, make_log, random_states
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
@@ -19,7 +19,6 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
 ANYMAL_B = ROBOTS / "anymal_b_simple_description/robots/anymal.urdf"
-TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
 SAMPLES, UNSEEN = 900, 200
 EXACT = 1e-12  # of the largest force; 3e-15 measured
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from simulated import BIPED, QUADRUPED
-from synthetic import DRONE, G1, PANDA, ROBOTS, Array, load, random_states
+from synthetic import DRONE, G1, PANDA, TALOS_FULL, Array, load, random_states
 from torch import Tensor
 
 from torchid.problem import Batch, MiniBatches, RowBuilder, Samples, compress, linear_problem
@@ -20,7 +20,6 @@ from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors
 
-TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
 NOISE = SensorNoise(joint_torque=0.3, contact_force=1.5, contact_moment=0.1, base_force=0.7, base_moment=0.05)
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 KINDS = {

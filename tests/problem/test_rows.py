@@ -15,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from synthetic import G1, PANDA, ROBOTS, SOLO12, Array, load, random_states
+from synthetic import G1, PANDA, SOLO12, Array, load, random_states
 
 from torchid.logs import Log
 from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
@@ -24,7 +24,6 @@ from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
 from torchid.sensing import Contact, Projection, SensorNoise, SensorSet, named_sensors
 
-TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
 NOISE = SensorNoise(joint_torque=0.3, contact_force=1.5, contact_moment=0.1, base_force=0.7, base_moment=0.05)
 State = tuple[Array, Array, Array]
 

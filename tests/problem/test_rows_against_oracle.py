@@ -18,8 +18,8 @@ import torch
 from motions import value
 from recordings import GRAVITY, in_world, states_of, with_imu
 from scipy.spatial.transform import Rotation
-from synthetic import ANYMAL, DRONE, G1, PANDA, SOLO12, Array, Oracle, load, make_log
-from true_robots import TALOS_FULL, true_parameters
+from synthetic import ANYMAL, DRONE, G1, PANDA, SOLO12, TALOS_FULL, Array, Oracle, load, make_log
+from true_robots import true_parameters
 from welded import CONTACTS, SENSORS, machine
 
 from torchid.logs import Log

@@ -16,6 +16,7 @@ from physical import random_bodies
 from regressors import assert_close, regressor, without_shapes
 from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, G1, PANDA, ROBOTS, ROMEO, TALOS, Array, Oracle, load, make_log, random_states
+from urdfs import words
 
 from torchid import parameters
 from torchid.errors import TorchidWarning
@@ -39,10 +40,10 @@ def machine(folder: Path) -> Path:
     for name in ("base", "slide", "arm", "hand", "finger", "camera", "tool"):
         R = Rotation.random(random_state=rng).as_matrix()
         inertia = R @ np.diag([0.3, 0.4, 0.5] * rng.uniform(0.8, 1.2, 3)) @ R.T
-        numbers = {f"i{'xyz'[i]}{'xyz'[j]}": words(inertia[i, j]) for i in range(3) for j in range(i, 3)}
+        numbers = {f"i{'xyz'[i]}{'xyz'[j]}": words([inertia[i, j]]) for i in range(3) for j in range(i, 3)}
         inertial = etree.Element("inertial")
         etree.SubElement(inertial, "origin", xyz=words(rng.normal(0.0, 0.2, 3)), rpy=words(rng.normal(size=3)))
-        etree.SubElement(inertial, "mass", value=words(rng.uniform(1.0, 3.0)))
+        etree.SubElement(inertial, "mass", value=words([rng.uniform(1.0, 3.0)]))
         etree.SubElement(inertial, "inertia", numbers)
         shape = f'<visual><!-- a {name} --><geometry><sphere radius="0.1"/></geometry><material name="red"/></visual>'
         shape += '<collision><origin rpy="0 1 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
@@ -63,10 +64,6 @@ def machine(folder: Path) -> Path:
     path = folder / "machine.urdf"
     path.write_text(f'<robot name="machine">{"".join(elements)}<transmission name="t"><type/></transmission></robot>')
     return path
-
-
-def words(numbers: Array | float) -> str:
-    return " ".join(repr(float(x)) for x in np.atleast_1d(numbers))
 
 
 def robot_of(name: str, folder: Path, fixed_base: bool = False) -> Robot:

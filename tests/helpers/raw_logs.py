@@ -1,0 +1,33 @@
+"""Log files of raw arrays, valid or not, and the line that reading one is refused with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from refusals import refused
+
+from torchid.errors import LogError
+from torchid.logs import read_log
+
+
+def write_arrays(path: Path, values: Mapping[str, Any]) -> Path:
+    """An archive of arrays as they are, `.npz` or HDF5."""
+    if path.suffix == ".npz":
+        np.savez(path, **values)
+        return path
+    with h5py.File(path, "w") as file:
+        for name, value in values.items():
+            array = np.asarray(value)
+            file[name] = np.char.encode(array) if array.dtype.kind == "U" else array
+    return path
+
+
+def log_refusal(path: Path) -> str:
+    """The one line, of a length to be read, that reading a log fails with."""
+    message = refused(lambda: read_log(path), f"{path}: ", LogError)
+    assert len(message) < 600
+    return message
