@@ -14,17 +14,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
-from synthetic import G1, PANDA, SOLO12, Array, load, random_states
+from random_samples import NOISE, random_samples, sensor_set
+from synthetic import G1, PANDA, SOLO12, Array, load
 
-from torchid.logs import Log
-from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
+from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.predict import force_series
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
-from torchid.sensing import Contact, Projection, SensorNoise, SensorSet, named_sensors
+from torchid.sensing import Contact, Projection, SensorSet, named_sensors
 
-NOISE = SensorNoise(joint_torque=0.3, contact_force=1.5, contact_moment=0.1, base_force=0.7, base_moment=0.05)
 State = tuple[Array, Array, Array]
 
 
@@ -59,37 +57,6 @@ def walker(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 loaded = cache(lambda urdf, fixed_base: load(urdf, fixed_base=fixed_base))
-
-
-def recorded(
-    robot: Robot, contacts: Sequence[Contact], rng: np.random.Generator, samples: int = 40, world: bool = False
-) -> tuple[Samples, State]:
-    """Unrelated random motion, forces and contact states: rows know nothing of whether the dynamics close."""
-    q, v, a = random_states(rng, robot.n, samples, robot.fixed_base)
-    rows, base = robot.base_rows, {}
-    if rows:
-        acceleration = Rotation.from_quat(q[:, 3:7]).apply(a[:, :3] + np.cross(v[:, 3:6], v[:, :3]))
-        base = {
-            "base_quat_xyzw": q[:, 3:7],
-            "base_linear_acceleration_world": acceleration,
-            "base_angular_velocity_base": v[:, 3:6],
-            "base_angular_acceleration_base": a[:, 3:6],
-        }
-    wrench = 20.0 * rng.normal(size=(samples, len(contacts), 6))
-    log = Log(
-        source="random.npz",
-        time=np.arange(samples) * 0.01,
-        joint_names=robot.joint_names,
-        joint_position=q[:, q.shape[1] - robot.n :],
-        joint_velocity=v[:, rows:],
-        joint_acceleration=a[:, rows:],
-        joint_torque=20.0 * rng.normal(size=(samples, robot.n)),
-        contact_names=tuple(contact.frame for contact in contacts),
-        contact_active=rng.integers(0, 2, (samples, len(contacts))).astype(bool),
-        **{"contact_wrench_world" if world else "contact_wrench_local": wrench},
-        **base,
-    )
-    return bind_log(log, robot, contacts), (q, v, a)
 
 
 def local_wrenches(robot: Robot, contacts: Sequence[Contact], samples: Samples) -> torch.Tensor:
@@ -147,15 +114,6 @@ def assert_same_rows(
     np.testing.assert_allclose(X.T @ X / np.outer(size, size), gram / np.outer(size, size), rtol=0.0, atol=1e-13)
 
 
-def sensor_set(name: str, robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
-    if name in ("full", "contacts", "joints"):
-        return named_sensors(name, robot.n, len(contacts), NOISE)
-    torque, wrench = np.zeros(robot.n, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
-    if name == "mixed":
-        torque[::2], wrench[:1], wrench[-1:, 1:3] = True, True, True
-    return SensorSet(torque, wrench, NOISE)
-
-
 SETS = ("full", "contacts", "joints", "mixed", "nothing")
 HELD = {
     "arm held by the hand": (PANDA, "panda_hand", [Contact("panda_link0", "flat")]),
@@ -170,7 +128,7 @@ HELD = {
 def test_fast_rows_are_the_plain_ones_when_another_link_is_the_base(case: str, sensors: str) -> None:
     urdf, base_link, contacts = HELD[case]
     robot = load(urdf, base_link)
-    samples, state = recorded(robot, contacts, np.random.default_rng(1))
+    samples, state = random_samples(robot, contacts, 40, 1)
     assert_same_rows(robot, contacts, sensor_set(sensors, robot, contacts), samples, state)
 
 
@@ -195,7 +153,7 @@ def test_fast_rows_are_the_plain_ones_whatever_is_measured_touches_and_however_f
     contacts = [Contact(c.frame, kinds[rng.integers(3)], "xyz"[rng.integers(3)]) for c in chosen]
     share = rng.random(2)
     sensors = SensorSet(rng.random(robot.n) < share[0], rng.random((len(contacts), 6)) < share[1], NOISE)
-    samples, state = recorded(robot, contacts, rng, 30, world and not fixed_base)
+    samples, state = random_samples(robot, contacts, 30, rng, world and not fixed_base)
     assert_same_rows(robot, contacts, sensors, samples, state)
 
 
@@ -204,7 +162,7 @@ def test_four_points_on_one_rigid_foot_count_once(walker: Path, sensors: str) ->
     """Twelve unmeasured forces on a foot push in six directions: as many equations are left as with a flat foot."""
     robot, rows = load(walker), {}
     for feet in (CONTACTS[:4], CONTACTS[4:5]):
-        samples, state = recorded(robot, feet, np.random.default_rng(2))
+        samples, state = random_samples(robot, feet, 40, 2)
         samples.active[:] = True
         chosen = sensor_set(sensors if sensors != "mixed" else "joints", robot, feet)
         assert_same_rows(robot, feet, chosen, samples, state)
@@ -215,7 +173,7 @@ def test_four_points_on_one_rigid_foot_count_once(walker: Path, sensors: str) ->
 def test_straight_legs_among_bent_ones_give_the_rows_of_their_own_rank() -> None:
     robot = load(SOLO12)
     contacts = [Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR")]
-    samples, (q, v, a) = recorded(robot, contacts, np.random.default_rng(7))
+    samples, (q, v, a) = random_samples(robot, contacts, 40, 7)
     q[::3, 7:] = 0.0
     samples.joint_position[:] = torch.from_numpy(q[:, 7:])
     samples.active[:20] = True
@@ -227,7 +185,7 @@ def test_a_foot_below_unmeasured_joints_of_a_bolted_robot_says_nothing() -> None
     robot = load(SOLO12, fixed_base=True)
     contacts = [Contact("FL_FOOT", "point"), Contact("FR_FOOT", "point")]
     torque = np.array([name.startswith("FR_") for name in robot.joint_names])
-    samples, state = recorded(robot, contacts, np.random.default_rng(5))
+    samples, state = random_samples(robot, contacts, 40, 5)
     for wrench in (True, False):
         sensors = SensorSet(torque, np.full((2, 6), wrench), NOISE)
         assert_same_rows(robot, contacts, sensors, samples, state)
@@ -236,7 +194,7 @@ def test_a_foot_below_unmeasured_joints_of_a_bolted_robot_says_nothing() -> None
 @pytest.mark.parametrize("world", [False, True], ids=["local", "world"])
 def test_evaluation_measures_and_predicts_what_the_plain_path_does(walker: Path, world: bool) -> None:
     robot, rng = load(walker), np.random.default_rng(4)
-    samples, state = recorded(robot, CONTACTS, rng, world=world)
+    samples, state = random_samples(robot, CONTACTS, 40, rng, world)
     builder = RowBuilder(robot, CONTACTS, named_sensors("full", robot.n, len(CONTACTS)))
     phi = rng.normal(size=(3, robot.nominal.size))
     phi.reshape(3, -1, 12)[:, 0, 10:] = 0.0  # the base has no joint
@@ -257,7 +215,7 @@ def test_evaluation_measures_and_predicts_what_the_plain_path_does(walker: Path,
 def test_an_unmeasured_wrench_leaves_the_joints_that_it_does_not_load_measured() -> None:
     robot = load(G1)
     contacts = [Contact("left_ankle_roll_link", "flat"), Contact("right_ankle_roll_link", "flat")]
-    samples, _ = recorded(robot, contacts, np.random.default_rng(6))
+    samples, _ = random_samples(robot, contacts, 40, 6)
     builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, 2))
     known, _ = force_series(builder, samples, robot.nominal.reshape(1, -1))
     samples.wrench[:, 0] = torch.nan
