@@ -131,7 +131,9 @@ def test_both_quaternion_orders_are_one_rotation_without_sign_flips(tmp_path: Pa
     flipped = np.roll(quat, 1, axis=1) * np.array([1, -1, -1, 1, -1, 1.0])[:, None] * 1.0005
     log = read_log(write_arrays(tmp_path / "x.npz", changed(base_quat_xyzw=None, base_quat_wxyz=flipped)))
     assert log.base_quat_xyzw is not None
-    np.testing.assert_allclose(log.base_quat_xyzw * np.sign(quat[0] @ log.base_quat_xyzw[0]), quat, atol=1e-15)
+    np.testing.assert_allclose(
+        log.base_quat_xyzw * np.sign(quat[0] @ log.base_quat_xyzw[0]), quat, rtol=0.0, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(
@@ -150,7 +152,7 @@ def test_components_in_the_other_frame_are_rotated(
     log = read_log(write_arrays(tmp_path / "x.npz", changed(**{canonical: None, given_name: vector})))
     world_base = Rotation.from_quat(file_fields()["base_quat_xyzw"])
     expected = world_base.apply(vector, inverse=to_canonical < 0)
-    np.testing.assert_allclose(getattr(log, canonical), expected, atol=1e-15)
+    np.testing.assert_allclose(getattr(log, canonical), expected, rtol=0.0, atol=1e-15)
     without = changed(**{canonical: None, given_name: vector, "base_quat_xyzw": None})
     assert given_name in log_refusal(write_arrays(tmp_path / "y.npz", without))
 

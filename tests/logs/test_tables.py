@@ -79,7 +79,7 @@ def test_both_quaternion_orders_are_told_apart_by_their_columns(tmp_path: Path, 
         table = columns(**{f"base_quat_{order}__{axis}": quat[axis] for axis in "zwxy"})
         log = read_log(save(tmp_path / f"{order}{suffix}", table))
         assert log.base_quat_xyzw is not None
-        np.testing.assert_allclose(log.base_quat_xyzw[1], [0.1, 0.7, 0.5, 0.5], atol=1e-15)
+        np.testing.assert_allclose(log.base_quat_xyzw[1], [0.1, 0.7, 0.5, 0.5], rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("flags", [[1, 0, 1], ["true", "FALSE", "True"], ["1.0", "0", " 1.000e+00"]])

@@ -150,11 +150,12 @@ def test_offsets_and_scales_are_exact_with_readings_in_the_air() -> None:
     sensors = named_sensors("full", robot.n, len(CONTACTS), NOISE, len(robot.ft_names))
     for terms, given, expected in ((OFFSETS, log, np.ones((3, 6))), (scaled, read, gain)):
         found = fit(robot, CONTACTS, sensors, replace(terms, offsets=ALL.offsets), [bound(given)])
-        for x in found.extras:
-            if x.extra.contact is not None:
-                contact, axis = x.extra.contact
-                true = off.wrench[contact, axis] if x.extra.what == "offset" else expected[contact, axis] - 1.0
-                assert x.value == pytest.approx(true, rel=1e-7, abs=1e-8), x.extra.label
+        of_contacts = {x.extra.label: x for x in found.extras if x.extra.contact is not None}
+        assert len(of_contacts) == (15 if given is log else 15 + 9)  # of vectors along world axes, all three
+        for label, x in of_contacts.items():
+            contact, axis = x.extra.contact
+            true = off.wrench[contact, axis] if x.extra.what == "offset" else expected[contact, axis] - 1.0
+            assert x.value == pytest.approx(true, rel=1e-7, abs=1e-8), label
 
 
 def test_parts_of_readings_in_the_air_are_beside_those_of_samples_which_stay_as_they_are() -> None:

@@ -54,7 +54,7 @@ def test_the_limbs_of_real_robots_are_mirror_images_and_so_is_their_matter(case:
     assert len(pairs) == count
     scale, off = parameter_scale(robot.nominal), []
     for pair in pairs:
-        np.testing.assert_allclose(pair.reflection @ pair.reflection.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(pair.reflection @ pair.reflection.T, np.eye(3), rtol=0.0, atol=1e-12)
         assert np.linalg.det(pair.reflection) == pytest.approx(-1.0)
         image = mirror_matrix(pair.reflection) @ robot.nominal[pair.body]
         off.append(float(np.abs((image - robot.nominal[pair.image]) / scale[pair.image])[:10].max()))
