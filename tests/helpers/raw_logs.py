@@ -1,13 +1,15 @@
-"""Log files of raw arrays, valid or not, and the line that reading one is refused with."""
+"""Log files of raw arrays, valid or not, and refusals to read one."""
 
 from __future__ import annotations
 
+import builtins
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import pytest
 from refusals import refused
 
 from torchid.errors import LogError
@@ -31,3 +33,15 @@ def log_refusal(path: Path) -> str:
     message = refused(lambda: read_log(path), f"{path}: ", LogError)
     assert len(message) < 600
     return message
+
+
+def without_package(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if a package were not installed."""
+    load = builtins.__import__
+
+    def absent(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.startswith(package):
+            raise ImportError(name, name=package)
+        return load(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", absent)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from raw_logs import log_refusal
+from raw_logs import log_refusal, without_package
 
 from torchid.errors import LogError, UnknownNameError
 from torchid.guards import MAX_COLUMNS
@@ -263,14 +262,7 @@ def test_a_long_text_in_every_row_of_a_parquet_file_is_kept_once(tmp_path: Path)
 
 def test_without_pyarrow_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save(tmp_path / "x.csv", columns())
-    load = builtins.__import__
-
-    def absent(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("pyarrow"):
-            raise ImportError(name)
-        return load(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", absent)
+    without_package("pyarrow", monkeypatch)
     assert "pip install '.[tables]'" in log_refusal(path)
     with pytest.raises(LogError, match="pyarrow is not installed"):
         write_log(Log("x", np.zeros(1), (), np.zeros((1, 0))), tmp_path / "y.parquet")

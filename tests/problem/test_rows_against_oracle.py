@@ -28,8 +28,9 @@ from torchid.problem.chunks import chunks_by_state
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
-NOISE = SensorNoise(0.3, 1.5, 0.1, base_force=0.7, base_moment=0.05, ft_force=0.9, ft_moment=0.02)
-JOINT, BASE, WRENCH, LIMB = 0.3, *(np.repeat(pair, 3) for pair in ((0.7, 0.05), (1.5, 0.1), (0.9, 0.02)))  # once more
+BASE = np.array([0.7, 0.9, 1.1, 0.05, 0.06, 0.08])  # standard deviations along the axes of the levelled base
+NOISE = SensorNoise(0.3, 1.5, 0.1, tuple(BASE[:3].tolist()), tuple(BASE[3:].tolist()), ft_force=0.9, ft_moment=0.02)
+JOINT, WRENCH, LIMB = 0.3, *(np.repeat(pair, 3) for pair in ((1.5, 0.1), (0.9, 0.02)))  # of NOISE once more
 EXACT = 1e-11  # of the largest number; 1e-12 measured
 
 SOLES = tuple(Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right"))
@@ -157,13 +158,28 @@ def with_wild_unmeasured_forces(r: Recorded, sensors: SensorSet) -> Log:
 # -------------------------------------------------------------------------------------------------------------- rows
 
 
-def measured_force(r: Recorded, sensors: SensorSet, i: int) -> tuple[Array, Array, Array]:
-    """Of one sample: f (nv + 6 F,), its covariance, and what each unmeasured force does to it, (k_x, nv + 6 F)."""
+def base_axes(quat_xyzw: Array) -> Array:
+    """Axes that the noise of the base is along, as columns: its own, tilted until the nearest one is vertical."""
+    up = Rotation.from_quat(quat_xyzw).inv().apply([0.0, 0.0, 1.0])
+    nearest = np.where(np.abs(up) == np.abs(up).max(), np.sign(up), 0.0)
+    across = np.cross(nearest, up)
+    angle = np.arctan2(np.linalg.norm(across), nearest @ up)
+    return Rotation.from_rotvec(angle * across / np.linalg.norm(across)).as_matrix()
+
+
+def measured_force(r: Recorded, log: Log, sensors: SensorSet, i: int) -> tuple[Array, Array, Array]:
+    """Of one sample: f (nv + 6 F,), its covariance, and what each unmeasured force does to it, (k_x, nv + 6 F).
+
+    The covariance is that of a log in its own convention: without an orientation it is along the base's own axes.
+    """
     base, n = r.robot.base_rows, r.robot.n
     std = np.concatenate([BASE[:base], np.full(n, JOINT), np.tile(LIMB, len(r.robot.ft_names))])
     limbs = () if r.log.ft_wrench is None else r.log.ft_wrench[i].flatten()
     torque = np.append(value(r.log.joint_torque)[i], limbs)
     f, covariance = np.append(np.zeros(base), np.where(sensors.torque, torque, 0.0)), np.diag(std**2)
+    if base and log.base_quat_xyzw is not None:
+        axes = np.kron(np.eye(2), base_axes(log.base_quat_xyzw[i]))
+        covariance[:6, :6] = axes @ covariance[:6, :6] @ axes.T
     unmeasured = [np.eye(len(std))[base:][~sensors.torque]]
     for c, contact in enumerate(r.contacts):
         if value(r.log.contact_active)[i, c]:
@@ -204,10 +220,11 @@ def test_rows_are_white_combinations_of_pinocchios_equations_that_no_unmeasured_
     r, recorded_as = recorded(name), CONVENTIONS[convention]
     builder = row_builder(name, sensors)
     chosen = builder.sensors
-    rows, W = rows_of(r, builder, recorded_as(r, r.log))
+    log = recorded_as(r, r.log)
+    rows, W = rows_of(r, builder, log)
     size = np.abs(W).max(initial=1.0) * max(np.abs(r.K).max(), 100.0)
     for i in range(len(r.log)):
-        f, covariance, unmeasured = measured_force(r, chosen, i)
+        f, covariance, unmeasured = measured_force(r, log, chosen, i)
         kept = W[i].any(axis=0)
         assert kept.sum() == len(f) - np.linalg.matrix_rank(unmeasured)
         assert_close(unmeasured @ W[i], 0.0, np.abs(W[i]).max(initial=1.0))
