@@ -23,6 +23,11 @@ SAMPLES, UNSEEN = 900, 200
 EXACT = 1e-12  # of the largest force; 3e-15 measured
 
 
+def stepping(feet: int) -> list[list[bool]]:
+    """Every foot down, and each lifted in turn."""
+    return [[True] * feet, *([foot != lifted for foot in range(feet)] for lifted in range(feet))]
+
+
 @dataclass(frozen=True)
 class Kind:
     """A robot, its feet, and the joints of the leg above the first foot."""
@@ -40,9 +45,8 @@ class Kind:
     def states(self) -> list[list[bool]]:
         """Every foot down, each lifted in turn, a trot for a quadruped, flight."""
         count = len(self.feet)
-        one_lifted = [[foot != lifted for foot in range(count)] for lifted in range(count)]
         trot = [[True, False, False, True]] if count == 4 else []
-        return [[True] * count, *one_lifted, *trot, [False] * count]
+        return [*stepping(count), *trot, [False] * count]
 
 
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
