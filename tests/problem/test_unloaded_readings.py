@@ -107,6 +107,16 @@ def test_a_filter_leaves_readings_in_the_air_as_they_were_recorded(settings: dic
     assert np.isfinite(found).mean() == pytest.approx(find_unloaded(time, active).mean(), abs=0.02)
 
 
+def test_all_that_is_said_of_contacts_is_in_the_order_of_the_experiment() -> None:
+    log = swinging()[0]
+    log = replace(log, contact_share=0.5 * value(log.contact_active) + [0.1, 0.2, 0.3])
+    there, back = (bind_log(log, world().robot, contacts) for contacts in (CONTACTS, CONTACTS[::-1]))
+    for name in ("active", "wrench", "share", "unloaded"):
+        columns = value(getattr(there, name)).numpy()
+        assert not np.array_equal(columns[:, 0], columns[:, -1], equal_nan=columns.dtype != bool)
+        np.testing.assert_array_equal(value(getattr(back, name)).numpy(), columns[:, ::-1], err_msg=name)
+
+
 def test_a_contact_whose_offset_is_not_asked_for_has_no_equation_in_the_air() -> None:
     log, _ = swinging()
     for terms in (ExtraTerms(), ExtraTerms(offsets={"joint_torque": "log"}), ExtraTerms(scales=EVERY)):
