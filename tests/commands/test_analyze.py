@@ -108,7 +108,7 @@ def test_the_plan_is_the_smallest_and_says_what_each_sensor_is_for(with_logs: tu
     assert plan["proven"]
     assert plan["cost"] == plan["lower_bound"] == 12
     assert {need["sensors"] for need in plan["needs"]} == {3}
-    assert all(check["random_postures"]["rank"] == 6 for check in plan["checks"])
+    assert {check["random_postures"]["rank"] for check in plan["checks"]} == {6}
     for part in plan["parts"]:
         bits = [found["bits"] for found in part["cheapest"]]
         assert bits == sorted(bits, reverse=True)
@@ -149,7 +149,7 @@ def test_the_stack_of_all_samples_needs_far_fewer_sensors(experiment: Path) -> N
     plan = json.loads((experiment / "stack.analysis" / "analysis.json").read_text())["scenarios"]["step"]
     assert plan["stack"]["rank"] == plan["stack"]["full"]
     assert plan["cost"] < 12
-    assert all(without["stack_rank"] < plan["stack"]["full"] for without in plan["without"])
+    assert max(without["stack_rank"] for without in plan["without"]) < plan["stack"]["full"]
 
 
 REFUSED = {

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from misread import CONTACTS, STATES, WIDTH, World, with_actuators
+from misread import WIDTH, World, with_actuators
 from motions import value
 from recordings import Miscalibration
 from synthetic import Oracle, load, make_log
-from welded import SENSORS, machine
+from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.cli import main
 from torchid.config import load_config

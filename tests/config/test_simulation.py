@@ -52,13 +52,6 @@ ALL: dict[str, Any] = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    path = tmp_path / "simulations" / "simulation.yaml"
-    path.parent.mkdir()
-    return path
-
-
 def load(file: Path, settings: Any, *overrides: str) -> SimulationConfig:
     file.write_text(settings if isinstance(settings, str) else yaml.safe_dump(settings))
     return load_simulation(file, overrides)
@@ -229,7 +222,7 @@ def test_each_of_the_four_keys_is_needed(file: Path, key: str) -> None:
 
 
 def test_a_file_that_is_no_simulation_is_named(file: Path) -> None:
-    with pytest.raises(ConfigError, match="simulation.yaml: file: cannot be read .*accepted: a YAML simulation file"):
+    with pytest.raises(ConfigError, match="experiment.yaml: file: cannot be read .*accepted: a YAML simulation file"):
         load_simulation(file)
     with pytest.raises(ConfigError, match="accepted: a mapping with robot, feet, motions, output"):
         load(file, "- a\n- b\n")

@@ -11,7 +11,7 @@ import pytest
 import torch
 from repository import DEMO
 from synthetic import G1, SOLO12, Array, Oracle, load, make_log, random_states
-from true_robots import true_parameters
+from true_robots import stepping, true_parameters
 
 from torchid import parameters
 from torchid.estimators import Conditions, Consistent, LeastSquares, violations
@@ -37,9 +37,8 @@ class Kind:
     def states(self) -> list[list[bool]]:
         """All feet down, each lifted in turn, a trot for a quadruped."""
         count = len(self.feet)
-        one_lifted = [[foot != lifted for foot in range(count)] for lifted in range(count)]
         trot = [[True, False, False, True], [False, True, True, False]] if count == 4 else []
-        return [[True] * count, *one_lifted, *trot]
+        return [*stepping(count), *trot]
 
 
 KINDS = {

@@ -11,18 +11,15 @@ import numpy as np
 from motions import value
 from recordings import Miscalibration, in_world
 from synthetic import Oracle, load, make_log
-from welded import SENSORS, machine
+from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.logs import Log
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import ExtraTerms, RowBuilder
 from torchid.problem.extras import recorded_components
 from torchid.robot import Robot
-from torchid.sensing import Contact
 
 KINDS = {"f": "force", "m": "moment"}
-CONTACTS = (Contact("sole", "flat"), Contact("thigh", "point"), Contact("fin", "line", "z"))
-STATES = [[True, False, False], [False, True, True], [True, True, True], [False, False, False]]
 WIDTH = 0.3  # [rad/s] of the sign of velocities
 
 

@@ -23,12 +23,21 @@ POSE = (
 
 
 def states_of(log: Log) -> tuple[Array, Array, Array]:
-    """Generalized coordinates of a floating base whose origin happens to be at rest where the world's is."""
+    """Generalized coordinates of a floating base whose origin happens to be at rest where the world's is, or of joints.
+
+    A log without the base's acceleration is one of a bolted robot.
+    """
+    joints = (log.joint_position, value(log.joint_velocity), value(log.joint_acceleration))
+    if log.base_linear_acceleration_world is None:
+        return joints
     quat, still = value(log.base_quat_xyzw), np.zeros((len(log), 3))
     linear = Rotation.from_quat(quat).inv().apply(value(log.base_linear_acceleration_world))
-    q = np.hstack([still, quat, log.joint_position])
-    v = np.hstack([still, value(log.base_angular_velocity_base), value(log.joint_velocity)])
-    a = np.hstack([linear, value(log.base_angular_acceleration_base), value(log.joint_acceleration)])
+    base = (
+        np.hstack([still, quat]),
+        np.hstack([still, value(log.base_angular_velocity_base)]),
+        np.hstack([linear, value(log.base_angular_acceleration_base)]),
+    )
+    q, v, a = (np.hstack(pair) for pair in zip(base, joints, strict=True))
     return q, v, a
 
 
@@ -63,11 +72,13 @@ def with_imu(oracle: Oracle, log: Log, frame: str, keep: Sequence[str] = ()) -> 
 
 
 def in_world(oracle: Oracle, log: Log) -> Log:
-    """The log with its contact wrenches along world axes."""
+    """The log with its contact wrenches along world axes; a bolted base may be mounted askew."""
     q, local = states_of(log)[0], value(log.contact_wrench_local)
+    bolted = not oracle.base and log.base_quat_xyzw is not None
+    mounting = Rotation.from_quat(log.base_quat_xyzw).as_matrix() if bolted else np.eye(3)
     turned = np.empty_like(local)
     for k, frame in enumerate(log.contact_names):
-        R = oracle.pose(q, frame)[0]
+        R = mounting @ oracle.pose(q, frame)[0]
         turned[:, k] = (local[:, k].reshape(-1, 2, 3) @ R.transpose(0, 2, 1)).reshape(-1, 6)
     return replace(log, contact_wrench_local=None, contact_wrench_world=turned)
 

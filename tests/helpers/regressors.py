@@ -37,9 +37,9 @@ def tensors(*arrays: Array) -> tuple[Tensor, ...]:
 
 
 def regressor(robot: Robot, *state: Array) -> Array:
-    """K, (B, nv, L, 12)."""
+    """K, (B, nv + 6 F, L, 12)."""
     K = Regressor(robot)(*tensors(*state)).numpy()
-    return K.reshape(len(state[0]), robot.nv, len(robot.bodies), parameters.PER_BODY)
+    return K.reshape(*K.shape[:2], len(robot.bodies), parameters.PER_BODY)
 
 
 def assert_close(found: Array, expected: Array, relative: float = 1e-14) -> None:

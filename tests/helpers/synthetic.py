@@ -37,6 +37,7 @@ SOLO8 = ROBOTS / "solo_description/robots/solo.urdf"
 G1 = ROBOTS / "g1_description/urdf/g1_29dof_rev_1_0.urdf"
 ANYMAL = ROBOTS / "anymal_c_simple_description/urdf/anymal.urdf"
 TALOS = ROBOTS / "talos_data/robots/talos_reduced.urdf"
+TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
 PANDA = ROBOTS / "panda_description/urdf/panda.urdf"
 BAXTER = ROBOTS / "baxter_description/urdf/baxter.urdf"
 TIAGO = ROBOTS / "tiago_description/robots/tiago_no_hand.urdf"
@@ -168,6 +169,16 @@ class Oracle:
                 out[sample, :, body, PINOCCHIO_ORDER] = by_body[:, place - 1].T
         return out
 
+    def friction_regressor(self, robot: Robot, v: Array) -> Array:
+        """Columns (B, nv + 6 F, L, 2) of Coulomb and viscous friction by the robot's bodies."""
+        out = np.zeros((len(v), self.expand.shape[1], len(robot.bodies), 2))
+        names = [body.joint.name if body.joint else "" for body in robot.bodies]
+        for name, ratios in zip(self.moving, self.ratios, strict=True):
+            velocity = v[:, self.base :] @ ratios
+            column = np.stack([np.sign(velocity), velocity], axis=1)
+            out[:, self.base : v.shape[1], names.index(name)] = ratios[:, None] * column[:, None]
+        return out
+
     def _places(self, robot: Robot) -> list[tuple[int, int]]:
         """Pairs of our body and Pinocchio's; the bolted base has none."""
         return [
@@ -254,8 +265,8 @@ def random_states(
 
 
 def _close_the_dynamics(
-    oracle: Oracle, q: Array, v: Array, a: Array, contacts: Sequence[tuple[str, int]], active: NDArray[np.bool_],
-    rng: np.random.Generator,
+    oracle: Oracle, q: Array, v: Array, a: Array, contacts: Sequence[tuple[str, Sequence[int]]],
+    active: NDArray[np.bool_], rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Accelerations (B, nv), torques (B, n + 6 F) and wrenches (B, C, 6) that obey the dynamics, with random forces.
 
@@ -270,7 +281,7 @@ def _close_the_dynamics(
     needed = oracle.forces(q, v, a)
     through_contacts = np.zeros_like(needed)
     for i in range(len(q)):
-        rows = [(k, component) for k, (_, size) in enumerate(contacts) if active[i, k] for component in range(size)]
+        rows = [(k, component) for k, (_, pushed) in enumerate(contacts) if active[i, k] for component in pushed]
         J_C = np.array([J[i, k, component] for k, component in rows]).reshape(-1, needed.shape[1])
         force = 20.0 * rng.normal(size=len(rows))
         if base:
@@ -287,7 +298,7 @@ def _close_the_dynamics(
 
 def make_log(
     oracle: Oracle,
-    contacts: Sequence[tuple[str, int]],
+    contacts: Sequence[tuple[str, int | Sequence[int]]],
     states: Sequence[Sequence[bool]],
     samples: int,
     rng: np.random.Generator,
@@ -298,7 +309,7 @@ def make_log(
 
     Args:
         oracle: the true robot.
-        contacts: frames with the number of components, 3 or 6, they can exert.
+        contacts: frames with the components of a wrench that they can exert, or the number of the first of these.
         states: contact states to cycle through, flight included.
         samples: number of samples.
         rng: draws states and internal forces.
@@ -307,7 +318,8 @@ def make_log(
     """
     q, v, a = random_states(rng, len(oracle.joint_names), samples, not oracle.base, tilt)
     active = np.array([states[i % len(states)] for i in range(samples)], dtype=bool).reshape(samples, len(contacts))
-    a, torque, wrench = _close_the_dynamics(oracle, q, v, a, contacts, active, rng)
+    pushing = [(name, range(size) if isinstance(size, int) else size) for name, size in contacts]
+    a, torque, wrench = _close_the_dynamics(oracle, q, v, a, pushing, active, rng)
     extra, n = 7 if oracle.base else 0, len(oracle.joint_names)
     base: dict[str, Any] = {}
     if oracle.base:

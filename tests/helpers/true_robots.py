@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from synthetic import G1, ROBOTS, Array, Oracle, load, make_log, random_states
+from synthetic import G1, ROBOTS, TALOS_FULL, Array, Oracle, load, make_log, random_states
 
 from torchid import parameters
 from torchid.estimators import Estimate, LeastSquares
@@ -19,9 +19,13 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
 ANYMAL_B = ROBOTS / "anymal_b_simple_description/robots/anymal.urdf"
-TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
 SAMPLES, UNSEEN = 900, 200
 EXACT = 1e-12  # of the largest force; 3e-15 measured
+
+
+def stepping(feet: int) -> list[list[bool]]:
+    """Every foot down, and each lifted in turn."""
+    return [[True] * feet, *([foot != lifted for foot in range(feet)] for lifted in range(feet))]
 
 
 @dataclass(frozen=True)
@@ -41,9 +45,8 @@ class Kind:
     def states(self) -> list[list[bool]]:
         """Every foot down, each lifted in turn, a trot for a quadruped, flight."""
         count = len(self.feet)
-        one_lifted = [[foot != lifted for foot in range(count)] for lifted in range(count)]
         trot = [[True, False, False, True]] if count == 4 else []
-        return [[True] * count, *one_lifted, *trot, [False] * count]
+        return [*stepping(count), *trot, [False] * count]
 
 
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")

@@ -8,8 +8,14 @@ import numpy as np
 from synthetic import BAXTER, G1, PANDA, SOLO12, TALOS, TIAGO, TIAGO_PRO
 from urdfs import inertial, joint, link, write
 
+from torchid.sensing import Contact
+
 SENSORS = ("mount_ft", "thigh_ft", "ankle_ft", "tail_ft")
 """Of `machine`: at the base, above a knee, below it, and beyond a joint that mimics another."""
+
+CONTACTS = (Contact("sole", "flat"), Contact("thigh", "point"), Contact("fin", "line", "z"))
+"""Of `machine`: beyond, before and between sensors."""
+STATES = [[True, False, False], [False, True, True], [True, True, True], [False, False, False]]
 
 REAL = {
     "wrist and sole of Talos": (TALOS, ("wrist_right_ft_joint", "leg_left_sole_fix_joint")),
@@ -25,7 +31,7 @@ REAL = {
 
 
 def machine(folder: Path, seed: int = 0) -> Path:
-    """A leg with a slide for a knee, an arm, a tail that mimics the hip; every pose, axis and inertia is skew.
+    """A leg with a slide for a knee, an arm without stops, a tail that mimics the hip; all is skew.
 
     Links: trunk, hips beyond a weld, thigh, shin beyond a weld, foot, sole beyond a weld, tail, fin beyond a weld and
     hand.
@@ -59,5 +65,5 @@ def machine(folder: Path, seed: int = 0) -> Path:
         placed("ankle_ft", "foot", "sole", "fixed"),
         placed("tail_joint", "trunk", "tail", extra='<mimic joint="hip" multiplier="-1.3" offset="0.2"/>'),
         placed("tail_ft", "tail", "fin", "fixed"),
-        placed("shoulder", "hips", "hand"),
+        placed("shoulder", "hips", "hand", "continuous"),
     )

@@ -27,7 +27,7 @@ from bags import (
     topics_of,
     write_bag,
 )
-from hostile_logs import mutated
+from hostile_logs import mutations
 from mcap.writer import CompressionType, Writer
 from rosbags import rosbag1
 
@@ -51,13 +51,8 @@ def write(path: Path, log: Log) -> Path:
 
 def damaged(folder: Path, suffix: str, count: int, seed: int) -> Cases:
     """A valid file cut off at any place, with bits flipped, with runs of bytes replaced, moved or repeated."""
-    rng = np.random.default_rng(seed)
     path = folder / f"damaged{suffix}"
-    whole = write(path, recorded(12)).read_bytes()
-    for number in range(count):
-        kind, content = mutated(whole, rng)
-        path.write_bytes(content)
-        yield f"{kind} {number}", path
+    return mutations(path, [write(path, recorded(12)).read_bytes()], count, np.random.default_rng(seed))
 
 
 # -------------------------------------------------------------------------------------------------------------- bags

@@ -17,8 +17,9 @@ import pyarrow.parquet as pq
 import zstandard
 from bags import ROS1, filled, joint_state
 from hostile_bags import _cdr
-from hostile_logs import N, fields, write
+from hostile_logs import N, fields
 from hostile_robots import INERTIAL
+from raw_logs import write_arrays
 
 MEBIBYTE = 2**20
 STATE = "sensor_msgs/msg/JointState"
@@ -52,7 +53,7 @@ def _chunk(content: bytes, **options: Any) -> Callable[[Path], None]:
     """A log whose torques are one chunk of a given content."""
 
     def make(path: Path) -> None:
-        write(path, {name: x for name, x in fields().items() if name != "joint_torque"})
+        write_arrays(path, {name: x for name, x in fields().items() if name != "joint_torque"})
         with h5py.File(path, "a") as file:
             made = file.create_dataset("joint_torque", (N, 2), "f8", chunks=(N, 2), **{"compression": "gzip"} | options)
             made.id.write_direct_chunk((0, 0), content)
@@ -68,7 +69,7 @@ def _tiny_chunks(path: Path) -> None:
 
 def _twice_pressed(path: Path) -> None:
     """By a filter that is there twice."""
-    write(path, {name: x for name, x in fields().items() if name != "joint_torque"})
+    write_arrays(path, {name: x for name, x in fields().items() if name != "joint_torque"})
     with h5py.File(path, "a") as file:
         plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         plist.set_chunk((N, 2))
@@ -80,7 +81,7 @@ def _twice_pressed(path: Path) -> None:
 
 def _chunks_of_text(path: Path) -> None:
     """Each name would unpack all of them again."""
-    write(path, {name: x for name, x in fields().items() if name != "joint_names"})
+    write_arrays(path, {name: x for name, x in fields().items() if name != "joint_names"})
     with h5py.File(path, "a") as file:
         options = {"chunks": (2**22,), "maxshape": (None,), "compression": "gzip"}
         file.create_dataset("joint_names", data=[f"j{k}" for k in range(9000)], dtype=h5py.string_dtype(), **options)

@@ -9,14 +9,15 @@ from typing import Any
 
 import h5py
 import numpy as np
-from hostile_logs import Cases, N, fields, void, write
+from hostile_logs import Cases, N, fields, void
+from raw_logs import write_arrays
 
 
 def hdf5(folder: Path) -> Cases:
     """HDF5 files made by hand."""
-    other = write(folder / "other.h5", fields())
+    other = write_arrays(folder / "other.h5", fields())
     for name, make in _HDF5.items():
-        path = write(folder / "log.h5", {key: x for key, x in fields().items() if key != "joint_torque"})
+        path = write_arrays(folder / "log.h5", {key: x for key, x in fields().items() if key != "joint_torque"})
         with h5py.File(path, "a") as file:
             make(file, other)
         yield name, path

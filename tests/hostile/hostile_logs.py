@@ -7,12 +7,13 @@ import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+from raw_logs import write_arrays
 
 Cases = Iterator[tuple[str, Path]]
 N = 40
@@ -37,25 +38,17 @@ def fields(samples: int = N) -> dict[str, Any]:
     }
 
 
-def write(path: Path, values: dict[str, Any]) -> Path:
-    """A log file of raw arrays, valid or not."""
-    if path.suffix == ".npz":
-        np.savez(path, **values)
-        return path
-    with h5py.File(path, "w") as file:
-        for name, value in values.items():
-            array = np.asarray(value)
-            file[name] = np.char.encode(array) if array.dtype.kind == "U" else array
-    return path
-
-
 def damaged(folder: Path, suffix: str, count: int, seed: int) -> Cases:
     """A valid file cut off at any place, with bits flipped, with runs of bytes replaced, moved or repeated."""
-    rng = np.random.default_rng(seed)
     path = folder / f"damaged{suffix}"
-    whole, compressed = write(path, fields()).read_bytes(), _compressed(path).read_bytes()
+    whole, compressed = write_arrays(path, fields()).read_bytes(), _compressed(path).read_bytes()
+    return mutations(path, [compressed, whole, whole], count, np.random.default_rng(seed))
+
+
+def mutations(path: Path, whole: Sequence[bytes], count: int, rng: np.random.Generator) -> Cases:
+    """A file of one content after the other, each with a random mutation."""
     for number in range(count):
-        kind, content = mutated(whole if number % 3 else compressed, rng)
+        kind, content = mutated(whole[number % len(whole)], rng)
         path.write_bytes(content)
         yield f"{kind} {number}", path
 
@@ -117,7 +110,7 @@ _TYPES = ("c16", "?", "i1", "u8", "f2", ">f8", "S3", "V7", [("a", "f8"), ("b", "
 
 
 def _named(folder: Path, name: str, suffix: str, content: dict[str, Any]) -> tuple[str, Path]:
-    return name, write(folder / f"values{suffix}", content)
+    return name, write_arrays(folder / f"values{suffix}", content)
 
 
 # ------------------------------------------------------------------------------------------------------------- archives
@@ -146,7 +139,7 @@ def archives(folder: Path) -> Cases:
 
 def _with_entry(path: Path, entry: str, content: bytes, method: int) -> Path:
     """A log with one entry more, or one in place of another."""
-    write(path, {name: x for name, x in fields().items() if f"{name}.npy" != entry})
+    write_arrays(path, {name: x for name, x in fields().items() if f"{name}.npy" != entry})
     with zipfile.ZipFile(path, "a", method) as archive:
         archive.writestr(entry, content)
     return path
@@ -226,13 +219,13 @@ _ENTRY_NAMES = {
 
 
 def _twice(path: Path) -> None:
-    write(path, fields())
+    write_arrays(path, fields())
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("time.npy", archive.read("time.npy"))
 
 
 def _also_without_suffix(path: Path) -> None:
-    write(path, fields())
+    write_arrays(path, fields())
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("time", archive.read("time.npy"))
 
@@ -241,7 +234,7 @@ def _bomb(mebibytes: int, declared: int | None = None) -> Callable[[Path], None]
     """Zeros without end, of a declared size that may be a lie."""
 
     def make(path: Path) -> None:
-        write(path, {name: x for name, x in fields().items() if name != "joint_torque"})
+        write_arrays(path, {name: x for name, x in fields().items() if name != "joint_torque"})
         press = zlib.compressobj(9, wbits=-15)
         start = header(f"({mebibytes * 2**16}, 2)")
         first = press.compress(start) + press.flush(zlib.Z_FULL_FLUSH)
@@ -275,7 +268,7 @@ def _flagged(offset: int, value: int) -> Callable[[Path], None]:
     """A field of every central directory entry set."""
 
     def make(path: Path) -> None:
-        data = bytearray(write(path, fields()).read_bytes())
+        data = bytearray(write_arrays(path, fields()).read_bytes())
         place = data.find(b"PK\x01\x02")
         while place >= 0:
             data[place + offset] = value
@@ -287,7 +280,7 @@ def _flagged(offset: int, value: int) -> Callable[[Path], None]:
 
 def _overlapping(path: Path) -> None:
     """All entries point to the data of the first."""
-    data = bytearray(write(path, fields()).read_bytes())
+    data = bytearray(write_arrays(path, fields()).read_bytes())
     place = data.find(b"PK\x01\x02")
     while place >= 0:
         data[place + 42 : place + 46] = bytes(4)
@@ -296,7 +289,7 @@ def _overlapping(path: Path) -> None:
 
 
 def _comment(path: Path) -> None:
-    write(path, fields())
+    write_arrays(path, fields())
     with zipfile.ZipFile(path, "a") as archive:
         archive.comment = b"PK\x05\x06" * 10_000
 

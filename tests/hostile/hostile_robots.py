@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from hostile_logs import Cases, mutated
+from hostile_logs import Cases, mutated, mutations
 from lxml import etree
 from urdfs import ARM, BASE, HINGE, INERTIAL, inertial, joint, link, mimic
 
@@ -75,11 +75,7 @@ def shuffled(folder: Path, count: int, seed: int) -> Cases:
 
 def damaged(folder: Path, count: int, seed: int) -> Cases:
     """A valid URDF with bytes cut off or changed."""
-    rng, path = np.random.default_rng(seed), folder / "machine.urdf"
-    for number in range(count):
-        kind, content = mutated(VALID.encode(), rng)
-        path.write_bytes(content)
-        yield f"{kind} {number}", path
+    return mutations(folder / "machine.urdf", [VALID.encode()], count, np.random.default_rng(seed))
 
 
 def _reshape(root: etree._Element, rng: np.random.Generator) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from hostile_logs import Cases, Evil, mutated
+from hostile_settings import places_in
 
 NUMBERS = (
     *("NaN", "Infinity", "-Infinity", "1e400", "1e308", "-1e308", "1e-320", "null", "true", '"1"', "[]", "{}", "[[[]]]"),
@@ -86,7 +87,7 @@ def checkpoints(path: Path, count: int, seed: int, share: int = 1) -> Cases:
         for name, other in _states(state).items():
             torch.save(other, path)
             yield name, path
-        for place, value in islice(product(_places(state), VALUES), 0, None, share):
+        for place, value in islice(product(places_in(state), VALUES), 0, None, share):
             torch.save(_with(state, place, value), path)
             yield f"{'.'.join(map(str, place))} = {str(value)[:30]}", path
         rng = np.random.default_rng(seed)
@@ -166,14 +167,6 @@ def _states(state: dict[str, Any]) -> dict[str, Any]:
 
 def _laughs() -> str:
     return "a0: &a0 [x, x]\n" + "".join(f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 10)}]\n" for k in range(30))
-
-
-def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    found = [place] if place else []
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, (list, tuple)) else ()
-    for key, item in items:
-        found += _places(item, (*place, key))
-    return found
 
 
 def _with(state: Any, place: tuple[Any, ...], value: Any) -> Any:

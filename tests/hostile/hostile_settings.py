@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from hostile_logs import Cases, mutated
+from hostile_logs import Cases, mutations
 
 BASE: dict[str, Any] = {
     "robot": {"urdf": "robot.urdf", "base_link": "base", "fixed_base": False},
@@ -67,7 +67,7 @@ def documents(folder: Path) -> Cases:
 
 def wrong_values(folder: Path, count: int, seed: int) -> Cases:
     """Something unfit in a random place of a valid file, as often as asked."""
-    rng, places = np.random.default_rng(seed), list(_places(BASE))
+    rng, places = np.random.default_rng(seed), list(places_in(BASE))
     for number in range(count):
         place, value = places[rng.integers(len(places))], VALUES[number % len(VALUES)]
         path = folder / "experiment.yaml"
@@ -77,30 +77,27 @@ def wrong_values(folder: Path, count: int, seed: int) -> Cases:
 
 def damaged(folder: Path, count: int, seed: int) -> Cases:
     """A valid file cut off, with bits flipped, or with bytes replaced."""
-    rng, whole = np.random.default_rng(seed), yaml.safe_dump(BASE, sort_keys=False).encode()
-    for number in range(count):
-        kind, content = mutated(whole, rng)
-        path = folder / "experiment.yaml"
-        path.write_bytes(content)
-        yield f"{kind} {number}", path
+    whole = yaml.safe_dump(BASE, sort_keys=False).encode()
+    return mutations(folder / "experiment.yaml", [whole], count, np.random.default_rng(seed))
 
 
 def overrides(count: int, seed: int) -> Iterator[tuple[str, list[str]]]:
     """What may stand after the file on the command line."""
     yield from ((text[:40], [text]) for text in OVERRIDES)
-    rng, places = np.random.default_rng(seed), list(_places(BASE))
+    rng, places = np.random.default_rng(seed), list(places_in(BASE))
     for number in range(count):
         place, value = places[rng.integers(len(places))], VALUES[number % len(VALUES)]
         key = ".".join(map(str, place)) if rng.random() < 0.7 else "".join(f"[{part}]" for part in place)
         yield f"{key}={value[:40]}", [f"{key}={value}"]
 
 
-def _places(value: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+def places_in(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Keys and indices that lead to every value inside mappings and sequences."""
     if place:
         yield place
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, (list, tuple)) else ()
     for key, item in items:
-        yield from _places(item, (*place, key))
+        yield from places_in(item, (*place, key))
 
 
 def _with(place: tuple[str | int, ...], value: str) -> str:

@@ -10,9 +10,10 @@ import pytest
 from demo import shortened_demo
 from hostile import examined
 from hostile_hdf5 import hdf5
-from hostile_logs import N, archives, damaged, fields, values, write
+from hostile_logs import N, archives, damaged, fields, values
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from raw_logs import write_arrays
 from refusals import refusal
 
 from torchid.errors import LogError
@@ -70,7 +71,7 @@ PLACE = rf"-?1e\+160 at sample {N - 1}.*; accepted: numbers of at most 1e\+30"
 @pytest.mark.parametrize("name", FLOATS)
 def test_a_number_beyond_all_that_is_measured_is_refused_where_it_stands(tmp_path: Path, name: str) -> None:
     for suffix in SUFFIXES:
-        path = write(tmp_path / f"log{suffix}", fields() | {name: too_large(name, fields()[name])})
+        path = write_arrays(tmp_path / f"log{suffix}", fields() | {name: too_large(name, fields()[name])})
         with pytest.raises(LogError, match=f"{name}: {PLACE}"):
             read_log(path)
         with pytest.raises(LogError, match=f"{name}: {PLACE}"), open_log_blocks(path, tmp_path) as blocks:
@@ -78,7 +79,7 @@ def test_a_number_beyond_all_that_is_measured_is_refused_where_it_stands(tmp_pat
 
 
 def test_a_number_beyond_all_that_is_measured_is_refused_in_a_table(tmp_path: Path) -> None:
-    write_log(read_log(write(tmp_path / "log.npz", fields())), tmp_path / "log.csv")
+    write_log(read_log(write_arrays(tmp_path / "log.npz", fields())), tmp_path / "log.csv")
     *rows, last = (tmp_path / "log.csv").read_text().splitlines()
     column = rows[0].split(",").index('"joint_torque.knee"')
     cells = [*last.split(",")[:column], "1e160", *last.split(",")[column + 1 :]]
@@ -133,7 +134,7 @@ def test_limits_are_far_beyond_any_log(
     """As many joints, of names as long: what is read, is read whole."""
     names = [f"{k}".rjust(max(letters, 4), "j") for k in range(n)]
     content = fields() | {name: np.zeros((40, n)) for name in fields() if name.startswith("joint_")}
-    path = write(
+    path = write_arrays(
         tmp_path_factory.getbasetemp() / f"many{suffix}", content | {"joint_names": np.array(names, dtype="U")}
     )
     if letters <= MAX_LETTERS:
@@ -144,4 +145,4 @@ def test_a_log_of_too_many_names_is_refused(tmp_path: Path) -> None:
     many = np.array([f"j{k}" for k in range(MAX_NAMES + 1)])
     for suffix in SUFFIXES:
         with pytest.raises(LogError, match="joint_names: cannot be read"):
-            read_log(write(tmp_path / f"x{suffix}", fields() | {"joint_names": many}))
+            read_log(write_arrays(tmp_path / f"x{suffix}", fields() | {"joint_names": many}))

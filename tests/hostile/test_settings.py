@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 from hostile import examined, judged
-from hostile_settings import BASE, damaged, documents, overrides, wrong_values
+from hostile_settings import BASE, damaged, documents, overrides, places_in, wrong_values
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -81,13 +81,8 @@ keys = st.text(max_size=4) | st.integers() | st.sampled_from(["name", "frame", "
 anything = st.recursive(scalars, lambda x: st.lists(x, max_size=3) | st.dictionaries(keys, x, max_size=3), max_leaves=6)
 
 
-def _places(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [place, *(inner for key, item in items for inner in _places(item, (*place, key)))]
-
-
 @settings(max_examples=40, deadline=None, derandomize=True)
-@given(st.sampled_from(_places(BASE)[1:]), anything)
+@given(st.sampled_from(list(places_in(BASE))), anything)
 def test_any_tree_of_values_in_any_place_is_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, place: tuple[Any, ...], value: Any
 ) -> None:

@@ -94,9 +94,9 @@ def test_an_odometrys_twist_is_that_of_the_child_frame(tmp_path: Path) -> None:
         (child, world_base.apply(linear), angular),
         (world, linear, world_base.inv().apply(angular)),
     ):
-        np.testing.assert_allclose(log.base_linear_velocity_world, [linear_world] * 4, atol=1e-14)
-        np.testing.assert_allclose(log.base_angular_velocity_base, [angular_base] * 4, atol=1e-14)
-        np.testing.assert_allclose(log.base_position_world, [position] * 4, atol=1e-14)
+        np.testing.assert_allclose(log.base_linear_velocity_world, [linear_world] * 4, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(log.base_angular_velocity_base, [angular_base] * 4, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(log.base_position_world, [position] * 4, rtol=0.0, atol=1e-14)
         np.testing.assert_allclose(Rotation.from_quat(log.base_quat_xyzw).as_matrix(), [world_base.as_matrix()] * 4)
     assert pose.base_linear_velocity_world is None
     assert pose.base_angular_velocity_base is None

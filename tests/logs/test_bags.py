@@ -28,6 +28,7 @@ from bags import (
     write_bag,
     write_folder,
 )
+from raw_logs import without_package
 
 from torchid.config import dump_config, load_config
 from torchid.errors import ConfigError, LogError, TorchidWarning, UnknownNameError
@@ -114,16 +115,7 @@ def test_topics_that_are_not_there_or_carry_something_else_are_named(tmp_path: P
 
 def test_without_rosbags_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_bag(tmp_path / "x.mcap", joints_at(STAMPS))
-    import builtins
-
-    load = builtins.__import__
-
-    def absent(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("rosbags"):
-            raise ImportError(name, name="rosbags")
-        return load(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", absent)
+    without_package("rosbags", monkeypatch)
     monkeypatch.delitem(sys.modules, "torchid.logs.ros_files", raising=False)
     with pytest.raises(LogError, match=r"rosbags is not installed; accepted: pip install '.\[ros\]'"):
         read_log(path, parsed({"joint_states": "/joint_states"}))

@@ -26,8 +26,8 @@ def test_a_sine_keeps_its_phase_and_loses_the_butterworth_share(time: FloatArray
     rate = 2 * np.pi * hertz
     # up to the quintic spline through 12 samples a period (40 Hz), or 5 (100 Hz) which the jitter spreads
     accuracy = 1e-5 if hertz <= 20 else 2e-4 if hertz <= 40 else 2e-3
-    np.testing.assert_allclose(middle.joint_position[:, 0], gain * np.sin(angle), atol=accuracy)
-    np.testing.assert_allclose(value(middle.joint_velocity)[:, 0] / rate, gain * np.cos(angle), atol=accuracy)
+    np.testing.assert_allclose(middle.joint_position[:, 0], gain * np.sin(angle), rtol=0.0, atol=accuracy)
+    np.testing.assert_allclose(value(middle.joint_velocity)[:, 0] / rate, gain * np.cos(angle), rtol=0.0, atol=accuracy)
 
 
 def test_every_channel_passes_the_same_filter() -> None:
@@ -56,7 +56,9 @@ def test_every_channel_passes_the_same_filter() -> None:
     for name, array in out.arrays().items():
         if name not in ("time", "contact_active"):
             columns = array.reshape(len(out), -1)
-            np.testing.assert_allclose(columns, np.tile(out.joint_position, columns.shape[1]), atol=1e-13, err_msg=name)
+            np.testing.assert_allclose(
+                columns, np.tile(out.joint_position, columns.shape[1]), rtol=0.0, atol=1e-13, err_msg=name
+            )
     assert out.arrays().keys() == log.arrays().keys()
     assert 0.2 < np.std(out.joint_position) < 0.45  # white noise keeps 30 Hz of 250 Hz of its power
 
@@ -68,8 +70,10 @@ def test_filters_and_splines_lose_only_the_stated_ends() -> None:
     np.testing.assert_array_equal(preprocess(log, cutoff_hz=10.0).time, t[100:-100])  # 2 periods of 10 Hz
     complete = dataclasses.replace(log, joint_velocity=log.joint_position, joint_acceleration=log.joint_position)
     resampled = preprocess(complete, sample_rate_hz=50.0)
-    np.testing.assert_allclose(resampled.time, np.arange(100) / 50, atol=1e-12)
-    np.testing.assert_allclose(preprocess(log, sample_rate_hz=50.0).time, 0.004 + np.arange(100) / 50, atol=1e-12)
+    np.testing.assert_allclose(resampled.time, np.arange(100) / 50, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        preprocess(log, sample_rate_hz=50.0).time, 0.004 + np.arange(100) / 50, rtol=0.0, atol=1e-12
+    )
 
 
 def test_what_the_kept_ends_of_a_filtered_log_are_off_by() -> None:
@@ -128,4 +132,4 @@ def test_one_spline_and_a_chain_of_short_ones_are_the_same() -> None:
     values, at = position(t), np.linspace(t[0], t[-1], 1234)
     whole = spline_derivatives(t, values, at, (0, 1, 2), block=10**6)
     for one, other in zip(whole, spline_derivatives(t, values, at, (0, 1, 2), block=100), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-12 * np.max(np.abs(one)))
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12 * np.max(np.abs(one)))

@@ -20,18 +20,11 @@ def read(path: Path) -> Log:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_damaged_files_give_a_log_or_one_line(tmp_path: Path, suffix: str) -> None:
-    tally = examined(f"damaged {suffix}", damaged(tmp_path, suffix, 200, 1), read, tmp_path)
+@pytest.mark.parametrize(("count", "seed"), [(200, 1), pytest.param(3000, 2, marks=pytest.mark.slow)])
+def test_damaged_files_give_a_log_or_one_line(tmp_path: Path, suffix: str, count: int, seed: int) -> None:
+    tally = examined(f"damaged {suffix}", damaged(tmp_path, suffix, count, seed), read, tmp_path)
     assert tally.faults == []
     assert tally.share("refused") > 0.3, "or the files were hardly damaged"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_files_damaged_in_thousands_of_ways_give_a_log_or_one_line(tmp_path: Path, suffix: str) -> None:
-    tally = examined(f"damaged {suffix}", damaged(tmp_path, suffix, 3000, 2), read, tmp_path)
-    assert tally.faults == []
-    assert tally.share("refused") > 0.3
 
 
 def test_hand_made_bags_are_refused_or_harmless(tmp_path: Path) -> None:

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from random_samples import random_samples, sensor_set
 from simulated import BIPED, QUADRUPED
-from synthetic import DRONE, G1, PANDA, ROBOTS, Array, load, random_states
+from synthetic import DRONE, G1, PANDA, TALOS_FULL, Array, load
 from torch import Tensor
 
 from torchid.problem import Batch, MiniBatches, RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot
-from torchid.sensing import Contact, SensorNoise, SensorSet, named_sensors
+from torchid.sensing import Contact
 
-TALOS_FULL = ROBOTS / "talos_data/robots/talos_full_v2.urdf"
-NOISE = SensorNoise(joint_torque=0.3, contact_force=1.5, contact_moment=0.1, base_force=0.7, base_moment=0.05)
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 KINDS = {
     "G1": (G1, None, False, [Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right")]),
@@ -37,34 +35,6 @@ CASES = [
     *(("mimic fingers", "mixed"), ("bolted arm", "full"), ("bolted arm", "mixed")),
 ]
 cases = pytest.mark.parametrize(("kind", "sensors"), CASES, ids=[" ".join(case) for case in CASES])
-
-
-def recorded(robot: Robot, contacts: Sequence[Contact], count: int, seed: int, world: bool = False) -> Samples:
-    """Unrelated random motion and forces in three contact states: rows do not mind whether the dynamics close."""
-    rng = np.random.default_rng(seed)
-    q, v, a = map(torch.from_numpy, random_states(rng, robot.n, count, robot.fixed_base))
-    torque, wrench = 20.0 * rng.normal(size=(count, robot.n)), 20.0 * rng.normal(size=(count, len(contacts), 6))
-    return Samples(
-        source=f"{seed}.npz",
-        time=torch.arange(count, dtype=torch.float64) * 0.01,
-        joint_position=q[:, q.shape[1] - robot.n :],
-        joint_velocity=v[:, v.shape[1] - robot.n :],
-        joint_acceleration=a[:, a.shape[1] - robot.n :],
-        base=BaseMotion.from_coordinates(q, v, a, robot.fixed_base),
-        torque=torch.from_numpy(torque),
-        wrench=torch.from_numpy(wrench),
-        wrench_in_world=world,
-        active=torch.from_numpy(rng.integers(0, 2, (3, len(contacts))).astype(bool)[np.arange(count) % 3]),
-    )
-
-
-def sensor_set(name: str, robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
-    """A named set; or every other torque, the first contact's wrench and part of the last one's."""
-    if name != "mixed":
-        return named_sensors(name, robot.n, len(contacts), NOISE)
-    torque, wrench = np.zeros(robot.n, dtype=bool), np.zeros((len(contacts), 6), dtype=bool)
-    torque[::2], wrench[:1], wrench[-1:, 1:3] = True, True, True
-    return SensorSet(torque, wrench, NOISE)
 
 
 @dataclass(frozen=True)
@@ -88,7 +58,7 @@ def world(kind: str, sensors: str, samples: tuple[int, ...] = (30, 21)) -> World
     urdf, base_link, fixed_base, contacts = KINDS[kind]
     robot = load(urdf, base_link, fixed_base)
     turned = (False, not fixed_base)
-    logs = [recorded(robot, contacts, n, k, turned[k % 2]) for k, n in enumerate(samples)]
+    logs = [random_samples(robot, contacts, n, k, turned[k % 2], states=3)[0] for k, n in enumerate(samples)]
     return World(robot, contacts, RowBuilder(robot, contacts, sensor_set(sensors, robot, contacts)), logs)
 
 

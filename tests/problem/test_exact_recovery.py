@@ -75,7 +75,9 @@ def test_torque_sensors_find_all_that_moves_the_robot(name: str, sensors: str) -
 def test_contact_sensors_alone_find_all_inertial_forces_and_leave_friction_at_the_urdf(name: str) -> None:
     w = world(name)
     phi = found(name, "contacts").phi.reshape(-1, parameters.PER_BODY).copy()
-    np.testing.assert_allclose(phi[:, parameters.FRICTION], w.robot.nominal[:, parameters.FRICTION], atol=1e-12)
+    np.testing.assert_allclose(
+        phi[:, parameters.FRICTION], w.robot.nominal[:, parameters.FRICTION], rtol=0.0, atol=1e-12
+    )
     phi[:, parameters.FRICTION] = 0.0
     forces = predicted(w.robot, phi.flatten(), *unseen(name))
     true = w.oracle.frictionless_forces(*unseen(name))

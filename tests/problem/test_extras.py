@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from misread import CONTACTS, WIDTH, World, with_actuators, world
-from recordings import Miscalibration, with_imu
+from misread import WIDTH, World, with_actuators, world
+from motions import value
+from recordings import Miscalibration, in_world, with_imu
 from synthetic import G1, Oracle, load, make_log, random_states
 from true_robots import predicted, true_parameters, worst
 from unknowns import Fit, fit
-from welded import SENSORS
+from welded import CONTACTS, SENSORS, STATES
 
 from torchid.estimators import Consistent
 from torchid.identifiability.base_parameters import base_parameters
 from torchid.identifiability.structure import structural_problem
+from torchid.logs import Log
 from torchid.problem import ExtraTerms, bind_log
 from torchid.problem.extras import CHANNELS, list_extras
+from torchid.problem.predict import calibrate_readings
+from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
@@ -217,3 +222,26 @@ def test_parameters_bound_to_be_physical_are_found_with_the_offsets_too() -> Non
     found = fit(w.robot, CONTACTS, sensors_of(w.robot, "full+limbs"), terms, logs, Consistent())
     for key, expected in w.true(found.builder, terms).items():
         assert found.values[key] == pytest.approx(expected, abs=1.5e-3), key  # 4.2e-4: where the interior point stops
+
+
+@pytest.mark.parametrize("turned", [lambda _, log: log, in_world], ids=["along the frames", "along the world"])
+def test_readings_calibrated_with_the_true_values_are_the_forces(turned: Callable[[Oracle, Log], Log]) -> None:
+    w, rng = world(), np.random.default_rng(15)
+    contacts = [(contact.frame, contact.components) for contact in CONTACTS]
+    log = turned(w.oracle, make_log(w.oracle, contacts, STATES, 20, rng))
+    off, terms = Miscalibration.random(log, rng, CHANNELS), ExtraTerms(*2 * (dict.fromkeys(CHANNELS, "log"),))
+    offsets = np.append(off.torque, off.ft), off.wrench
+    scales = np.append(off.torque_scale, off.ft_scale) - 1.0, off.wrench_scale - 1.0
+    extras, values = list_extras(w.robot, CONTACTS, sensors_of(w.robot, "full+limbs"), terms), []
+    for extra in extras:
+        of_dofs, of_contacts = offsets if extra.what == "offset" else scales
+        values.append(of_dofs[extra.dof] if extra.contact is None else of_contacts[extra.contact])
+    ideal, read = (bind_log(one, w.robot, CONTACTS) for one in (log, off.read(log)))
+    found = calibrate_readings(read, extras, np.array(values), KinematicTree(w.robot))
+    np.testing.assert_allclose(value(found.torque), value(ideal.torque), rtol=0.0, atol=1e-11)
+    known = np.zeros(value(ideal.wrench).shape, dtype=bool)
+    for extra in extras:
+        if extra.contact is not None:
+            known[:, extra.contact[0], extra.contact[1]] = ideal.active[:, extra.contact[0]]
+    assert known.sum() > 100
+    np.testing.assert_allclose(value(found.wrench)[known], value(ideal.wrench)[known], rtol=0.0, atol=1e-11)

@@ -14,57 +14,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from synthetic import Array, random_states
+from random_samples import NOISE, random_samples, sensor_set
+from synthetic import Array
 
 import torchid
-from torchid.problem import RowBuilder, Samples
-from torchid.problem.base_motion import BaseMotion
+from torchid.problem import RowBuilder
 from torchid.problem.chunks import chunks_by_state
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
 FORCE = [0, 1, 2]  # of the six components of a wrench, those that a point contact exerts
-NOISE = torchid.SensorNoise(joint_torque=0.3, contact_force=1.5, base_force=0.7, base_moment=0.05)
 
 
-def random_samples(count: int = 60) -> tuple[Samples, tuple[torch.Tensor, ...]]:
-    """Unrelated motion, torques, contact forces and contact states, and the generalized coordinates (q, v, a)."""
-    rng = np.random.default_rng(0)
-    q, v, a = map(torch.from_numpy, random_states(rng, ROBOT.n, count))
-    wrench = np.zeros((count, len(FEET), 6))
-    wrench[..., FORCE] = 20.0 * rng.normal(size=(count, len(FEET), 3))
-    samples = Samples(
-        source="random",
-        time=0.01 * torch.arange(count, dtype=torch.float64),
-        joint_position=q[:, 7:],
-        joint_velocity=v[:, 6:],
-        joint_acceleration=a[:, 6:],
-        base=BaseMotion.from_coordinates(q, v, a),
-        torque=torch.from_numpy(20.0 * rng.normal(size=(count, ROBOT.n))),
-        wrench=torch.from_numpy(wrench),
-        wrench_in_world=False,
-        active=torch.from_numpy(rng.integers(0, 2, (count, len(FEET))).astype(bool)),
-    )
-    return samples, (q, v, a)
-
-
-def some_sensors() -> torchid.SensorSet:
-    """Every other joint torque, all of one foot's force, and the vertical force of another."""
-    sensors = torchid.named_sensors("joints", ROBOT.n, len(FEET), NOISE)
-    sensors.torque[1::2] = False
-    sensors.wrench[0], sensors.wrench[1, 2] = True, True
-    return sensors
-
-
-SENSOR_SETS = {
-    **{name: torchid.named_sensors(name, ROBOT.n, len(FEET), NOISE) for name in ("full", "contacts", "joints")},
-    "some of each": some_sensors(),
-}
+SENSOR_SETS = {name: sensor_set(name, ROBOT, FEET) for name in ("full", "contacts", "joints", "mixed")}
+SAMPLES, STATE = random_samples(ROBOT, FEET, 60, 0)
 
 
 def by_public_modules(sensors: torchid.SensorSet) -> tuple[Array, Array]:
     """A and b of all samples, from K, J_C and their projection."""
-    samples, (q, v, a) = random_samples()
+    samples, (q, v, a) = SAMPLES, map(torch.from_numpy, STATE)
     K = torchid.Regressor(ROBOT)(q, v, a)  # (B, n_rows, 12 L)
     J_C = torch.cat([torchid.FrameJacobian(ROBOT, foot.frame)(q)[:, FORCE] for foot in FEET], dim=1)
     project = torchid.Projection(
@@ -85,9 +53,8 @@ def by_public_modules(sensors: torchid.SensorSet) -> tuple[Array, Array]:
 
 def by_row_builder(sensors: torchid.SensorSet) -> tuple[Array, Array]:
     """The same of the fast path, its columns expanded to the bodies' parameters."""
-    samples, _ = random_samples()
     builder = RowBuilder(ROBOT, FEET, sensors)
-    rows = torch.cat([builder.rows_by_sample(samples[index], state)[0] for state, index in chunks_by_state(samples)])
+    rows = torch.cat([builder.rows_by_sample(SAMPLES[index], state)[0] for state, index in chunks_by_state(SAMPLES)])
     rows = rows.flatten(0, 1).numpy()
     return rows[:, :-1] @ builder.columns.parameter_map(), rows[:, -1]
 
@@ -96,6 +63,8 @@ def by_row_builder(sensors: torchid.SensorSet) -> tuple[Array, Array]:
 def test_both_ways_give_the_same_equations_up_to_a_rotation(name: str) -> None:
     (A, b), (A_fast, b_fast) = (way(SENSOR_SETS[name]) for way in (by_public_modules, by_row_builder))
     size = np.linalg.norm(A, axis=0) + 1e-3 * np.linalg.norm(A)
-    np.testing.assert_allclose(A_fast.T @ A_fast / np.outer(size, size), A.T @ A / np.outer(size, size), atol=1e-13)
+    np.testing.assert_allclose(
+        A_fast.T @ A_fast / np.outer(size, size), A.T @ A / np.outer(size, size), rtol=0.0, atol=1e-13
+    )
     np.testing.assert_allclose(A_fast.T @ b_fast / size, A.T @ b / size, rtol=0.0, atol=1e-13 * np.linalg.norm(b))
     assert np.linalg.norm(b_fast) == pytest.approx(np.linalg.norm(b), rel=1e-13)

@@ -8,11 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from misread import CONTACTS, world
+from misread import world
 from motions import value
 from recordings import Miscalibration
 from synthetic import Array
 from unknowns import fit
+from welded import CONTACTS
 
 from torchid.identifiability.confounding import disagreements
 from torchid.logs import Log
@@ -106,6 +107,16 @@ def test_a_filter_leaves_readings_in_the_air_as_they_were_recorded(settings: dic
     assert np.isfinite(found).mean() == pytest.approx(find_unloaded(time, active).mean(), abs=0.02)
 
 
+def test_all_that_is_said_of_contacts_is_in_the_order_of_the_experiment() -> None:
+    log = swinging()[0]
+    log = replace(log, contact_share=0.5 * value(log.contact_active) + [0.1, 0.2, 0.3])
+    there, back = (bind_log(log, world().robot, contacts) for contacts in (CONTACTS, CONTACTS[::-1]))
+    for name in ("active", "wrench", "share", "unloaded"):
+        columns = value(getattr(there, name)).numpy()
+        assert not np.array_equal(columns[:, 0], columns[:, -1], equal_nan=columns.dtype != bool)
+        np.testing.assert_array_equal(value(getattr(back, name)).numpy(), columns[:, ::-1], err_msg=name)
+
+
 def test_a_contact_whose_offset_is_not_asked_for_has_no_equation_in_the_air() -> None:
     log, _ = swinging()
     for terms in (ExtraTerms(), ExtraTerms(offsets={"joint_torque": "log"}), ExtraTerms(scales=EVERY)):
@@ -149,11 +160,12 @@ def test_offsets_and_scales_are_exact_with_readings_in_the_air() -> None:
     sensors = named_sensors("full", robot.n, len(CONTACTS), NOISE, len(robot.ft_names))
     for terms, given, expected in ((OFFSETS, log, np.ones((3, 6))), (scaled, read, gain)):
         found = fit(robot, CONTACTS, sensors, replace(terms, offsets=ALL.offsets), [bound(given)])
-        for x in found.extras:
-            if x.extra.contact is not None:
-                contact, axis = x.extra.contact
-                true = off.wrench[contact, axis] if x.extra.what == "offset" else expected[contact, axis] - 1.0
-                assert x.value == pytest.approx(true, rel=1e-7, abs=1e-8), x.extra.label
+        of_contacts = {x.extra.label: x for x in found.extras if x.extra.contact is not None}
+        assert len(of_contacts) == (15 if given is log else 15 + 9)  # of vectors along world axes, all three
+        for label, x in of_contacts.items():
+            contact, axis = x.extra.contact
+            true = off.wrench[contact, axis] if x.extra.what == "offset" else expected[contact, axis] - 1.0
+            assert x.value == pytest.approx(true, rel=1e-7, abs=1e-8), label
 
 
 def test_parts_of_readings_in_the_air_are_beside_those_of_samples_which_stay_as_they_are() -> None:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from regressors import base_kinds, by_joints_of, seen_from, tensors
-from synthetic import Array, Oracle, load, make_log, random_states
+from regressors import base_kinds, by_joints_of, regressor, seen_from
+from synthetic import Oracle, load, make_log, random_states
 from true_robots import hide, true_parameters, worst
 from urdfs import BASE, inertial, joint, link, write
-from welded import REAL, SENSORS, machine
+from welded import CONTACTS, REAL, SENSORS, STATES, machine
 
 from torchid import parameters
 from torchid.errors import LogError, UnknownNameError
@@ -21,11 +21,10 @@ from torchid.estimators import LeastSquares
 from torchid.identifiability.base_parameters import state_reports
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem import RowBuilder, Samples, bind_log, compress, linear_problem
-from torchid.problem.chunks import chunks_by_state
 from torchid.problem.predict import force_series
-from torchid.regressor import FrameJacobian, Regressor
+from torchid.regressor import FrameJacobian
 from torchid.robot import Robot, load_robot
-from torchid.sensing import Contact, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
+from torchid.sensing import SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
 EXACT = 1e-14  # of the largest number; 3e-15 measured
 
@@ -35,17 +34,11 @@ def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return machine(tmp_path_factory.mktemp("welded"))
 
 
-def dense(robot: Robot, *state: Array) -> Array:
-    """K, (B, nv + 6 F, L, 12)."""
-    K = Regressor(robot)(*tensors(*state)).numpy()
-    return K.reshape(len(state[0]), robot.nv + 6 * len(robot.ft_names), len(robot.bodies), parameters.PER_BODY)
-
-
 def assert_oracles(robot: Robot, seed: int) -> None:
     """Columns of K, nominal forces and Jacobians of many links are Pinocchio's."""
     oracle = Oracle.of(robot)
     state = random_states(np.random.default_rng(seed), robot.n, 3, robot.fixed_base)
-    K, expected = dense(robot, *state), oracle.regressor(robot, *state)
+    K, expected = regressor(robot, *state), oracle.regressor(robot, *state)
     np.testing.assert_allclose(K[..., :10], expected, rtol=0.0, atol=EXACT * np.abs(expected).max())
     forces, nominal = oracle.frictionless_forces(*state), robot.nominal[:, :10]
     found = np.einsum("bilk,lk->bi", K[..., :10], nominal)
@@ -82,7 +75,7 @@ def test_a_sensor_under_a_hanging_mass_reads_its_weight_and_beside_the_lever_its
     )
     robot = load_robot(write(tmp_path, *parts), ft_joints=["flange"])
     q, still = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 6))
-    (reading,) = np.einsum("bilk,lk->bi", dense(robot, q, still, still), robot.nominal)[:, 6:]
+    (reading,) = np.einsum("bilk,lk->bi", regressor(robot, q, still, still), robot.nominal)[:, 6:]
     weight = 2.0 * 9.81  # the parent holds the tool up, along -z of the child
     np.testing.assert_allclose(reading, [0, 0, -weight, 0, 0.3 * weight, 0], rtol=0.0, atol=1e-12)
 
@@ -92,9 +85,9 @@ def test_without_sensors_the_robot_is_the_lumped_one(urdf: Path) -> None:
     assert lumped.ft_names == ()
     assert lumped.dof_names == lumped.joint_names == split.joint_names
     state = random_states(np.random.default_rng(2), lumped.n, 5)
-    np.testing.assert_array_equal(dense(load(urdf, ft_joints=()), *state), dense(lumped, *state))
-    forces = np.einsum("bilk,lk->bi", dense(lumped, *state)[..., :10], lumped.nominal[:, :10])
-    found = np.einsum("bilk,lk->bi", dense(split, *state)[..., :10], split.nominal[:, :10])[:, : split.nv]
+    np.testing.assert_array_equal(regressor(load(urdf, ft_joints=()), *state), regressor(lumped, *state))
+    forces = np.einsum("bilk,lk->bi", regressor(lumped, *state)[..., :10], lumped.nominal[:, :10])
+    found = np.einsum("bilk,lk->bi", regressor(split, *state)[..., :10], split.nominal[:, :10])[:, : split.nv]
     np.testing.assert_allclose(found, forces, rtol=0.0, atol=EXACT * np.abs(forces).max())
 
 
@@ -107,7 +100,7 @@ def test_a_sensor_reads_the_same_wrench_whichever_link_is_the_base(urdf: Path, b
     moved = tuple(by_joints_of(from_root, from_other, k, x) for k, x in zip((7, 6, 6), moved, strict=True))
     readings = []
     for robot, motion in ((from_root, state), (from_other, moved)):
-        needed = np.einsum("bilk,lk->bi", dense(robot, *motion)[..., :10], robot.nominal[:, :10])
+        needed = np.einsum("bilk,lk->bi", regressor(robot, *motion)[..., :10], robot.nominal[:, :10])
         J = FrameJacobian(robot, "foot")(torch.from_numpy(motion[0])).numpy()
         wrench = np.linalg.solve(J[:, :, :6].transpose(0, 2, 1), needed[:, :6, None])[..., 0]
         left = needed - np.einsum("bki,bk->bi", J, wrench)
@@ -118,8 +111,6 @@ def test_a_sensor_reads_the_same_wrench_whichever_link_is_the_base(urdf: Path, b
 
 # ------------------------------------------------------------------------------------------------ rows and fits
 
-CONTACTS = (Contact("sole", "flat"), Contact("thigh", "point"), Contact("fin", "line", "z"))
-STATES = [[True, False, False], [False, True, True], [True, True, True], [False, False, False]]
 SETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "limbs alone": ("none", SENSORS),
     "the base's and the tail's": ("none", ("mount_ft", "tail_ft")),
@@ -147,52 +138,6 @@ def recorded(robot: Robot, seed: int, samples: int = 200) -> tuple[Oracle, Sampl
     return oracle, bind_log(make_log(oracle, contacts, STATES, samples, rng), robot, CONTACTS)
 
 
-def jacobian(oracle: Oracle, samples: Samples, contact: Contact) -> Array:
-    """Of the components that a contact can exert, (B, k, nv + 6 F)."""
-    q = samples.coordinates()[0].numpy()
-    return oracle.jacobian(q, contact.frame)[:, list(contact.components)]
-
-
-@base_kinds
-@pytest.mark.parametrize("seed", range(2))
-def test_rows_are_whitened_combinations_of_k_that_no_unmeasured_force_enters(
-    urdf: Path, fixed_base: bool, seed: int
-) -> None:
-    robot = load(urdf, None, fixed_base, SENSORS)
-    oracle, samples = recorded(robot, 4, 40)
-    rng = np.random.default_rng(seed)  # components of sensors in limbs, one by one
-    sensors = SensorSet(rng.random(robot.n_dofs) < 0.7, rng.random((3, 6)) < 0.5)
-    builder = RowBuilder(robot, CONTACTS, sensors)
-    M, base, noise = builder.columns.parameter_map(), robot.base_rows, sensors.noise
-    std = np.append(noise.base_std[:base], noise.dof_std(robot.n, robot.n_dofs))
-    for state, index in chunks_by_state(hide(samples, sensors)):
-        part = hide(samples, sensors)[index]
-        rows, W = (x.numpy() for x in builder.rows_by_sample(part, state))
-        K = dense(robot, *(x.numpy() for x in part.coordinates())).reshape(len(part), len(std), -1)
-        np.testing.assert_allclose(rows[..., :-1] @ M, W.transpose(0, 2, 1) @ K, rtol=0.0, atol=1e-12 * np.abs(K).max())
-        f, cov = np.zeros(K.shape[:2]), np.tile(np.diag(std**2), (len(part), 1, 1))
-        assert samples.torque is not None
-        assert samples.wrench is not None
-        f[:, base:] = np.where(sensors.torque, samples.torque[index], 0.0)
-        unmeasured = [np.tile(np.eye(len(std))[base:][~sensors.torque], (len(part), 1, 1))]
-        for c, contact in enumerate(CONTACTS):
-            if state[c]:
-                J = jacobian(oracle, part, contact)
-                seen = sensors.wrench[c, list(contact.components)]
-                force = samples.wrench[index][:, c, list(contact.components)].numpy()
-                f += np.einsum("bki,bk->bi", J[:, seen], force[:, seen])
-                var = noise.wrench_std[list(contact.components)][seen] ** 2
-                cov += np.einsum("bki,k,bkj->bij", J[:, seen], var, J[:, seen])
-                unmeasured.append(J[:, ~seen])
-        A = np.concatenate(unmeasured, axis=1)
-        np.testing.assert_allclose(A @ W, 0.0, rtol=0.0, atol=1e-11)
-        np.testing.assert_allclose(rows[..., -1], (W.transpose(0, 2, 1) @ f[..., None])[..., 0], rtol=1e-9, atol=1e-9)
-        kept = np.abs(W).max(axis=1) > 0.0
-        assert (kept.sum(1) == len(std) - np.linalg.matrix_rank(A)).all()
-        white = W.transpose(0, 2, 1) @ cov @ W
-        np.testing.assert_allclose(white, kept[:, None] * np.eye(len(std)), rtol=0.0, atol=1e-10)
-
-
 @base_kinds
 @pytest.mark.parametrize("name", SETS)
 def test_limb_sensors_mixed_with_others_find_all_that_they_can_see(urdf: Path, name: str, fixed_base: bool) -> None:
@@ -205,11 +150,11 @@ def test_limb_sensors_mixed_with_others_find_all_that_they_can_see(urdf: Path, n
     if not fixed_base:
         assert {report.base_rank for report in state_reports([samples], builder)} == {6}
     state = random_states(np.random.default_rng(99), robot.n, 100, fixed_base)
-    found = np.einsum("bilk,lk->bi", dense(robot, *state), estimate.phi.reshape(-1, parameters.PER_BODY))
+    found = np.einsum("bilk,lk->bi", regressor(robot, *state), estimate.phi.reshape(-1, parameters.PER_BODY))
     seen = np.append(np.ones(robot.base_rows, dtype=bool), sensors.torque)
     true = oracle.forces(*state)
     assert worst(found[:, seen], true[:, seen]) < 1e-11
-    nominal = np.einsum("bilk,lk->bi", dense(robot, *state), robot.nominal)
+    nominal = np.einsum("bilk,lk->bi", regressor(robot, *state), robot.nominal)
     assert worst(nominal[:, seen], true[:, seen]) > 0.01
 
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from mujoco_oracle import joint_addresses, mujoco_forces, mujoco_model
 from regressors import assert_close, base_kinds, of_robots, regressor, tensors, without_shapes
-from scipy.spatial.transform import Rotation
 from synthetic import (
     ANYMAL,
     BAXTER,
@@ -111,26 +109,10 @@ def test_the_derivative_of_force_by_acceleration_is_pinocchios_mass_matrix() -> 
         return (Regressor(robot)(*tensors(q, v), acceleration) @ phi)[0]
 
     (found,) = torch.autograd.functional.jacobian(force, (torch.from_numpy(a),))
-    oracle = Oracle.of(robot)
-    M = oracle.expand.T @ pin.crba(oracle.model, oracle.data, oracle.coordinates(q[0])) @ oracle.expand
-    assert_close(found[:, 0].numpy(), M)
+    assert_close(found[:, 0].numpy(), Oracle.of(robot).mass_matrix(q[0]))
 
 
 # ---------------------------------------------------------------------------------------------------------- MuJoCo
-
-
-def mujoco_model(urdf: Path, base_link: str, fixed_base: bool) -> mujoco.MjModel:
-    """The URDF as MuJoCo reads it, in free flight unless its base is fixed; viscous friction only."""
-    root = ElementTree.parse(urdf).getroot()
-    if not fixed_base:
-        ElementTree.SubElement(root, "link", name="the ground")
-        flight = ElementTree.SubElement(root, "joint", name="free flight", type="floating")
-        ElementTree.SubElement(flight, "parent", link="the ground")
-        ElementTree.SubElement(flight, "child", link=base_link)
-    model = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode")).compile()
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    model.dof_armature[:], model.dof_frictionloss[:], model.dof_damping[:] = 0.0, 0.0, 0.0
-    return model
 
 
 @pytest.mark.parametrize(
@@ -141,32 +123,18 @@ def mujoco_model(urdf: Path, base_link: str, fixed_base: bool) -> mujoco.MjModel
 def test_forces_are_mujocos(urdf: Path, fixed_base: bool, tmp_path: Path) -> None:
     path = without_shapes(urdf, tmp_path)
     robot = load(path, fixed_base=fixed_base)
-    model = mujoco_model(path, robot.base_link, fixed_base)
-    data = mujoco.MjData(model)
+    model = mujoco_model(path, robot)
     rng = np.random.default_rng(5)
-    q, v, a = random_states(rng, robot.n, 5, fixed_base)
+    state = random_states(rng, robot.n, 5, fixed_base)
     phi = robot.nominal.copy()
     phi[:, parameters.COULOMB] = 0.0
     phi[1:, parameters.VISCOUS] = rng.uniform(0.5, 2.0, robot.n)
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in robot.joint_names]
-    joint_q, joint_v = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
-    model.dof_damping[joint_v] = phi[1:, parameters.VISCOUS]
-    extra, base, expected = 0 if fixed_base else 7, robot.base_rows, []
-    for sample in range(5):
-        data.qpos[joint_q] = q[sample, extra:]
-        data.qvel[joint_v], data.qacc[joint_v] = v[sample, base:], a[sample, base:]
-        R = np.eye(3)
-        if not fixed_base:  # MuJoCo: linear parts along world axes, angular along the body's, quaternion w x y z
-            R = Rotation.from_quat(q[sample, 3:7]).as_matrix()
-            linear, angular = v[sample, :3], v[sample, 3:6]
-            data.qpos[:7] = [*q[sample, :3], q[sample, 6], *q[sample, 3:6]]
-            data.qvel[:6] = [*(R @ linear), *angular]
-            data.qacc[:6] = [*(R @ (a[sample, :3] + np.cross(angular, linear))), *a[sample, 3:6]]
-        mujoco.mj_inverse(model, data)
-        force = data.qfrc_inverse
-        expected.append([*(R.T @ force[:3]), *force[3:6], *force[joint_v]][6 - base :])
-    found = np.einsum("bilk,lk->bi", regressor(robot, q, v, a), phi)
-    assert_close(found, np.array(expected), 1e-12)  # MuJoCo turns every inertia into its principal axes
+    model.dof_armature[:], model.dof_frictionloss[:], model.dof_damping[:] = 0.0, 0.0, 0.0
+    model.dof_damping[joint_addresses(model, robot)[1]] = phi[1:, parameters.VISCOUS]
+    found = np.einsum("bilk,lk->bi", regressor(robot, *state), phi)
+    assert_close(
+        found, mujoco_forces(model, robot, *state), 1e-12
+    )  # MuJoCo turns every inertia into its principal axes
 
 
 # -------------------------------------------------------------------------------------------------------- friction

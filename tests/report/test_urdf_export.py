@@ -6,16 +6,17 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 import yourdfpy
 from lxml import etree
+from mujoco_oracle import mujoco_forces, mujoco_model
 from physical import random_bodies
 from regressors import assert_close, regressor, without_shapes
 from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, G1, PANDA, ROBOTS, ROMEO, TALOS, Array, Oracle, load, make_log, random_states
+from urdfs import words
 
 from torchid import parameters
 from torchid.errors import TorchidWarning
@@ -39,10 +40,10 @@ def machine(folder: Path) -> Path:
     for name in ("base", "slide", "arm", "hand", "finger", "camera", "tool"):
         R = Rotation.random(random_state=rng).as_matrix()
         inertia = R @ np.diag([0.3, 0.4, 0.5] * rng.uniform(0.8, 1.2, 3)) @ R.T
-        numbers = {f"i{'xyz'[i]}{'xyz'[j]}": words(inertia[i, j]) for i in range(3) for j in range(i, 3)}
+        numbers = {f"i{'xyz'[i]}{'xyz'[j]}": words([inertia[i, j]]) for i in range(3) for j in range(i, 3)}
         inertial = etree.Element("inertial")
         etree.SubElement(inertial, "origin", xyz=words(rng.normal(0.0, 0.2, 3)), rpy=words(rng.normal(size=3)))
-        etree.SubElement(inertial, "mass", value=words(rng.uniform(1.0, 3.0)))
+        etree.SubElement(inertial, "mass", value=words([rng.uniform(1.0, 3.0)]))
         etree.SubElement(inertial, "inertia", numbers)
         shape = f'<visual><!-- a {name} --><geometry><sphere radius="0.1"/></geometry><material name="red"/></visual>'
         shape += '<collision><origin rpy="0 1 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
@@ -63,10 +64,6 @@ def machine(folder: Path) -> Path:
     path = folder / "machine.urdf"
     path.write_text(f'<robot name="machine">{"".join(elements)}<transmission name="t"><type/></transmission></robot>')
     return path
-
-
-def words(numbers: Array | float) -> str:
-    return " ".join(repr(float(x)) for x in np.atleast_1d(numbers))
 
 
 def robot_of(name: str, folder: Path, fixed_base: bool = False) -> Robot:
@@ -104,40 +101,6 @@ def pinocchio_forces(path: Path, robot: Robot, q: Array, v: Array, a: Array) -> 
     return oracle.forces(q, v, a)
 
 
-def mujoco_model(path: Path, robot: Robot) -> mujoco.MjModel:
-    """The file as MuJoCo reads it, in free flight unless the base is fixed."""
-    root = etree.parse(str(path)).getroot()
-    if not robot.fixed_base:
-        etree.SubElement(root, "link", name="the ground")
-        flight = etree.SubElement(root, "joint", name="free flight", type="floating")
-        etree.SubElement(flight, "parent", link="the ground")
-        etree.SubElement(flight, "child", link=robot.base_link)
-    return mujoco.MjModel.from_xml_string(etree.tostring(root, encoding="unicode"))
-
-
-def mujoco_forces(path: Path, robot: Robot, q: Array, v: Array, a: Array) -> Array:
-    """Inverse dynamics (B, nv) of the file; Coulomb friction, a soft constraint in MuJoCo, is added as it reads it."""
-    model = mujoco_model(path, robot)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    data, base, expected = mujoco.MjData(model), robot.base_rows, []
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in robot.joint_names]
-    joint_q, joint_v = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
-    for q_, v_, a_ in zip(q, v, a, strict=True):
-        data.qpos[joint_q] = q_[7 if base else 0 :]
-        data.qvel[joint_v], data.qacc[joint_v] = v_[base:], a_[base:]
-        R = np.eye(3)
-        if base:  # MuJoCo: linear parts along world axes, angular along the body's, quaternion w x y z
-            R = Rotation.from_quat(q_[3:7]).as_matrix()
-            data.qpos[:7] = [*q_[:3], q_[6], *q_[3:6]]
-            data.qvel[:6] = [*(R @ v_[:3]), *v_[3:6]]
-            data.qacc[:6] = [*(R @ (a_[:3] + np.cross(v_[3:6], v_[:3]))), *a_[3:6]]
-        mujoco.mj_inverse(model, data)
-        force = data.qfrc_inverse
-        joints = force[joint_v] + model.dof_frictionloss[joint_v] * np.sign(v_[base:])
-        expected.append([*(R.T @ force[:3]), *force[3:6], *joints] if base else joints)
-    return np.array(expected)
-
-
 def torchid_forces(robot: Robot, phi: Array, q: Array, v: Array, a: Array) -> Array:
     return np.einsum("bilk,lk->bi", regressor(robot, q, v, a), phi)
 
@@ -147,7 +110,7 @@ def assert_means(robot: Robot, phi: Array, path: Path) -> None:
     states = random_states(np.random.default_rng(2), robot.n, 4, robot.fixed_base)
     expected = torchid_forces(robot, phi, *states)
     assert_close(pinocchio_forces(path, robot, *states), expected, READ)
-    assert_close(mujoco_forces(path, robot, *states), expected, READ)
+    assert_close(mujoco_forces(mujoco_model(path, robot), robot, *states), expected, READ)
     assert_close(torchid_forces(robot, load(path, robot.base_link).nominal, *states), expected, READ)
     assert_inertials(robot, phi, path)
 
@@ -209,7 +172,7 @@ def test_a_robot_read_from_another_base_is_written_as_it_was_rooted(tmp_path: Pa
     as_rooted = load(identified)
     assert as_rooted.body_names == straight.body_names
     states = random_states(np.random.default_rng(4), straight.n, 3)
-    forces = mujoco_forces(identified, straight, *states)
+    forces = mujoco_forces(mujoco_model(identified, straight), straight, *states)
     assert_close(forces, torchid_forces(straight, as_rooted.nominal, *states), READ)
     assert as_rooted.nominal[:, 0].sum() == pytest.approx(phi[:, 0].sum())
 

@@ -115,7 +115,7 @@ def assert_encloses(extent: Extent, points: Array, slack: float = 1e-9, gap: flo
     assert box.max() <= 1.0 + slack
     assert box.min() >= 1.0 - gap
     assert 1.0 - gap <= ellipsoid <= 1.0 + slack
-    np.testing.assert_allclose(extent.axes.T @ extent.axes, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(extent.axes.T @ extent.axes, np.eye(3), rtol=0.0, atol=1e-12)
 
 
 # -------------------------------------------------------------------------------------------------------- one shape
@@ -141,7 +141,7 @@ def test_a_turned_shape_is_enclosed_along_its_own_axes(kind: str, seed: int, tmp
 def test_half_edges_and_semi_axes_are_the_stated_ones(case: tuple, tmp_path: Path) -> None:
     geometry, half, factor = case
     extent = one(tmp_path, f'<visual><origin xyz="1 2 3" rpy="0.3 -0.2 0.5"/><geometry>{geometry}</geometry></visual>')
-    np.testing.assert_allclose(extent.centre, [1.0, 2.0, 3.0], atol=1e-12)
+    np.testing.assert_allclose(extent.centre, [1.0, 2.0, 3.0], rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(extent.half, half, rtol=1e-12)
     if factor is not None:
         np.testing.assert_allclose(extent.semi_axes, factor * np.array(half), rtol=1e-9)
@@ -153,7 +153,7 @@ def test_roll_pitch_and_yaw_turn_a_box_as_the_urdf_means(tmp_path: Path) -> None
     turned = '<origin rpy="1.5707963267948966 0 1.5707963267948966"/><geometry><box size="2 4 6"/></geometry>'
     extent = one(tmp_path, f"<visual>{turned}</visual>")  # x to y; y to z; z to x
     points = extent.centre + (CORNERS * extent.half) @ extent.axes.T
-    np.testing.assert_allclose(np.ptp(points, axis=0), [6.0, 2.0, 4.0], atol=1e-12)
+    np.testing.assert_allclose(np.ptp(points, axis=0), [6.0, 2.0, 4.0], rtol=0.0, atol=1e-12)
 
 
 def test_a_plate_keeps_an_interior_and_a_point_is_no_shape(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from synthetic import (
     ROBOTS,
     SOLO12,
     TALOS,
+    TALOS_FULL,
     TIAGO,
     UR5,
     Oracle,
@@ -28,6 +29,7 @@ from synthetic import (
     random_states,
     transform,
 )
+from urdfs import write
 
 from torchid import parameters
 from torchid.errors import TorchidWarning
@@ -37,19 +39,12 @@ REAL = (
     *(ANYMAL, BAXTER, DRONE, G1, PANDA, SOLO12, TALOS, TIAGO, UR5),
     ROBOTS / "romeo_description/urdf/romeo.urdf",
     ROBOTS / "pr2_description/urdf/pr2.urdf",
-    ROBOTS / "talos_data/robots/talos_full_v2.urdf",
+    TALOS_FULL,
     ROBOTS / "tiago_pro_description/robots/tiago_pro.urdf",
     ROBOTS / "icub_description/robots/icub.urdf",
 )
 
 every_real_robot = pytest.mark.parametrize("urdf", REAL, ids=lambda path: path.stem)
-
-
-def write(folder: Path, *elements: str) -> Path:
-    """A URDF of some elements."""
-    path = folder / "machine.urdf"
-    path.write_text(f'<robot name="machine">{"".join(elements)}</robot>')
-    return path
 
 
 def link(name: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from synthetic import Array
-from true_robots import KINDS, Kind, World, driving, fit, predicted, unseen, world, worst
+from true_robots import KINDS, Kind, World, driving, fit, predicted, stepping, unseen, world, worst
 
 from torchid import parameters
 from torchid.identifiability.structure import standing_samples, standing_states, structural_problem
@@ -25,9 +25,7 @@ PER_STATE = 250
 
 
 def steps(kind: Kind) -> tuple[tuple[bool, ...], ...]:
-    """Every foot down, and each lifted in turn."""
-    feet = range(len(kind.feet))
-    return ((True,) * len(kind.feet), *(tuple(foot != lifted for foot in feet) for lifted in feet))
+    return tuple(map(tuple, stepping(len(kind.feet))))
 
 
 @cache

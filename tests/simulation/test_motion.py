@@ -77,9 +77,11 @@ def test_only_the_joints_that_a_wave_names_are_driven(biped: Simulation) -> None
 def test_a_turning_base_has_the_angular_velocity_of_its_rotation(biped: Simulation) -> None:
     time, found = goals(biped, MotionConfig("m", 1.0, [wave("base_yaw", 0.8, 0.1)]))
     yaw = np.array([np.arctan2(goal.base[1, 0], goal.base[0, 0]) for goal in found])
-    np.testing.assert_allclose(yaw[time >= 0.0], 0.1 * np.sin(2 * np.pi * 0.8 * time[time >= 0.0]), atol=1e-12)
+    np.testing.assert_allclose(
+        yaw[time >= 0.0], 0.1 * np.sin(2 * np.pi * 0.8 * time[time >= 0.0]), rtol=0.0, atol=1e-12
+    )
     rate = np.array([goal.base_rate[0] for goal in found])
-    np.testing.assert_allclose(np.gradient(yaw, time)[2:-2], rate[2:-2, 2], atol=1e-9)
+    np.testing.assert_allclose(np.gradient(yaw, time)[2:-2], rate[2:-2, 2], rtol=0.0, atol=1e-9)
 
 
 # --------------------------------------------------------------------------------------------------------------- steps
@@ -128,7 +130,7 @@ def test_a_step_that_would_have_to_begin_before_the_log_is_left_out(biped: Simul
     """At 1 Hz, swings are highest at 0.25 s on the right and at 0.75 s on the left."""
     time, lift, load = heights_and_loads(biped, stepping("r_sole", "l_sole", hz=1.0, swing_s=0.46, transfer_s=0.1))
     begins = [time[lift[:, SOLES.index(name)] > 0.0].min() for name in ("r_sole", "l_sole")]
-    np.testing.assert_allclose(begins, [1.25 - 0.23, 0.75 - 0.23], atol=2.0 / HZ)
+    np.testing.assert_allclose(begins, [1.25 - 0.23, 0.75 - 0.23], rtol=0.0, atol=2.0 / HZ)
     assert (load[time < 0.75 - 0.33] == 1.0).all()
 
 
@@ -176,7 +178,7 @@ def test_a_posture_with_one_leg_bent_is_met_halfway_with_both_feet_on_the_floor(
     posture = {"l_hip_flexion": -0.55, "l_knee_flexion": 1.1, "l_ankle_flexion": -0.55}
     simulation = set_up_simulation(robot_on(BIPED, [FootConfig(sole) for sole in SOLES], posture))
     knees = [simulation.plant.joint_names.index(f"{side}_knee_flexion") for side in "lr"]
-    np.testing.assert_allclose(simulation.stance.position[7:][knees], 0.55, atol=0.01)
+    np.testing.assert_allclose(simulation.stance.position[7:][knees], 0.55, rtol=0.0, atol=0.01)
 
 
 def test_a_posture_beyond_a_joints_range_is_refused() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from torchid.cli import main
-from torchid.errors import ConfigError, UnknownNameError
+from torchid.errors import ConfigError, InputError, UnknownNameError
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -32,22 +32,23 @@ def refusal(arguments: list[str], folder: Path, capsys: pytest.CaptureFixture[st
     return complaint[0]
 
 
+def refused(call: Callable[[], object], start: str, kind: type[InputError] = InputError) -> str:
+    """The one line of an error of a kind that a call ends with."""
+    with pytest.raises(kind) as raised:
+        call()
+    message = str(raised.value)
+    assert "\n" not in message
+    assert message.startswith(start)
+    assert "; accepted: " in message
+    return message
+
+
 def assert_unknown_key(load: Callable[[], object], file: Path, place: str, name: str, nearest: str) -> None:
     """A settings file is refused by the place of an unknown key and the nearest key that exists."""
-    with pytest.raises(UnknownNameError) as raised:
-        load()
-    message = str(raised.value)
-    assert message.startswith(f"{file}: {place}: unknown name '{name}'; accepted: ")
+    message = refused(load, f"{file}: {place}: unknown name '{name}'; accepted: ", UnknownNameError)
     assert nearest in message.split("accepted: ")[1].split(", ")
-    assert "\n" not in message
 
 
 def assert_wrong_value(load: Callable[[], object], file: Path, place: str, found: str) -> None:
     """A settings file is refused by the place of a value, the value, and what is accepted."""
-    with pytest.raises(ConfigError) as raised:
-        load()
-    message = str(raised.value)
-    assert message.startswith(f"{file}: {place}: ")
-    assert found in message
-    assert "accepted: " in message
-    assert "\n" not in message
+    assert found in refused(load, f"{file}: {place}: ", ConfigError)

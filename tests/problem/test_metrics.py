@@ -1,0 +1,59 @@
+"""Errors by group of rows: those of the series that they summarize."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from motions import value
+from scipy.linalg import null_space
+from synthetic import Array, Oracle, load, make_log
+from welded import CONTACTS, SENSORS, STATES, machine
+
+from torchid.problem import bind_log
+from torchid.problem.metrics import Evaluation
+from torchid.problem.predict import force_series
+
+
+def rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+@pytest.mark.parametrize("fixed_base", [False, True], ids=["floating", "bolted"])
+def test_errors_by_group_are_those_of_the_series(tmp_path: Path, fixed_base: bool) -> None:
+    """Projected ones are as long as the part of the error that no contact force and no wrench in a limb enters."""
+    robot, rng = load(machine(tmp_path), None, fixed_base, SENSORS), np.random.default_rng(0)
+    oracle = Oracle.of(robot)
+    oracle.perturb(rng, 0.2)
+    contacts = [(contact.frame, contact.components) for contact in CONTACTS]
+    samples = bind_log(make_log(oracle, contacts, STATES, 24, rng), robot, CONTACTS)
+    evaluation, phi, base = Evaluation(robot, CONTACTS), robot.nominal.reshape(1, -1), robot.base_rows
+    (found,) = evaluation.metrics([samples], phi)
+    measured, (predicted,) = force_series(evaluation.builder, samples, phi)
+    off, joints = predicted - measured, slice(base, robot.nv)
+    torque = np.hstack([np.zeros((24, base)), value(samples.torque).numpy()])
+    limbs, limbs_measured = (x[:, robot.nv :].reshape(24, -1, 2, 3) for x in (off, measured))
+    for k, group in enumerate(("ft_force", "ft_moment")):
+        assert found.limb_rms[group] == pytest.approx(rms(limbs[:, :, k]), rel=1e-12)
+        assert found.limb_relative[group] == pytest.approx(
+            rms(limbs[:, :, k]) / rms(limbs_measured[:, :, k]), rel=1e-12
+        )
+    expected = {"joint_torque": (np.mean([rms(x) for x in off[:, joints].T]), 1e-12)}
+    if base:
+        expected |= {"base_force": (rms(off[:, :3]), 1e-12), "base_moment": (rms(off[:, 3:6]), 1e-12)}
+    q = replace(samples, wrench=None).coordinates()[0].numpy()
+    J = [oracle.jacobian(q, contact.frame)[:, list(contact.components)] for contact in CONTACTS]
+    unmeasured, inside = np.eye(robot.n_rows)[robot.nv :], []
+    for i, active in enumerate(samples.active.tolist()):
+        rows = [one[i] for one, touches in zip(J, active, strict=True) if touches]
+        V = null_space(np.concatenate([unmeasured, *rows]), rcond=1e-9)
+        inside.append(V.T @ (predicted - torque)[i])
+    expected["nullspace"] = (rms(np.concatenate(inside)), 1e-9)
+    for group, (size, accuracy) in expected.items():
+        assert found.rms[group] == pytest.approx(size, rel=accuracy), group
+    if base:
+        about_mean = rms(measured[:, :3] - measured[:, :3].mean(axis=0))
+        assert found.base_force_of_variation == pytest.approx(rms(off[:, :3]) / about_mean, rel=1e-12)
+    assert list(found.by_joint_rms.values()) == pytest.approx([rms(x) for x in off[:, joints].T], rel=1e-12)
