@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from motions import jittered, uniform, value
 
 from torchid.logs import Log
@@ -101,3 +102,10 @@ def test_where_a_filtered_contact_is_not_active_hardly_any_of_its_force_is_left(
     assert force[active].max() == pytest.approx(700.0, rel=0.2)
     begins, ends = out.time[active][[0, -1]]
     assert (begins, ends) == pytest.approx((0.9, 3.1), abs=0.008)
+
+
+def test_a_log_of_reversed_views_is_one_that_torch_takes() -> None:
+    t = uniform(0.05, 100.0)
+    position = np.arange(10.0).reshape(5, 2)
+    log = Log("x", t, ("b", "a"), position[:, ::-1])
+    np.testing.assert_array_equal(torch.from_numpy(value(log.joint_position)), position[:, ::-1])

@@ -103,3 +103,16 @@ def test_dependent_rows_are_found_in_either_precision(dtype: torch.dtype) -> Non
     ((_, V),) = null_space(A)
     assert V.shape == (20, 18, 9)
     assert (A @ V).abs().max() < 100.0 * torch.finfo(dtype).eps * A.abs().max()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("with_gradient", [False, True])
+def test_a_jacobian_of_rounding_errors_alone_has_rank_0(dtype: torch.dtype, with_gradient: bool) -> None:
+    eps = torch.finfo(dtype).eps
+    A = eps * torch.randn(4, 2, 5, dtype=dtype, generator=torch.Generator().manual_seed(0))
+    A[0, 1] = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0])
+    bases = dict.fromkeys(range(4), torch.empty(0, 0))
+    for index, V in null_space(A.requires_grad_(with_gradient)):
+        bases |= dict(zip(torch.arange(4)[index].tolist(), V, strict=True))
+    assert [V.shape[1] for V in bases.values()] == [4, 5, 5, 5]
+    assert (bases[0][1].abs() < 100.0 * eps).all()

@@ -158,6 +158,8 @@ class Log:
             accepted = np.dtype(np.bool_ if name == "contact_active" else np.float64)
             if array.dtype != accepted:
                 raise LogError.at_field(name, f"values of type {array.dtype}", str(accepted))
+            if min(array.strides, default=0) < 0:
+                object.__setattr__(self, name, array.copy())  # torch takes no reversed view
         if all(getattr(self, name) is not None for name in WRENCHES):
             raise LogError.at_field(WRENCHES[1], f"given together with {WRENCHES[0]}", "one of the two")
 

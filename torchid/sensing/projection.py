@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchid.rounding import BASE_RANK_TOLERANCE, KINEMATIC_TOLERANCE, relative_tolerance
 
+_ROUNDINGS = 100.0  # of a unit term: by so many units of rounding an entry of a Jacobian may be off
 _SUSPECT = 1e3  # below this many tolerances, the QR path hands the sample to an SVD
 
 
@@ -158,7 +159,7 @@ def base_rank(singular_values: Tensor) -> Tensor:
     return (singular_values > tolerance).sum(1)
 
 
-def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
+def null_space(A: Tensor, size: float = 1.0) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Orthonormal bases of the null spaces of a batch of matrices, grouped by rank.
 
     A QR factorization of the transpose serves samples of full row rank; only those that might have lost rank (straight
@@ -169,12 +170,15 @@ def null_space(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
 
     Args:
         A: (B, k, m); with gradient if it requires one.
+        size: of the terms that its entries are sums of, 1 for the work of unit wrenches. Singular values below rounding
+            of it are zero, even if all are: a wrench can act on no measured degree of freedom.
 
     Yields:
         (index of the samples, V): V is (B', m, m - rank) with `A @ V = 0` and `V^T V = I`.
     """
-    for index, V in _bases(A.detach()):
-        yield index, _differentiable(A[index], V) if A.requires_grad else V
+    floor = _ROUNDINGS * torch.finfo(A.dtype).eps * size
+    for index, V in _bases(A.detach(), floor):
+        yield index, _differentiable(A[index], V, floor) if A.requires_grad else V
 
 
 def whitened_null_space(
@@ -199,7 +203,7 @@ def whitened_null_space(
         for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std):
             yield index, _along(W.mT, axes[index].mT).mT
         return
-    for index, V in null_space(A / row_std):
+    for index, V in null_space(A / row_std, float(torch.linalg.vector_norm(1.0 / row_std))):
         W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
         if len(wrench_std):
             through_contacts = (J_m[index] @ W) * wrench_std[:, None]
@@ -214,7 +218,7 @@ def _along(X: Tensor, axes: Tensor) -> Tensor:
     return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)
 
 
-def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
+def _bases(A: Tensor, floor: float) -> Iterator[tuple[Tensor | slice, Tensor]]:
     samples, k, m = A.shape
     if samples == 0:
         return
@@ -228,8 +232,9 @@ def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
         reflectors, tau = torch.geqrf(A.mT)
         R = reflectors[:, :k].triu()
         inverse = torch.linalg.solve_triangular(R, identity[:k, :k].expand_as(R), upper=True)
-        condition = torch.linalg.matrix_norm(R) * torch.linalg.matrix_norm(inverse)
-        suspect = ~(condition < 1.0 / (_SUSPECT * tolerance))  # so written, infinite and undefined ones are suspect too
+        negligible = (tolerance * torch.linalg.matrix_norm(R)).clamp_min(floor)
+        ratio = negligible * torch.linalg.matrix_norm(inverse)
+        suspect = ~(ratio < 1.0 / _SUSPECT)  # so written, infinite and undefined ones are suspect too
         V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
         if not suspect.any():
             yield slice(None), V
@@ -239,18 +244,18 @@ def _bases(A: Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
             yield regular, V[regular]
     remaining = torch.nonzero(suspect)[:, 0]
     _, values, Vh = torch.linalg.svd(A[remaining], full_matrices=True)
-    rank = (values > tolerance * values[:, :1].clamp_min(torch.finfo(A.dtype).tiny)).sum(1)
+    rank = (values > (tolerance * values[:, :1]).clamp_min(floor)).sum(1)
     for r in rank.unique().tolist():
         same = rank == r
         yield remaining[same], Vh[same, r:].mT
 
 
-def _differentiable(A: Tensor, V: Tensor) -> Tensor:
+def _differentiable(A: Tensor, V: Tensor, floor: float) -> Tensor:
     """Bases `V` as functions of A: projected onto the null space of A and made orthonormal again.
 
     Their value does not change but by rounding. To first order dV = -A^+ dA V (Golub, Pereyra 1973).
     """
-    inverse = torch.linalg.pinv(A, rtol=_tolerance(A))
+    inverse = torch.linalg.pinv(A, atol=floor, rtol=_tolerance(A))
     inside = V - inverse @ (A @ V)
     L = torch.linalg.cholesky(inside.mT @ inside)
     return torch.linalg.solve_triangular(L, inside.mT, upper=False).mT
