@@ -108,7 +108,7 @@ def test_frozen_bodies_and_bodies_without_mass_are_not_enclosed_nor_complained_o
     elements = [link("base", INERTIAL + ball(0.1)), link("arm"), link("hand", INERTIAL + ball(0.2)), link("ghost", "")]
     joints = [joint("a", "base", "arm"), joint("b", "arm", "hand"), joint("c", "hand", "ghost")]
     robot = load(write(tmp_path, *elements, *joints))
-    with pytest.warns(TorchidWarning, match="no shapes at arm: where") as caught:
+    with pytest.warns(TorchidWarning, match="no shapes at arm: their extent") as caught:
         assert [e.body for e in conditions(tmp_path, robot, com_inside="box").enclosures] == [0, 2]
     assert len(caught) == 1
     with warnings.catch_warnings():
