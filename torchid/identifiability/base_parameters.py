@@ -286,7 +286,7 @@ def state_reports(logs: Sequence[Samples], builder: RowBuilder) -> list[StateRep
         defaultdict[ContactState, list[Tensor]](list),
     )
     for samples, state, weight in subsample_states(logs, _CHECKED):
-        for _, V in builder.null_space_bases(samples.to(builder.device), state):
+        for _, V in builder.null_space_bases(state, builder.kinematics(samples.to(builder.device))):
             rows[state] = max(rows[state], V.shape[2] + len(builder.layout(state).uncoupled_joints))
             if builder.tree.base_rows:
                 values[state].append(base_singular_values(V).cpu())

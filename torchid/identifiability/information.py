@@ -267,8 +267,8 @@ def expected_errors(
     model, sensors = ForceSums(nv), ForceSums(nv)
     for samples, state, weight in subsample_states(logs, _ERROR_SAMPLES):
         samples = samples.to(builder.device)
-        terms = builder.dynamics(samples)
-        predicted = torch.stack([predict_forces(builder, terms, phi).T for phi in columns])
+        kinematics = builder.kinematics(samples)
+        predicted = predict_forces(builder, kinematics, columns).mT
         rows = _row_noise(builder, samples, noise)
         through_contacts = _wrench_noise(builder, samples, state, noise)
         for sums, errors, without_contacts in (
@@ -276,7 +276,7 @@ def expected_errors(
             (sensors, torch.cat([rows, through_contacts]), rows),
         ):
             sums.rows.add(_root_sum_of_squares(errors), weight)
-            for inside in null_space_components(builder, samples, state, without_contacts):
+            for inside in null_space_components(builder, state, kinematics, without_contacts):
                 sums.projected.add(_root_sum_of_squares(inside).flatten()[:, None], weight)
     errors_rms = (sums.rms(base, builder.tree.n) for sums in (model, sensors))
     return ExpectedErrors(*({group: finite_or_none(rms[group]) for group in ROW_GROUPS} for rms in errors_rms))

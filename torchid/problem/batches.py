@@ -127,11 +127,14 @@ class MiniBatches:
     @torch.no_grad()
     def generalized_forces(self, phi: Array) -> Iterator[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
         """Coordinates (q, v, a) of samples, log by log, with K phi, (B, n_rows) [N, N m], of parameters (12 L,)."""
-        columns = self.builder.to_columns(phi[None])[0]
+        columns = self.builder.to_columns(phi[None])
         for log in self._logs:
             for start in range(0, len(log), _CHUNK):
                 samples = log[start : start + _CHUNK].to(self.builder.device)
-                yield samples.coordinates(), predict_forces(self.builder, self.builder.dynamics(samples), columns).T
+                yield (
+                    samples.coordinates(),
+                    predict_forces(self.builder, self.builder.kinematics(samples), columns)[0].T,
+                )
 
     def _generator(self, number: int) -> torch.Generator:
         return torch.Generator().manual_seed((self.seed * 1_000_003 + number) % 2**63)

@@ -14,7 +14,7 @@ from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.predict import measured_and_predicted_forces
-from torchid.problem.rows import RowBuilder
+from torchid.problem.rows import ChunkKinematics, RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors
@@ -119,11 +119,12 @@ class Evaluation:
         def sum_chunks(chunks: Iterator[tuple[Samples, ContactState]]) -> list[ForceSums]:
             sums = [ForceSums(self.robot.n_rows) for _ in range(len(phi) + 1)]
             for samples, state in chunks:
-                forces = measured_and_predicted_forces(builder, samples, state, columns)
+                kinematics = builder.kinematics(samples)
+                forces = measured_and_predicted_forces(builder, samples, state, columns, kinematics)
                 for total, predicted in zip(sums, (torch.zeros_like(forces.torque), *forces.predicted), strict=True):
                     total.rows.add(predicted - forces.measured)
                 vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])
-                for group in null_space_components(builder, samples, state, vectors):
+                for group in null_space_components(builder, state, kinematics, vectors):
                     for total, inside in zip(sums, group, strict=True):
                         total.projected.add(inside.flatten()[:, None])
             return sums
@@ -206,7 +207,7 @@ def group_name(group: str) -> str:
 
 
 def null_space_components(
-    builder: RowBuilder, samples: Samples, state: ContactState, vectors: torch.Tensor
+    builder: RowBuilder, state: ContactState, kinematics: ChunkKinematics, vectors: torch.Tensor
 ) -> Iterator[torch.Tensor]:
     """V_x^T of generalized forces (M, B, n_rows), V_x the contacts' null space, in groups of one rank, (M, B', r).
 
@@ -215,9 +216,10 @@ def null_space_components(
     layout, base = builder.layout(state), builder.tree.base_rows
     coupled = [*range(base), *(base + joint for joint in layout.coupled_joints)]
     uncoupled = [base + joint for joint in layout.uncoupled_joints]
-    for index, V in builder.null_space_bases(samples, state):
+    for index, V in builder.null_space_bases(state, kinematics):
         forces = vectors[:, index]
-        yield torch.cat([(V.mT @ forces[..., coupled, None])[..., 0], forces[..., uncoupled]], dim=2)
+        inside = (V.mT @ forces[..., coupled].permute(1, 2, 0)).permute(2, 0, 1)
+        yield torch.cat([inside, forces[..., uncoupled]], dim=2)
 
 
 class ForceSums:

@@ -17,8 +17,9 @@ from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.contact_state import ContactState, contact_extra_column, dof_extra_column
 from torchid.problem.extras import ACTUATORS, Extra
-from torchid.problem.rows import ChunkDynamics, RowBuilder
+from torchid.problem.rows import ChunkKinematics, RowBuilder
 from torchid.problem.samples import Samples
+from torchid.regressor.columns import body_wrenches
 from torchid.regressor.regressor import generalized_forces, wrench_transform, wrenches_at_base
 from torchid.regressor.tree import KinematicTree
 
@@ -83,27 +84,23 @@ class GeneralizedForces:
     predicted: Tensor
 
 
-def predict_forces(builder: RowBuilder, dynamics: ChunkDynamics, phi: Tensor) -> Tensor:
-    """K phi, (n_rows, B), for parameters in the builder's columns, (columns,), without extras.
+def predict_forces(builder: RowBuilder, kinematics: ChunkKinematics, phi: Tensor) -> Tensor:
+    """K phi, (M, n_rows, B), for M parameter vectors (M, columns) in the builder's columns, without extras.
 
     Joint forces are products of screw axes with wrenches summed over subtrees; the rows of K are never formed.
     """
-    tree, layout = builder.tree, builder.columns.layout
-    by_body = phi.new_zeros(tree.n_nodes, layout.count)
-    for body, start in enumerate(layout.starts[:-1]):
-        end = layout.starts[body + 1]
-        by_body[body, start:end] = phi[start:end]
-    wrench = by_body @ dynamics.wrenches  # (6, L, B)
+    tree, columns = builder.tree, builder.columns
+    wrench = body_wrenches(kinematics.states, columns.inertial_by_node(phi)).transpose(0, 1)  # (M, 6, L, B)
     below = tree.ancestors.T @ wrench
-    torque = (dynamics.screw_axes * below).sum(0)
-    coulomb, viscous = phi[layout.count : builder.columns.count].unflatten(0, (-1, 2)).unbind(1)
-    velocity = dynamics.joints.velocity[1:]
-    torque[1:] += coulomb[:, None] * tree.coulomb_sign(velocity) + viscous[:, None] * velocity
+    torque = below.mul_(kinematics.screw_axes).sum(1)
+    coulomb, viscous = phi[:, columns.layout.count : columns.count, None].unflatten(1, (-1, 2)).unbind(2)
+    velocity = kinematics.joints.velocity[1:]
+    torque[:, 1:].addcmul_(coulomb, tree.coulomb_sign(velocity)).addcmul_(viscous, velocity)
     joints = tree.joint_map.T @ torque
-    return torch.cat([wrench.sum(1), joints]) if tree.base_rows else joints
+    return torch.cat([wrench.sum(2), joints], 1) if tree.base_rows else joints
 
 
-def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, dynamics: ChunkDynamics) -> Tensor:
+def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, kinematics: ChunkKinematics) -> Tensor:
     """J_C^T lambda, (n_rows, B), over the active contacts; NaN in the rows that an unmeasured component reaches."""
     tree = builder.tree
     total = samples.time.new_zeros(tree.n_rows, len(samples))
@@ -112,26 +109,25 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, d
             body, T_joint_frame = builder.frames[contact]
             possible = list(builder.contacts[contact].components)
             units = total.new_tensor(wrench_transform(T_joint_frame).T[possible])
-            components = builder.recorded_wrench(samples, contact, dynamics)[:, possible].T
-            wrench = (wrenches_at_base(dynamics.states, body, units) * components).sum(1, keepdim=True)
+            components = builder.recorded_wrench(samples, contact, kinematics)[:, possible].T
+            wrench = (wrenches_at_base(kinematics.states, body, units) * components).sum(1, keepdim=True)
             joints = builder.columns.joints_above(body)  # other rows must not become NaN by an unmeasured force
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
-            total[rows] += generalized_forces(tree, dynamics.screw_axes, body, wrench, joints)[0]
+            total[rows] += generalized_forces(tree, kinematics.screw_axes, body, wrench, joints)[0]
     return total
 
 
 def measured_and_predicted_forces(
-    builder: RowBuilder, samples: Samples, state: ContactState, phi: Tensor
+    builder: RowBuilder, samples: Samples, state: ContactState, phi: Tensor, kinematics: ChunkKinematics
 ) -> GeneralizedForces:
     """Measured and predicted forces of samples that share a contact state; `phi` is (M, width).
 
     Sensors are taken as calibrated: of the extras only those of actuators enter.
     """
-    dynamics = builder.dynamics(samples)
     base_rows = builder.tree.base_rows
     torque = torch.nn.functional.pad(builder.recorded_torque(samples), (base_rows, 0))
-    measured = torque + contact_forces(builder, samples, state, dynamics).T
-    predicted = torch.stack([predict_forces(builder, dynamics, p).T for p in phi])
+    measured = torque + contact_forces(builder, samples, state, kinematics).T
+    predicted = predict_forces(builder, kinematics, phi).mT
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
         if extra.dof is not None and extra.what in ACTUATORS:
             column = dof_extra_column(extra, samples, builder.tree)
@@ -146,7 +142,8 @@ def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Arr
     measured, predicted = np.empty((len(samples), n_rows)), np.empty((len(phi), len(samples), n_rows))
     with torch.no_grad(), one_thread():
         for state, index in chunks_by_state(samples):
-            forces = measured_and_predicted_forces(builder, samples[index].to(builder.device), state, columns)
+            chunk = samples[index].to(builder.device)
+            forces = measured_and_predicted_forces(builder, chunk, state, columns, builder.kinematics(chunk))
             where = index if isinstance(index, slice) else index.numpy()
             measured[where] = forces.measured.cpu().numpy()
             predicted[:, where] = forces.predicted.cpu().numpy()
@@ -160,7 +157,8 @@ def null_space_part(builder: RowBuilder, samples: Samples, forces: Array) -> Arr
         for state, index in chunks_by_state(samples):
             where = np.arange(len(samples))[index if isinstance(index, slice) else index.numpy()]
             coupled = [*range(base), *(base + joint for joint in builder.layout(state).coupled_joints)]
-            for part, V in builder.null_space_bases(samples[index].to(builder.device), state):
+            kinematics = builder.kinematics(samples[index].to(builder.device))
+            for part, V in builder.null_space_bases(state, kinematics):
                 chosen = where[part if isinstance(part, slice) else part.cpu().numpy()]
                 at = np.ix_(np.arange(len(forces)), chosen, coupled)
                 inside = V @ (V.mT @ torch.from_numpy(forces[at]).to(V)[..., None])

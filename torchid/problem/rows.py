@@ -53,22 +53,31 @@ class Workspace:
 
 
 @dataclass(frozen=True)
-class ChunkDynamics:
-    """Dynamics of B samples, from which rows and predictions are computed.
+class ChunkKinematics:
+    """Kinematics of B samples, from which predictions and contact Jacobians are computed.
 
     Attributes:
         joints: motion of all joints.
         states: of the joint frames of all nodes.
         screw_axes: (6, L, B), see `joint_screw_axes`.
-        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter.
         rotation_world_base: (B, 3, 3), None where it was not recorded.
     """
 
     joints: JointMotion
     states: BodyStates
     screw_axes: Tensor
-    wrenches: Tensor
     rotation_world_base: Tensor | None
+
+
+@dataclass(frozen=True)
+class ChunkDynamics(ChunkKinematics):
+    """Kinematics of B samples with the columns of the inertial parameters, from which rows are computed.
+
+    Attributes:
+        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter.
+    """
+
+    wrenches: Tensor
 
     def select(self, index: Tensor | slice) -> ChunkDynamics:
         """The dynamics of some samples."""
@@ -82,8 +91,8 @@ class ChunkDynamics:
             JointMotion(*map(pick, vars(self.joints).values())),
             BodyStates(*map(pick, vars(self.states).values())),
             pick(self.screw_axes),
-            pick(self.wrenches),
             None if self.rotation_world_base is None else self.rotation_world_base[index],
+            pick(self.wrenches),
         )
 
 
@@ -142,17 +151,19 @@ class RowBuilder(nn.Module):
         """Layout of a contact state: its columns, coupled joints and wrench directions."""
         return self._layouts.layout(state)
 
-    def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
-        """Dynamics of some samples; with a workspace, valid until the next call with the same."""
+    def kinematics(self, samples: Samples) -> ChunkKinematics:
+        """Kinematics of some samples."""
         motion = samples.motion()
         joints = joint_motion(self.tree, motion)
         states = body_states(self.tree, motion, joints)
-        screw_axes = joint_screw_axes(self.tree, states)
-        column_layout, out = self.columns.layout, None
+        return ChunkKinematics(joints, states, joint_screw_axes(self.tree, states), samples.base.rotation)
+
+    def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
+        """Dynamics of some samples; with a workspace, valid until the next call with the same."""
+        kinematics, layout, out = self.kinematics(samples), self.columns.layout, None
         if workspace is not None:
-            out = workspace.zeros("wrenches", states.position, 6, column_layout.count, len(samples))
-        wrenches = all_wrench_columns(states, column_layout, out)
-        return ChunkDynamics(joints, states, screw_axes, wrenches, samples.base.rotation)
+            out = workspace.zeros("wrenches", kinematics.screw_axes, 6, layout.count, len(samples))
+        return ChunkDynamics(**vars(kinematics), wrenches=all_wrench_columns(kinematics.states, layout, out))
 
     def rows(
         self, samples: Samples, state: ContactState, workspace: Workspace | None = None
@@ -196,21 +207,20 @@ class RowBuilder(nn.Module):
             W[:, base + joint, slot] = 1.0 / self._layouts.dof_std[joint]
         return rows, W
 
-    def null_space_bases(self, samples: Samples, state: ContactState) -> Iterator[tuple[Tensor | slice, Tensor]]:
+    def null_space_bases(
+        self, state: ContactState, kinematics: ChunkKinematics
+    ) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
-        layout, dynamics = self.layout(state), self.dynamics(samples)
-        yield from null_space(self._contact_rows(layout, dynamics)[0])
+        yield from null_space(self._contact_rows(self.layout(state), kinematics)[0])
 
     def contact_jacobian(self, samples: Samples) -> Tensor:
         """Jacobians of all contact frames along their own axes, active or not, (B, C, 6, n_rows)."""
-        motion = samples.motion()
-        states = body_states(self.tree, motion, joint_motion(self.tree, motion))
-        screw_axes, joints = joint_screw_axes(self.tree, states), range(self.tree.n_dofs)
-        J = motion.joint_position.new_zeros(len(samples), len(self.frames), 6, self.tree.n_rows)
+        kinematics, joints = self.kinematics(samples), range(self.tree.n_dofs)
+        J = kinematics.screw_axes.new_zeros(len(samples), len(self.frames), 6, self.tree.n_rows)
         for contact, (body, T_joint_frame) in enumerate(self.frames):
             units = J.new_tensor(wrench_transform(T_joint_frame).T.copy())
-            at_base = wrenches_at_base(states, body, units)
-            J[:, contact] = generalized_forces(self.tree, screw_axes, body, at_base, joints).permute(2, 0, 1)
+            at_base = wrenches_at_base(kinematics.states, body, units)
+            J[:, contact] = generalized_forces(self.tree, kinematics.screw_axes, body, at_base, joints).permute(2, 0, 1)
         return J
 
     def noise_axes(self, rotation_world_base: Tensor | None) -> Tensor | None:
@@ -219,21 +229,21 @@ class RowBuilder(nn.Module):
             None if rotation_world_base is None or not self.tree.base_rows else levelled_base_axes(rotation_world_base)
         )
 
-    def recorded_wrench(self, samples: Samples, contact: int, dynamics: ChunkDynamics) -> Tensor:
+    def recorded_wrench(self, samples: Samples, contact: int, kinematics: ChunkKinematics) -> Tensor:
         """Recorded wrench of a contact along its frame's axes, (B, 6) [N, N m], NaN where not recorded."""
         if samples.wrench is None:
             return samples.time.new_full((len(samples), 6), torch.nan)
         wrench = samples.wrench[:, contact]
         if not samples.wrench_in_world:
             return wrench
-        return (self._rotation(contact, dynamics).mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
+        return (self._rotation(contact, kinematics).mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
 
-    def _rotation(self, contact: int, dynamics: ChunkDynamics) -> Tensor:
+    def _rotation(self, contact: int, kinematics: ChunkKinematics) -> Tensor:
         """Rotation contact frame to world, (B, 3, 3), or to a bolted base whose orientation is unknown."""
         body, T_joint_frame = self.frames[contact]
-        in_body = dynamics.wrenches.new_tensor(T_joint_frame[:3, :3])
-        rotation = dynamics.states.rotation[:, :, body].permute(2, 0, 1) @ in_body
-        return rotation if dynamics.rotation_world_base is None else dynamics.rotation_world_base @ rotation
+        in_body = kinematics.screw_axes.new_tensor(T_joint_frame[:3, :3])
+        rotation = kinematics.states.rotation[:, :, body].permute(2, 0, 1) @ in_body
+        return rotation if kinematics.rotation_world_base is None else kinematics.rotation_world_base @ rotation
 
     def recorded_torque(self, samples: Samples) -> Tensor:
         """Recorded joint torques and wrenches in limbs, (B, n + 6 F) [N m, N], NaN where not recorded."""
@@ -331,19 +341,19 @@ class RowBuilder(nn.Module):
         for k in (0, 1, 2):
             out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), path_sums[k].unsqueeze(1))
 
-    def _contact_rows(self, layout: ContactStateLayout, dynamics: ChunkDynamics) -> tuple[Tensor, Tensor]:
+    def _contact_rows(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> tuple[Tensor, Tensor]:
         """Rows of J_C, unmeasured and measured, in base and coupled joints, (B, k, base rows + coupled joints)."""
-        samples, base_rows = dynamics.wrenches.shape[-1], self.tree.base_rows
+        samples, base_rows = kinematics.screw_axes.shape[-1], self.tree.base_rows
         sizes = [sum(len(getattr(body, kind)) for body in layout.contact_bodies) for kind in ("unmeasured", "measured")]
-        both = dynamics.wrenches.new_zeros(sum(sizes), len(layout.row_std), samples)
+        both = kinematics.screw_axes.new_zeros(sum(sizes), len(layout.row_std), samples)
         starts = [0, sizes[0]]
         for contact in layout.contact_bodies:
             joints = [layout.coupled_joints[index] for index in contact.joints]
             columns = [*range(base_rows), *(base_rows + index for index in contact.joints)]
             for kind, wrenches in enumerate((contact.unmeasured, contact.measured)):
                 if len(wrenches):
-                    at_base = wrenches_at_base(dynamics.states, contact.body, wrenches)
-                    rows = generalized_forces(self.tree, dynamics.screw_axes, contact.body, at_base, joints)
+                    at_base = wrenches_at_base(kinematics.states, contact.body, wrenches)
+                    rows = generalized_forces(self.tree, kinematics.screw_axes, contact.body, at_base, joints)
                     target = both[starts[kind] : starts[kind] + len(wrenches)]
                     target.index_copy_(1, self._index(columns), rows)
                     starts[kind] += len(wrenches)
@@ -352,11 +362,11 @@ class RowBuilder(nn.Module):
     def _index(self, indices: Iterable[int]) -> Tensor:
         return torch.tensor(list(indices), dtype=torch.int64, device=self.device)
 
-    def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics) -> Tensor:
+    def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""
         components = [component for body in layout.contact_bodies for component in body.components]
         local = {
-            contact: self.recorded_wrench(samples, contact, dynamics)
+            contact: self.recorded_wrench(samples, contact, kinematics)
             for contact in {contact for contact, _ in components}
         }
         return torch.stack([local[contact][:, k] for contact, k in components], dim=1)

@@ -136,7 +136,7 @@ def base_values(builder: RowBuilder, state: ContactState, postures: Array) -> to
     values = torch.zeros(len(postures), 6, dtype=torch.float64)
     for start in range(0, len(postures), _CHUNK):
         samples = resting_samples(postures[start : start + _CHUNK], state)
-        for index, V in builder.null_space_bases(samples, state):
+        for index, V in builder.null_space_bases(state, builder.kinematics(samples)):
             values[start : start + _CHUNK][index] = base_singular_values(V)
     return values
 
@@ -241,7 +241,7 @@ def _assess_state(
 
 
 def _lost_base(builder: RowBuilder, state: ContactState, posture: Array, state_demands: _StateDemands) -> LostBase:
-    [(_, V)] = builder.null_space_bases(resting_samples(posture, state), state)
+    [(_, V)] = builder.null_space_bases(state, builder.kinematics(resting_samples(posture, state)))
     U, values, _ = np.linalg.svd(V[0, :6].numpy())
     directions = U[:, (values > BASE_RANK_TOLERANCE).sum() :]
     missing = state_demands.missing()
