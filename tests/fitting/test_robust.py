@@ -279,7 +279,7 @@ def whitened(bench: Bench, log: Samples) -> tuple[Array, Array]:
         wide[:, [*support, bench.builder.width]] = block.numpy()
         rows.append(wide)
     X = np.concatenate(rows)
-    return X[:, :-1] @ bench.builder.columns.parameter_map(), X[:, -1]
+    return X[:, :-1] @ bench.builder.columns.parameter_map, X[:, -1]
 
 
 @pytest.mark.parametrize("kind", LOSSES)

@@ -66,7 +66,7 @@ def stacked(builder: RowBuilder, robot: Robot, logs: list[Samples]) -> tuple[Arr
     """All rows [K | extras], the extras of each log in columns of their own, the right-hand side, and the labels."""
     labels = [(log.source, x.label) for log in logs for x in builder.extras if x.per_log]
     labels += [("", x.label) for x in builder.extras if not x.per_log]
-    count, M = builder.columns.count, builder.columns.parameter_map()
+    count, M = builder.columns.count, builder.columns.parameter_map
     blocks, right = [], []
     for log in logs:
         for state, index in chunks_by_state(log):

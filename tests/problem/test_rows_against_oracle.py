@@ -193,7 +193,7 @@ def measured_force(r: Recorded, log: Log, sensors: SensorSet, i: int) -> tuple[A
 
 def rows_of(r: Recorded, builder: RowBuilder, log: Log) -> tuple[Array, Array]:
     """All rows [K | f], (B, n_rows, 12 L + 1), and the basis W that made them, (B, n_rows, n_rows)."""
-    samples, M = bind_log(log, r.robot, r.contacts, builder.sensors), torch.from_numpy(builder.columns.parameter_map())
+    samples, M = bind_log(log, r.robot, r.contacts, builder.sensors), torch.from_numpy(builder.columns.parameter_map)
     n_rows = builder.tree.n_rows
     rows, W = (torch.zeros(len(log), n_rows, k, dtype=torch.float64) for k in (M.shape[1] + 1, n_rows))
     for state, index in chunks_by_state(samples):

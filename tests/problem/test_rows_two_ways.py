@@ -56,7 +56,7 @@ def by_row_builder(sensors: torchid.SensorSet) -> tuple[Array, Array]:
     builder = RowBuilder(ROBOT, FEET, sensors)
     rows = torch.cat([builder.rows_by_sample(SAMPLES[index], state)[0] for state, index in chunks_by_state(SAMPLES)])
     rows = rows.flatten(0, 1).numpy()
-    return rows[:, :-1] @ builder.columns.parameter_map(), rows[:, -1]
+    return rows[:, :-1] @ builder.columns.parameter_map, rows[:, -1]
 
 
 @pytest.mark.parametrize("name", SENSOR_SETS)

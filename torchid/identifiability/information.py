@@ -157,7 +157,7 @@ def prior_directions(builder: RowBuilder, prior: Array) -> Array:
     `N N^T` is the covariance of the columns' parameters if parameters are independent with the standard deviations
     `prior`, (12 L,), 0 where they are known, and extras with that of their size.
     """
-    rigid = triangular_factor((builder.columns.parameter_map() * prior).T).T
+    rigid = triangular_factor((builder.columns.parameter_map * prior).T).T
     return np.asarray(scipy.linalg.block_diag(rigid, np.diag([extra.size for extra in builder.extras])))
 
 
@@ -262,7 +262,7 @@ def expected_errors(
         directions: (M, 12 L), independent errors of the parameters, as `error_directions` gives them.
         noise: of the sensors that recorded these logs, and of the base rows.
     """
-    columns = torch.from_numpy(triangular_factor(directions @ builder.columns.parameter_map().T)).to(builder.device)
+    columns = torch.from_numpy(triangular_factor(directions @ builder.columns.parameter_map.T)).to(builder.device)
     base, nv = builder.tree.base_rows, builder.tree.base_rows + len(builder.columns.joint_rows)
     model, sensors = ForceSums(nv), ForceSums(nv)
     for samples, state, weight in subsample_states(logs, _ERROR_SAMPLES):

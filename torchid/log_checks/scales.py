@@ -111,7 +111,7 @@ def _prior_columns(builder: RowBuilder, robot: Robot, samples: Sequence[Samples]
     massless = [body.massless for body in robot.bodies]
     scale[massless, parameters.INERTIAL] = 0.0
     kept = scale.flatten() > 0.0
-    return np.asarray((builder.columns.parameter_map() * scale.flatten())[:, kept])
+    return np.asarray((builder.columns.parameter_map * scale.flatten())[:, kept])
 
 
 @torch.no_grad()
@@ -274,7 +274,7 @@ def fit_torque_gains(samples: Sequence[Samples], robot: Robot, contacts: Sequenc
         return None
     builder = RowBuilder(robot, contacts, sensors)
     columns = _prior_columns(builder, robot, samples)
-    nominal = builder.columns.parameter_map() @ robot.nominal.flatten()
+    nominal = builder.columns.parameter_map @ robot.nominal.flatten()
     parts = []
     for part in samples:
         rows, W, equations = _whitened_rows(builder, part)

@@ -79,7 +79,7 @@ class MiniBatches:
         if builder.extras:
             raise ValueError("builder: found extra terms; accepted: one without")
         self.builder, self.batch_size, self.seed = builder, batch_size, seed
-        self.columns = torch.from_numpy(builder.columns.parameter_map()).to(builder.device)
+        self.columns = torch.from_numpy(builder.columns.parameter_map).to(builder.device)
         self.samples = sum(map(len, logs))
         self._logs, self._memory = tuple(logs), memory
         self._starts = torch.tensor([0, *(len(log) for log in logs)]).cumsum(0).tolist()

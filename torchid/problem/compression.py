@@ -179,7 +179,7 @@ def problem_from_triangle(
     """
     count = builder.columns.count
     return LinearProblem(
-        A=R[:count, :-1] @ builder.columns.parameter_map(),
+        A=R[:count, :-1] @ builder.columns.parameter_map,
         b=R[:count, -1],
         residual=float(np.square(R[count:, -1]).sum()),
         rows=rows,

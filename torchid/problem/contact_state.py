@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -63,6 +64,7 @@ class Columns:
         path = set(self.tree.path(body))
         return [j for j, row in enumerate(self.joint_rows) if any(moved in path for moved, _ in row.moved)]
 
+    @cached_property
     def parameter_map(self) -> Array:
         """Matrix M, (count, 12 L), from parameters to these columns: `K = K_columns @ M`."""
         nodes = self.tree.node_of

@@ -118,7 +118,7 @@ def _eliminate(
     scale = np.where(present, sizes, 1.0)
     U, values, V, remaining = _project_off(np.where(present, columns / scale, 0.0), rest)
     top, count = U.T @ rest, builder.columns.count
-    C = np.hstack([top[:, :count] @ builder.columns.parameter_map(), top[:, count:-1]])
+    C = np.hstack([top[:, :count] @ builder.columns.parameter_map, top[:, count:-1]])
     std_if_known = np.where(present, 1.0 / scale, np.inf)
     unobservable = np.eye(len(extras)) - V @ V.T
     elimination = Elimination(log, extras, (V / values) / scale[:, None], C, top[:, -1], std_if_known, unobservable)

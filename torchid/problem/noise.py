@@ -364,7 +364,7 @@ def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
     kept = is_significant(values)
     G = np.zeros((builder.width, int(kept.sum())))
     basis = scale[:, None] * Vh[kept].T / values[kept]
-    G[: builder.columns.count] = builder.columns.parameter_map()[:, problem.free] @ basis
+    G[: builder.columns.count] = builder.columns.parameter_map[:, problem.free] @ basis
     return torch.from_numpy(G)
 
 

@@ -138,7 +138,7 @@ class RowBuilder(nn.Module):
 
     def to_columns(self, phi: Array) -> Tensor:
         """Parameters (M, 12 L), or (M, 12 L + E) with values of the `extras`, in these columns: (M, width)."""
-        rigid = self.columns.parameter_map()
+        rigid = self.columns.parameter_map
         extra = phi[:, rigid.shape[1] :] if phi.shape[1] > rigid.shape[1] else np.zeros((len(phi), len(self.extras)))
         return torch.from_numpy(np.hstack([phi[:, : rigid.shape[1]] @ rigid.T, extra])).to(self.device)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.image import imread
+from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 
 from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
@@ -16,6 +16,7 @@ from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, SETS
 
+_RGBA = 4  # colour space in Summary.Image
 _CHARTED = (*SETS, "left_out")
 _TERMS = ("total", "data", "prior", "eigenvalue", "log_det", "mass", "friction", "residual")
 
@@ -150,8 +151,10 @@ class RunEvents:
         """
         self._writer.add_text("config", _preformatted(settings))
         for tag, path in figures.items():
-            pixels = np.round(255.0 * imread(path)).astype(np.uint8)
-            self._writer.add_image(tag, pixels, step, dataformats="HWC")
+            png = path.read_bytes()
+            width, height = struct.unpack(">II", png[16:24])
+            image = Summary.Image(encoded_image_string=png, width=width, height=height, colorspace=_RGBA)
+            self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
         named = {f"final/{name}": value for name, value in final.items()}
         self._writer.add_hparams(dict(hyperparameters), named, run_name="hparams")
 
