@@ -84,7 +84,7 @@ def subsample_states(logs: Sequence[Samples], count: int) -> Iterator[tuple[Samp
     pieces_by_state: dict[ContactState, list[tuple[Samples, torch.Tensor]]] = {}
     for samples in logs:
         every = torch.arange(len(samples))
-        for state, index in chunks_by_state(samples):
+        for state, index in chunks_by_state(samples, max(len(samples), 1)):
             pieces_by_state.setdefault(state, []).append((samples, every[index]))
     for state, pieces in pieces_by_state.items():
         total = sum(len(index) for _, index in pieces)
