@@ -275,9 +275,10 @@ class SumsOfSquares:
         """Add samples (N, rows), NaN where unknown, each of which counts as `weight` samples."""
         values = x.cpu().numpy()
         known = np.isfinite(values)
-        values = np.where(known, values, 0.0)
+        if not known.all():
+            values = np.where(known, values, 0.0)
         self.sum += weight * values.sum(0)
-        self.squares += weight * np.square(values).sum(0)
+        self.squares += weight * np.einsum("ij,ij->j", values, values)
         self.count += weight * known.sum(0)
 
     def add_squares(self, squares: float, count: int) -> None:

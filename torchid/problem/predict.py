@@ -90,14 +90,14 @@ def predict_forces(builder: RowBuilder, kinematics: ChunkKinematics, phi: Tensor
     Joint forces are products of screw axes with wrenches summed over subtrees; the rows of K are never formed.
     """
     tree, columns = builder.tree, builder.columns
-    wrench = body_wrenches(kinematics.states, columns.inertial_by_node(phi)).transpose(0, 1)  # (M, 6, L, B)
+    wrench = body_wrenches(kinematics.states, columns.inertial_by_node(phi))
     below = tree.ancestors.T @ wrench
-    torque = below.mul_(kinematics.screw_axes).sum(1)
+    torque = below.mul_(kinematics.screw_axes[:, None]).sum(0)
     coulomb, viscous = phi[:, columns.layout.count : columns.count, None].unflatten(1, (-1, 2)).unbind(2)
     velocity = kinematics.joints.velocity[1:]
     torque[:, 1:].addcmul_(coulomb, tree.coulomb_sign(velocity)).addcmul_(viscous, velocity)
     joints = tree.joint_map.T @ torque
-    return torch.cat([wrench.sum(2), joints], 1) if tree.base_rows else joints
+    return torch.cat([wrench.sum(2).transpose(0, 1), joints], 1) if tree.base_rows else joints
 
 
 def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, kinematics: ChunkKinematics) -> Tensor:
