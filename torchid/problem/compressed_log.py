@@ -1,0 +1,157 @@
+"""Logs compressed one by one, before it is known what other logs a fit has: in blocks from which folds can be made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from torchid.problem.chunks import ProgressCallback, chunks_by_state
+from torchid.problem.compression import (
+    LEAST_PER_FOLD,
+    Part,
+    block_spans,
+    compress_parts,
+    compress_unloaded,
+    fold_count,
+    lay_out_folds,
+    merge_by_key,
+)
+from torchid.problem.contact_state import ContactState
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples
+
+Span = tuple[int, int]
+"""First of some successive samples of a log, and the end."""
+
+
+@dataclass(frozen=True)
+class CompressedLog:
+    """Factors of a log, in pieces that make up as many blocks as a fit with other logs may cut it into.
+
+    Blocks are those of `split_into_folds`: one for a log among many, several for a long one. Factors of pieces merge
+    into those of blocks. Equations of readings in the air do not, as they come from means over whole blocks: they are
+    there for every block of every number of blocks.
+
+    Attributes:
+        source: name of the log.
+        samples: their number.
+        oversampling: of the samples, as `Samples` has it.
+        blocks: their largest number.
+        parts: by the samples that they are of.
+    """
+
+    source: str
+    samples: int
+    oversampling: float
+    blocks: int
+    parts: dict[Span, list[Part]]
+
+    def __len__(self) -> int:
+        return self.samples
+
+    @property
+    def states(self) -> set[ContactState]:
+        """Contact states of the samples."""
+        return {part.state for parts in self.parts.values() for part in parts}
+
+    @property
+    def rows(self) -> int:
+        """Number of equations, without those of readings in the air."""
+        return sum(part.factor.rows for parts in self.parts.values() for part in parts if not part.unloaded)
+
+    def block(self, start: int, stop: int, fold: int, builder: RowBuilder) -> CompressedBlock:
+        """A block of the log."""
+        loaded = [
+            part
+            for (first, last), parts in self.parts.items()
+            for part in parts
+            if start <= first and last <= stop and not part.unloaded
+        ]
+        unloaded = [part for part in self.parts.get((start, stop), []) if part.unloaded]
+        parts = [replace(part, source=self.source, fold=fold) for part in (*loaded, *unloaded)]
+        return CompressedBlock(self.source, fold, stop - start, _merged(parts, builder))
+
+
+@dataclass(frozen=True)
+class CompressedBlock:
+    """A block of a compressed log in a fold, which stands in for its samples.
+
+    Attributes:
+        source: name of the log.
+        fold: number of the fold.
+        samples: their number.
+        parts: one for each contact state; equations of readings in the air are apart.
+    """
+
+    source: str
+    fold: int
+    samples: int
+    parts: list[Part]
+
+    def __len__(self) -> int:
+        return self.samples
+
+
+Block = Samples | CompressedBlock
+"""Samples of one log in one fold, or what they compress to."""
+
+
+def piece_spans(samples: int, blocks: int) -> list[Span]:
+    """Pieces of a log that make up the blocks of every number of blocks up to a largest one."""
+    ends = sorted({end for count in range(1, blocks + 1) for span in block_spans(samples, count) for end in span})
+    return list(zip(ends, ends[1:], strict=False))
+
+
+def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback | None = None) -> CompressedLog:
+    """Compress one log for later fits with others.
+
+    As `split_into_folds` and `compress_parts` do for logs that are all there::
+
+        compressed = [torchid.compress_log(log, builder) for log in logs]
+        blocks = torchid.fold_compressed(compressed, builder)
+        fit = fitter.fit(torchid.merge_blocks(blocks, builder))
+
+    Args:
+        log: a bound log.
+        builder: of its rows.
+        progress: called with the number of samples done.
+    """
+    states = {state for state, _ in chunks_by_state(log)}
+    folds = round(len(log) / log.oversampling / LEAST_PER_FOLD)  # rounded, as its share of the folds of a fit is
+    blocks = fold_count(LEAST_PER_FOLD * folds, len(states), builder)
+    parts: dict[Span, list[Part]] = {}
+    pieces = piece_spans(len(log), blocks)
+    for part in compress_parts(_cut(log, pieces), builder, progress=progress):
+        if not part.unloaded:
+            parts.setdefault(pieces[part.fold], []).append(part)
+    for count in range(1, blocks + 1):
+        spans = block_spans(len(log), count)
+        for part in compress_unloaded(_cut(log, spans), builder):
+            parts.setdefault(spans[part.fold], []).append(part)
+    return CompressedLog(log.source, len(log), log.oversampling, blocks, parts)
+
+
+def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[CompressedBlock]:
+    """The logs, in order, in blocks with folds: those that `split_into_folds` makes of their samples.
+
+    Args:
+        logs: compressed logs, of different names.
+        builder: of their rows.
+    """
+    count = fold_count(sum(len(log) / log.oversampling for log in logs), sum(len(log.states) for log in logs), builder)
+    layout = lay_out_folds([len(log) for log in logs], count, [log.blocks for log in logs])
+    return [log.block(*block, builder) for log, blocks in zip(logs, layout, strict=True) for block in blocks]
+
+
+def merge_blocks(blocks: Sequence[CompressedBlock], builder: RowBuilder) -> list[Part]:
+    """The parts of all blocks, as `compress_parts` would have them: one of each log, contact state and fold."""
+    return _merged([part for block in blocks for part in block.parts], builder)
+
+
+def _merged(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+    return merge_by_key(parts, [(part.source, part.state, part.fold, part.unloaded) for part in parts], builder)
+
+
+def _cut(log: Samples, spans: Sequence[Span]) -> list[Samples]:
+    """The samples of each span, with its number as their fold."""
+    return [replace(log if len(spans) == 1 else log[start:stop], fold=k) for k, (start, stop) in enumerate(spans)]
