@@ -68,9 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     compress = commands.add_parser("compress", help=_COMPRESS, description=_COMPRESS)
     compress.add_argument("file", help="experiment file (YAML)")
     compress.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example overwrite=true")
-    compress.add_argument(
-        "--output", required=True, metavar="FOLDER", help="folder to write: a .factor file per log"
-    )
+    compress.add_argument("--output", required=True, metavar="FOLDER", help="folder to write: a .factor file per log")
     compress.set_defaults(command=_compress)
     evaluate = commands.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
     evaluate.add_argument("run", help="run folder")

@@ -101,7 +101,6 @@ class _Description:
     duration_s: NotNegative
     excluded: _Whole
     blocks: Annotated[int, Field(ge=1, le=FOLDS)]
-    columns: Annotated[int, Field(ge=1, le=2**20)]
     settings: dict[str, Value]
     noise: dict[str, Annotated[Number, Field(gt=0.0)]]
     supports: list[list[_Whole]]
@@ -200,7 +199,6 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
                     "triangles": triangles,
                 }
             )
-    columns = next((part.factor.columns for same in log.parts.values() for part in same), 1)
     description = {
         "format": FORMAT,
         "torchid": factors.version,
@@ -211,7 +209,6 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
         "duration_s": factors.duration,
         "excluded": factors.excluded,
         "blocks": log.blocks,
-        "columns": columns,
         "settings": factors.model.settings,
         "noise": factors.model.noise,
         "supports": list(supports),
@@ -263,7 +260,10 @@ def _parts(source: str, description: _Description, values: Array) -> dict[Span, 
     """The parts by span; ValueError if they cannot be those of a log."""
     pieces = set(piece_spans(description.samples, description.blocks))
     blocks = {span for count in range(1, description.blocks + 1) for span in block_spans(description.samples, count)}
-    supports, stream = [_support(one, description.columns) for one in description.supports], _Stream(values)
+    columns = description.settings.get("columns")
+    if not isinstance(columns, int) or columns < 1:
+        raise ValueError("no number of columns")
+    supports, stream = [_support(one, columns) for one in description.supports], _Stream(values)
     out: dict[Span, list[Part]] = {}
     seen = set[tuple[object, ...]]()
     for one in description.parts:
@@ -272,16 +272,18 @@ def _parts(source: str, description: _Description, values: Array) -> dict[Span, 
         if key in seen or span not in (blocks if one.unloaded else pieces):
             raise ValueError(f"samples {one.start} to {one.stop} are no block of the log, or one given twice")
         seen.add(key)
-        out.setdefault(span, []).append(_part(source, one, description, supports, stream))
+        out.setdefault(span, []).append(_part(source, one, columns, description.settings, supports, stream))
     if sum(one.samples for one in description.parts) != description.samples or stream.left:
         raise ValueError("factors of other samples than those of the log")
     return out
 
 
-def _part(source: str, one: _Part, description: _Description, supports: list[tuple[int, ...]], stream: _Stream) -> Part:
-    contacts, extras = description.settings.get("contacts"), 0
+def _part(
+    source: str, one: _Part, settings: dict[str, Value], supports: list[tuple[int, ...]], stream: _Stream
+) -> Part:
+    contacts, columns, extras = settings.get("contacts"), settings["columns"], 0
     for key in _EXTRAS:
-        labels = description.settings.get(key)
+        labels = settings.get(key)
         extras += len(labels) if isinstance(labels, list) else 0
     if not isinstance(contacts, list) or len(one.state) != len(contacts) or set(one.state) - {"0", "1"}:
         raise ValueError(f"contact state {one.state[:MAX_LETTERS]!r}")
@@ -292,7 +294,7 @@ def _part(source: str, one: _Part, description: _Description, supports: list[tup
     triangles = {supports[k]: stream.triangle(len(supports[k]) + 1, rows, packed) for k, rows, packed in one.triangles}
     if len(triangles) != len(one.triangles):
         raise ValueError("the same columns twice")
-    factor = TriangularFactor.from_blocks(description.columns, one.rows, one.independent_rows, triangles)
+    factor = TriangularFactor.from_blocks(columns, one.rows, one.independent_rows, triangles)
     state = tuple(digit == "1" for digit in one.state)
     return Part(source, state, factor, one.samples, unloaded=one.unloaded, gated=set(one.gated))
 

@@ -17,7 +17,7 @@ from torchid.robot.tree import BodyJoint
 from torchid.rounding import KINEMATIC_TOLERANCE
 from torchid.sensing import Contact
 
-Value = bool | float | str | list[str] | None
+Value = bool | int | float | str | list[str] | None
 
 NOISE = "sensors.noise"
 """Key of an experiment file under which noise is stated."""
@@ -28,7 +28,8 @@ class RowModel:
     """Robot, contacts, sensors, extra parameters and preprocessing that rows were formed with.
 
     Attributes:
-        settings: by the key of an experiment file that they come from; names of the robot's parts under "robot.urdf".
+        settings: by the key of an experiment file that they come from; names of the robot's parts under "robot.urdf",
+            and the number of columns.
         noise: standard deviations of the sensors by group [N m, N].
         geometry: constants of the kinematic tree and poses of contacts, in units of the URDF.
     """
@@ -64,6 +65,7 @@ class RowModel:
             "sensors.scales": labels["scale"],
             "actuators": [x.label for x in extras if x.what not in labels],
             "actuators.sign_width": tree.sign_width,
+            "columns": builder.width,
         }
         settings |= {f"preprocessing.{name}": value for name, value in preprocessing.items()}
         geometry = {
@@ -93,6 +95,8 @@ def require_same_rows(path: object, found: RowModel, expected: RowModel, referen
         one, other = found.settings.get(key), expected.settings.get(key)
         if one != other:
             raise LogError(path, key, *_texts(one, other, reference))
+    if found.noise.keys() != expected.noise.keys():
+        raise LogError(path, NOISE, join_names(list(found.noise)) or "none", join_names(list(expected.noise)))
     for name, array in expected.geometry.items():
         own = found.geometry[name]
         if own.shape != array.shape or not np.allclose(own, array, rtol=0.0, atol=KINEMATIC_TOLERANCE):
@@ -100,17 +104,15 @@ def require_same_rows(path: object, found: RowModel, expected: RowModel, referen
 
 
 def require_same_noise(path: object, found: RowModel, expected: RowModel, reference: object) -> None:
-    """Refuse factors that were weighed with other noise than others.
+    """Refuse factors that were weighed with other noise than others, of rows that are alike otherwise.
 
     Raises:
         LogError: names the noise, its value and the accepted one.
     """
     for group, value in expected.noise.items():
-        own = found.noise.get(group)
-        if own is None or not np.isclose(own, value, rtol=KINEMATIC_TOLERANCE, atol=0.0):
-            text = "none" if own is None else f"{own:g}"
+        if not np.isclose(found.noise[group], value, rtol=KINEMATIC_TOLERANCE, atol=0.0):
             accepted = f"{value:g}, as in {reference}: compress with all of sensors.noise stated"
-            raise LogError(path, f"{NOISE}.{group}", text, accepted)
+            raise LogError(path, f"{NOISE}.{group}", f"{found.noise[group]:g}", accepted)
 
 
 def _contact_text(contact: Contact) -> str:
