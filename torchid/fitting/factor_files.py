@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, field
 from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
@@ -279,9 +280,14 @@ def _parts(source: str, description: _Description, values: Array) -> dict[Span, 
 
 
 def _part(
-    source: str, one: _Part, settings: dict[str, Value], supports: list[tuple[int, ...]], stream: _Stream
+    source: str,
+    one: _Part,
+    columns: int,
+    settings: Mapping[str, Value],
+    supports: Sequence[tuple[int, ...]],
+    stream: _Stream,
 ) -> Part:
-    contacts, columns, extras = settings.get("contacts"), settings["columns"], 0
+    contacts, extras = settings.get("contacts"), 0
     for key in _EXTRAS:
         labels = settings.get(key)
         extras += len(labels) if isinstance(labels, list) else 0
