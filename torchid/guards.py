@@ -54,7 +54,7 @@ MAX_TOPICS = 10_000
 
 # -------------------------------------------------------------------------------------------------------- factors
 
-#: Bytes of the description of a compressed log, and triangles in it: one of a humanoid in 64 contact states has 15 000.
+#: Bytes of the description of a compressed log, and triangles in it: one of a humanoid in 64 contact states has 3000.
 MAX_DESCRIPTION, MAX_TRIANGLES = 8 * MEBIBYTE, 50_000
 
 # --------------------------------------------------------------------------------------------------------- settings

@@ -176,7 +176,7 @@ def test_the_table_of_files_says_what_is_in_them(
     lines = [line for line in capsys.readouterr().out.splitlines() if ".factor" in line]
     size = (tmp_path / "f" / "sway_train.factor").stat().st_size
     found = read_factors(tmp_path / "f" / "sway_train.factor").log
-    cells = ["sway_train.factor", str(KEPT), str(found.rows), str(len(found.states)), f"{size / 1e3:.0f}"]
+    cells = ["sway_train.factor", str(KEPT), str(found.rows), str(len(found.by_state)), f"{size / 1e3:.0f}"]
     assert [x.strip() for x in lines[0].strip("│").split("│")] == cells
 
 
@@ -365,7 +365,7 @@ def rewritten(path: Path, target: Path, change: Callable[[dict[str, Any], dict[s
 
 
 def first_part(description: dict[str, Any]) -> dict[str, Any]:
-    part: dict[str, Any] = description["parts"][0]
+    part: dict[str, Any] = description["pieces"][0]
     return part
 
 
@@ -373,7 +373,8 @@ HOSTILE: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
     "a later format": lambda d, a: d.update(format=2),
     "no format": lambda d, a: d.pop("format"),
     "another key": lambda d, a: d.update(more=1),
-    "no parts": lambda d, a: d.update(parts=[]),
+    "no pieces": lambda d, a: d.update(pieces=[]),
+    "no states": lambda d, a: d.update(by_state=[]),
     "samples": lambda d, a: d.update(samples=399),
     "a billion samples": lambda d, a: d.update(samples=10**15),
     "too many blocks": lambda d, a: d.update(blocks=1000),
@@ -382,8 +383,10 @@ HOSTILE: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
     "columns as text": lambda d, a: d["settings"].update(columns="118"),
     "another state": lambda d, a: first_part(d).update(state="11"),
     "a state of letters": lambda d, a: first_part(d).update(state="abcd"),
-    "another span": lambda d, a: first_part(d).update(stop=first_part(d)["stop"] + 1),
-    "a part twice": lambda d, a: d["parts"].append(first_part(d)),
+    "another span": lambda d, a: first_part(d).update(samples=first_part(d)["samples"] + 1),
+    "a piece twice": lambda d, a: d["pieces"].append(first_part(d)),
+    "a state twice": lambda d, a: d["by_state"][0].update(state=d["by_state"][1]["state"]),
+    "air that is no block": lambda d, a: d["unloaded"].append({"start": 1, "stop": 3, "parts": []}),
     "a triangle too many": lambda d, a: first_part(d)["triangles"].append([0, 1, False]),
     "a support that is none": lambda d, a: first_part(d)["triangles"].append([10**6, 1, False]),
     "more rows than a triangle has": lambda d, a: first_part(d)["triangles"][0].__setitem__(1, 10**6),

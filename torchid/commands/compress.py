@@ -131,7 +131,7 @@ def _compressed(
 def _write(path: Path, factors: FactorFile) -> CompressedFile:
     write_factors(path, factors)
     log = factors.log
-    return CompressedFile(path.name, path.stat().st_size, len(log), log.rows, len(log.states))
+    return CompressedFile(path.name, path.stat().st_size, len(log), log.rows, len(log.by_state))
 
 
 def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:

@@ -161,7 +161,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             warn_of_confounded(fit.extras)
             warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
-            whole = merge_folds(fit.parts, builder)
+            whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
             alone = _by_state(fitter, whole)
             added = _contributions(experiment, builder, whole, logs["train"], problem, bars)
         with clock("evaluate"):
@@ -253,6 +253,13 @@ def _robust(
         message = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"
         warn_about_file(message, NumericalWarning)
     return robust.fit, robust.summary
+
+
+def _with_states(parts: Sequence[Part], factors: Sequence[FactorFile]) -> Sequence[Part]:
+    """The parts of a fit, by contact state where they come from factors, too."""
+    if not factors:
+        return parts
+    return [*(part for one in factors for part in one.log.by_state), *(part for part in parts if part.unloaded)]
 
 
 def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:

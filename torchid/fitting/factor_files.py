@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, field
 from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ from torchid.identifiability.base_parameters import StateReport
 from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_explained
 from torchid.parameters import Array
 from torchid.problem import TriangularFactor
-from torchid.problem.compressed_log import CompressedLog, Span, piece_spans
+from torchid.problem.compressed_log import CompressedLog, piece_spans
 from torchid.problem.compression import FOLDS, Part, block_spans
 from torchid.settings import NotNegative, Number
 from torchid.staging import atomic_file
@@ -81,14 +81,18 @@ class _Part:
     """`state`: a digit for each contact; `triangles`: number of the support, rows, whether packed as a triangle."""
 
     state: str
-    start: _Whole
-    stop: _Whole
-    unloaded: bool
     samples: _Whole
     rows: _Whole
     independent_rows: NotNegative
     gated: list[_Whole]
     triangles: list[tuple[_Whole, _Whole, bool]]
+
+
+@dataclass(config=_STRICT, frozen=True)
+class _Unloaded:
+    start: _Whole
+    stop: _Whole
+    parts: list[_Part]
 
 
 @dataclass(config=_STRICT, frozen=True)
@@ -104,8 +108,10 @@ class _Description:
     blocks: Annotated[int, Field(ge=1, le=FOLDS)]
     settings: dict[str, Value]
     noise: dict[str, Annotated[Number, Field(gt=0.0)]]
+    pieces: list[_Part]
+    by_state: list[_Part]
+    unloaded: list[_Unloaded]
     supports: list[list[_Whole]]
-    parts: list[_Part]
     states: list[_State]
 
 
@@ -178,21 +184,19 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
     """The description, and the numbers of all triangles."""
     log, supports = factors.log, dict[tuple[int, ...], int]()
     values: list[Array] = []
-    parts = []
-    for (start, stop), same in log.parts.items():
-        for part in same:
+
+    def entries(parts: Sequence[Part]) -> list[dict[str, object]]:
+        out: list[dict[str, object]] = []
+        for part in parts:
             triangles = []
             for support, block in part.factor.blocks.items():
                 rows = block.cpu().numpy()
                 packed = len(rows) == rows.shape[1] and not np.tril(rows, -1).any()
                 values.append(rows[np.triu_indices(len(rows))] if packed else rows.ravel())
                 triangles.append((supports.setdefault(support, len(supports)), len(rows), packed))
-            parts.append(
+            out.append(
                 {
                     "state": "".join("01"[active] for active in part.state),
-                    "start": start,
-                    "stop": stop,
-                    "unloaded": part.unloaded,
                     "samples": part.samples,
                     "rows": part.factor.rows,
                     "independent_rows": part.factor.independent_rows,
@@ -200,6 +204,8 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
                     "triangles": triangles,
                 }
             )
+        return out
+
     description = {
         "format": FORMAT,
         "torchid": factors.version,
@@ -212,8 +218,10 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
         "blocks": log.blocks,
         "settings": factors.model.settings,
         "noise": factors.model.noise,
+        "pieces": entries(log.pieces),
+        "by_state": entries(log.by_state),
+        "unloaded": [{"start": a, "stop": b, "parts": entries(parts)} for (a, b), parts in log.unloaded.items()],
         "supports": list(supports),
-        "parts": parts,
         "states": [asdict(state) for state in factors.states],
     }
     return description, np.concatenate([np.empty(0), *values])
@@ -231,11 +239,8 @@ def _read(path: Path, container: Container) -> FactorFile:
         version = "none" if found is None else f"{excerpt(str(found))}, of another version of torchid"
         raise LogError.at_field("format", version, f"{FORMAT}, as torchid {__version__} writes it")
     description = _DESCRIPTION.validate_json(text)
-    if sum(len(part.triangles) for part in description.parts) > MAX_TRIANGLES:
-        raise ValueError(f"more than {MAX_TRIANGLES} triangles")
     geometry = {name: _array(container, name, np.float64) for name in _GEOMETRY}
-    parts = _parts(str(path), description, _array(container, "values", np.float64, 1))
-    log = CompressedLog(str(path), description.samples, description.oversampling, description.blocks, parts)
+    log = _log(str(path), description, _array(container, "values", np.float64, 1))
     return FactorFile(
         log,
         RowModel(description.settings, dict(description.noise), geometry),
@@ -257,52 +262,63 @@ def _array(container: Container, name: str, dtype: type, dimensions: int | None 
     return array
 
 
-def _parts(source: str, description: _Description, values: Array) -> dict[Span, list[Part]]:
-    """The parts by span; ValueError if they cannot be those of a log."""
-    pieces = set(piece_spans(description.samples, description.blocks))
-    blocks = {span for count in range(1, description.blocks + 1) for span in block_spans(description.samples, count)}
-    columns = description.settings.get("columns")
-    if not isinstance(columns, int) or columns < 1:
-        raise ValueError("no number of columns")
-    supports, stream = [_support(one, columns) for one in description.supports], _Stream(values)
-    out: dict[Span, list[Part]] = {}
-    seen = set[tuple[object, ...]]()
-    for one in description.parts:
-        span = (one.start, one.stop)
-        key = (*span, one.state, one.unloaded)
-        if key in seen or span not in (blocks if one.unloaded else pieces):
-            raise ValueError(f"samples {one.start} to {one.stop} are no block of the log, or one given twice")
-        seen.add(key)
-        out.setdefault(span, []).append(_part(source, one, columns, description.settings, supports, stream))
-    if sum(one.samples for one in description.parts) != description.samples or stream.left:
-        raise ValueError("factors of other samples than those of the log")
-    return out
+def _log(source: str, description: _Description, values: Array) -> CompressedLog:
+    """The compressed log; ValueError if it cannot be one."""
+    samples, blocks = description.samples, description.blocks
+    parts = _Parts(source, description, values)
+    pieces, by_state = ([parts.read(one) for one in same] for same in (description.pieces, description.by_state))
+    unloaded = {(x.start, x.stop): [parts.read(one, unloaded=True) for one in x.parts] for x in description.unloaded}
+    spans = {span for count in range(1, blocks + 1) for span in block_spans(samples, count)}
+    if not set(unloaded) <= spans or len(unloaded) != len(description.unloaded):
+        raise ValueError("readings in the air of what is no block of the log")
+    if [part.samples for part in pieces] != [stop - start for start, stop in piece_spans(samples, blocks)]:
+        raise ValueError("pieces of other samples than those of the log")
+    if sum(part.samples for part in by_state) != samples or len({part.state for part in by_state}) != len(by_state):
+        raise ValueError("contact states of other samples than those of the log")
+    if parts.numbers_left:
+        raise ValueError("more numbers than are described")
+    return CompressedLog(source, samples, description.oversampling, blocks, pieces, by_state, unloaded)
 
 
-def _part(
-    source: str,
-    one: _Part,
-    columns: int,
-    settings: Mapping[str, Value],
-    supports: Sequence[tuple[int, ...]],
-    stream: _Stream,
-) -> Part:
-    contacts, extras = settings.get("contacts"), 0
-    for key in _EXTRAS:
-        labels = settings.get(key)
-        extras += len(labels) if isinstance(labels, list) else 0
-    if not isinstance(contacts, list) or len(one.state) != len(contacts) or set(one.state) - {"0", "1"}:
-        raise ValueError(f"contact state {one.state[:MAX_LETTERS]!r}")
-    if max(one.gated, default=-1) >= extras or (one.unloaded and one.samples):
-        raise ValueError("readings in the air of a sensor that is none")
-    if not one.independent_rows <= one.rows or (one.rows and not one.independent_rows):
-        raise ValueError(f"{one.independent_rows:g} independent of {one.rows} rows")
-    triangles = {supports[k]: stream.triangle(len(supports[k]) + 1, rows, packed) for k, rows, packed in one.triangles}
-    if len(triangles) != len(one.triangles):
-        raise ValueError("the same columns twice")
-    factor = TriangularFactor.from_blocks(columns, one.rows, one.independent_rows, triangles)
-    state = tuple(digit == "1" for digit in one.state)
-    return Part(source, state, factor, one.samples, unloaded=one.unloaded, gated=set(one.gated))
+class _Parts:
+    """Parts of a log, read one after the other; ValueError where one cannot be that of a log."""
+
+    def __init__(self, source: str, description: _Description, values: Array) -> None:
+        settings = description.settings
+        columns, contacts = settings.get("columns"), settings.get("contacts")
+        if not isinstance(columns, int) or columns < 1 or not isinstance(contacts, list):
+            raise ValueError("neither columns nor contacts")
+        self._source, self._columns, self._contacts = source, columns, len(contacts)
+        labels = (settings.get(key) for key in _EXTRAS)
+        self._extras = sum(len(x) for x in labels if isinstance(x, list))
+        self._supports = [_support(one, columns) for one in description.supports]
+        self._stream, self._triangles = _Stream(values), 0
+
+    @property
+    def numbers_left(self) -> int:
+        """Numbers that belong to no part so far."""
+        return self._stream.left
+
+    def read(self, one: _Part, unloaded: bool = False) -> Part:
+        """The next part."""
+        self._triangles += 1 + len(one.triangles)
+        if self._triangles > MAX_TRIANGLES:
+            raise ValueError(f"more than {MAX_TRIANGLES} triangles")
+        if len(one.state) != self._contacts or set(one.state) - {"0", "1"}:
+            raise ValueError(f"contact state {one.state[:MAX_LETTERS]!r}")
+        if max(one.gated, default=-1) >= self._extras or (unloaded and one.samples):
+            raise ValueError("readings in the air of a sensor that is none")
+        if not one.independent_rows <= one.rows or (one.rows and not one.independent_rows):
+            raise ValueError(f"{one.independent_rows:g} independent of {one.rows} rows")
+        triangles = {}
+        for number, rows, packed in one.triangles:
+            support = self._supports[number]
+            triangles[support] = self._stream.triangle(len(support) + 1, rows, packed)
+        if len(triangles) != len(one.triangles):
+            raise ValueError("the same columns twice")
+        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles)
+        state = tuple(digit == "1" for digit in one.state)
+        return Part(self._source, state, factor, one.samples, unloaded=unloaded, gated=set(one.gated))
 
 
 def _support(columns: list[int], count: int) -> tuple[int, ...]:

@@ -15,8 +15,9 @@ from torchid.problem.compression import (
     fold_count,
     lay_out_folds,
     merge_by_key,
+    merge_folds,
+    merge_states,
 )
-from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 
@@ -30,46 +31,44 @@ class CompressedLog:
 
     Blocks are those of `split_into_folds`: one for a log among many, several for a long one. Factors of pieces merge
     into those of blocks. Equations of readings in the air do not, as they come from means over whole blocks: they are
-    there for every block of every number of blocks.
+    there for every block of every number of blocks. No fit needs a contact state of a piece: a piece has all of them in
+    one factor, and each contact state has one of the whole log, which takes a fraction of the room.
 
     Attributes:
         source: name of the log.
         samples: their number.
         oversampling: of the samples, as `Samples` has it.
         blocks: their largest number.
-        parts: by the samples that they are of.
+        pieces: a factor of each of `piece_spans`, all contact states together, in time.
+        by_state: a factor of each contact state of the whole log.
+        unloaded: equations of readings in the air, by the block that they are of.
     """
 
     source: str
     samples: int
     oversampling: float
     blocks: int
-    parts: dict[Span, list[Part]]
+    pieces: list[Part]
+    by_state: list[Part]
+    unloaded: dict[Span, list[Part]]
 
     def __len__(self) -> int:
         return self.samples
 
     @property
-    def states(self) -> set[ContactState]:
-        """Contact states of the samples."""
-        return {part.state for parts in self.parts.values() for part in parts}
-
-    @property
     def rows(self) -> int:
         """Number of equations, without those of readings in the air."""
-        return sum(part.factor.rows for parts in self.parts.values() for part in parts if not part.unloaded)
+        return sum(part.factor.rows for part in self.pieces)
 
     def block(self, start: int, stop: int, fold: int, builder: RowBuilder) -> CompressedBlock:
         """A block of the log."""
-        loaded = [
-            part
-            for (first, last), parts in self.parts.items()
-            for part in parts
-            if start <= first and last <= stop and not part.unloaded
-        ]
-        unloaded = [part for part in self.parts.get((start, stop), []) if part.unloaded]
-        parts = [replace(part, source=self.source, fold=fold) for part in (*loaded, *unloaded)]
-        return CompressedBlock(self.source, fold, stop - start, _merged(parts, builder))
+        spans = piece_spans(self.samples, self.blocks)
+        pieces = zip(spans, self.pieces, strict=True)
+        loaded = [part for (first, last), part in pieces if start <= first and last <= stop]
+        loaded, unloaded = (
+            [replace(part, fold=fold) for part in parts] for parts in (loaded, self.unloaded.get((start, stop), []))
+        )
+        return CompressedBlock(self.source, fold, stop - start, [*merge_states(loaded, builder), *unloaded])
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ class CompressedBlock:
         source: name of the log.
         fold: number of the fold.
         samples: their number.
-        parts: one for each contact state; equations of readings in the air are apart.
+        parts: one with all contact states, whose own state means nothing, and equations of readings in the air.
     """
 
     source: str
@@ -119,16 +118,18 @@ def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback |
     states = {state for state, _ in chunks_by_state(log)}
     folds = round(len(log) / log.oversampling / LEAST_PER_FOLD)  # rounded, as its share of the folds of a fit is
     blocks = fold_count(LEAST_PER_FOLD * folds, len(states), builder)
-    parts: dict[Span, list[Part]] = {}
-    pieces = piece_spans(len(log), blocks)
-    for part in compress_parts(_cut(log, pieces), builder, progress=progress):
-        if not part.unloaded:
-            parts.setdefault(pieces[part.fold], []).append(part)
+    parts = [
+        part
+        for part in compress_parts(_cut(log, piece_spans(len(log), blocks)), builder, progress=progress)
+        if not part.unloaded
+    ]
+    unloaded: dict[Span, list[Part]] = {}
     for count in range(1, blocks + 1):
         spans = block_spans(len(log), count)
         for part in compress_unloaded(_cut(log, spans), builder):
-            parts.setdefault(spans[part.fold], []).append(part)
-    return CompressedLog(log.source, len(log), log.oversampling, blocks, parts)
+            unloaded.setdefault(spans[part.fold], []).append(part)
+    pieces = sorted(merge_states(parts, builder), key=lambda part: part.fold)
+    return CompressedLog(log.source, len(log), log.oversampling, blocks, pieces, merge_folds(parts, builder), unloaded)
 
 
 def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[CompressedBlock]:
@@ -138,18 +139,20 @@ def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[
         logs: compressed logs, of different names.
         builder: of their rows.
     """
-    count = fold_count(sum(len(log) / log.oversampling for log in logs), sum(len(log.states) for log in logs), builder)
+    count = fold_count(
+        sum(len(log) / log.oversampling for log in logs), sum(len(log.by_state) for log in logs), builder
+    )
     layout = lay_out_folds([len(log) for log in logs], count, [log.blocks for log in logs])
     return [log.block(*block, builder) for log, blocks in zip(logs, layout, strict=True) for block in blocks]
 
 
 def merge_blocks(blocks: Sequence[CompressedBlock], builder: RowBuilder) -> list[Part]:
-    """The parts of all blocks, as `compress_parts` would have them: one of each log, contact state and fold."""
-    return _merged([part for block in blocks for part in block.parts], builder)
-
-
-def _merged(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    return merge_by_key(parts, [(part.source, part.state, part.fold, part.unloaded) for part in parts], builder)
+    """The parts of all blocks, as `merge_states` has those of samples: one for each log and fold."""
+    parts = [part for block in blocks for part in block.parts]
+    loaded = merge_states([part for part in parts if not part.unloaded], builder)
+    unloaded = [part for part in parts if part.unloaded]
+    keys = [(part.source, part.state, part.fold) for part in unloaded]
+    return [*loaded, *merge_by_key(unloaded, keys, builder)]
 
 
 def _cut(log: Samples, spans: Sequence[Span]) -> list[Samples]:
