@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from torchid.problem.chunks import ProgressCallback, chunks_by_state
+from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread
 from torchid.problem.compression import (
     LEAST_PER_FOLD,
     Part,
@@ -128,8 +128,10 @@ def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback |
         spans = block_spans(len(log), count)
         for part in compress_unloaded(_cut(log, spans), builder):
             unloaded.setdefault(spans[part.fold], []).append(part)
-    pieces = sorted(merge_states(parts, builder), key=lambda part: part.fold)
-    return CompressedLog(log.source, len(log), log.oversampling, blocks, pieces, merge_folds(parts, builder), unloaded)
+    pieces = sorted(_compact(merge_states(parts, builder)), key=lambda part: part.fold)
+    return CompressedLog(
+        log.source, len(log), log.oversampling, blocks, pieces, _compact(merge_folds(parts, builder)), unloaded
+    )
 
 
 def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[CompressedBlock]:
@@ -153,6 +155,11 @@ def merge_blocks(blocks: Sequence[CompressedBlock], builder: RowBuilder) -> list
     unloaded = [part for part in parts if part.unloaded]
     keys = [(part.source, part.state, part.fold) for part in unloaded]
     return [*loaded, *merge_by_key(unloaded, keys, builder)]
+
+
+@one_thread()
+def _compact(parts: Sequence[Part]) -> list[Part]:
+    return [replace(part, factor=part.factor.compact()) for part in parts]
 
 
 def _cut(log: Samples, spans: Sequence[Span]) -> list[Samples]:
