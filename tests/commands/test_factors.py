@@ -206,6 +206,22 @@ def test_condemned_samples_are_left_out_when_logs_are_compressed(fleet: Path, tm
     assert found.excluded + len(found.log) == KEPT
 
 
+def test_an_implausible_fit_is_refused_without_a_look_for_samples(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with np.load(fleet / "sway_train.npz") as log:
+        np.savez(tmp_path / "reversed.npz", **{**log, "joint_torque": -log["joint_torque"]})
+    logs = f"logs.train=[{tmp_path / 'reversed.npz'}]"
+    assert main(["compress", str(fleet / "logs.yaml"), logs, "--output", str(tmp_path / "f")]) == 0
+    capsys.readouterr()
+    looked: list[Path] = []
+    monkeypatch.setattr("torchid.commands.plausibility.read_log_to_check", lambda path, *_: looked.append(path))
+    factors = f"logs.train=[{tmp_path / 'f' / 'reversed.factor'}]"
+    message = refusal(["identify", str(fleet / "experiment.yaml"), factors], tmp_path, capsys)
+    assert "usual reasons: torques or wrenches of the opposite sign" in message
+    assert looked == []
+
+
 # ------------------------------------------------------------------------------------------------------------- refusals
 
 REFUSED = {

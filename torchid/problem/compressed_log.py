@@ -126,7 +126,7 @@ def compress_log(log: Samples, builder: RowBuilder, progress: ProgressCallback |
     unloaded: dict[Span, list[Part]] = {}
     for count in range(1, blocks + 1):
         spans = block_spans(len(log), count)
-        for part in compress_unloaded(_cut(log, spans), builder):
+        for part in _compact(compress_unloaded(_cut(log, spans), builder)):
             unloaded.setdefault(spans[part.fold], []).append(part)
     pieces = sorted(_compact(merge_states(parts, builder)), key=lambda part: part.fold)
     return CompressedLog(

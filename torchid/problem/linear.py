@@ -165,13 +165,14 @@ class TriangularFactor:
         return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks)
 
     def compact(self) -> TriangularFactor:
-        """The factor as one triangle in all columns, on the CPU, if that has fewer numbers than its blocks."""
+        """The factor on the CPU, as one triangle in all columns if that has fewer numbers than its blocks."""
         sizes = ((len(block), block.shape[1]) for block in self._blocks.values())
         numbers = sum(rows * width - (rows * (rows - 1) // 2 if rows == width else 0) for rows, width in sizes)
         if numbers <= (self.columns + 1) * (self.columns + 2) // 2:
-            return self
-        whole = {tuple(range(self.columns)): self.triangle().triu()}
-        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, whole)
+            blocks = {support: block.to("cpu", torch.float64) for support, block in self._blocks.items()}
+        else:
+            blocks = {tuple(range(self.columns)): self.triangle().triu()}
+        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks)
 
     def triangle(self) -> Tensor:
         """Upper triangular R, (columns + 1, columns + 1), float64 on the CPU."""
