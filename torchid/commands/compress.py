@@ -25,6 +25,10 @@ from torchid.problem.noise import noise_of_groups, std_by_group
 from torchid.report.tables import progress_bars
 
 _THE_EXPERIMENT = "the experiment file"
+_APART = (
+    "exclude_condemned",
+    "memory_gb",
+)  # of preprocessing: they say which samples of a log there are, not what rows
 
 
 @dataclass(frozen=True)
@@ -136,9 +140,8 @@ def _write(path: Path, factors: FactorFile) -> CompressedFile:
 
 def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:
     """What the rows of an experiment are formed with."""
-    settings = experiment.config.preprocessing
-    named = ("cutoff_hz", "sample_rate_hz", "contact_margin_s")
-    return RowModel.of(experiment.robot, builder, {name: getattr(settings, name) for name in named})
+    settings = vars(experiment.config.preprocessing)
+    return RowModel.of(experiment.robot, builder, {name: x for name, x in settings.items() if name not in _APART})
 
 
 # ------------------------------------------------------------------------------------------------------ fits of factors
