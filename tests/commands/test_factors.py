@@ -64,9 +64,11 @@ def assert_same(logs: Identification, factors: Identification) -> None:
     assert {x.name: (x.samples, x.rows, x.base_rank) for x in logs.states} == {
         x.name: (x.samples, x.rows, x.base_rank) for x in factors.states
     }
-    for name in ("logs", "states"):
-        bits = [[x.bits for x in getattr(run.contributions, name)] for run in (logs, factors)]
-        assert bits[1] == pytest.approx(bits[0], rel=1e-9)
+    for kind in ("logs", "states"):
+        one_kind, other_kind = (
+            {Path(x.name).stem: x.bits for x in getattr(run.contributions, kind)} for run in (logs, factors)
+        )
+        assert other_kind == pytest.approx(one_kind, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -25,10 +25,7 @@ from torchid.problem.noise import noise_of_groups, std_by_group
 from torchid.report.tables import progress_bars
 
 _THE_EXPERIMENT = "the experiment file"
-_APART = (
-    "exclude_condemned",
-    "memory_gb",
-)  # of preprocessing: they say which samples of a log there are, not what rows
+_APART = ("exclude_condemned", "memory_gb")  # keys of preprocessing that do not change what a row is
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
     Noise that the experiment does not state is estimated from these logs together.
 
     Args:
-        config: the experiment; what it says of estimators, tests and its output does not matter.
+        config: the experiment; what it says of tests and of its own output does not matter.
         output: the folder; one that this function has written is replaced if the experiment says `overwrite`.
 
     Raises:
