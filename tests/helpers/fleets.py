@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from demo import shortened_demo
 from motions import value
 from walking import MACHINES, recorded, truth
 
@@ -62,3 +63,17 @@ def fitted_twice(file: Path, *overrides: str) -> tuple[Identification, Identific
     names = [Path(name).stem for name in yaml.safe_load(file.read_text())["logs"]["train"]]
     files = [str(file.parent / "factors" / f"{name}.factor") for name in names]
     return fitted(file, "of_logs", *overrides), fitted(file, "of_factors", *overrides, f"logs.train={files}")
+
+
+def demo_fleet(folder: Path) -> Path:
+    """The folder, with the demo cut short: logs.yaml, and experiment.yaml with the factors of both of its logs."""
+    shortened_demo(folder, 400)
+    settings = yaml.safe_load((folder / "quadruped.yaml").read_text())
+    settings["sensors"]["noise"] |= {"base_force": 0.3, "base_moment": 0.1}
+    settings |= {"output": str(folder / "run"), "estimator": {"ridge": 0.1}}
+    settings["logs"] = {"train": ["sway_train.npz", "sway_test.npz"]}
+    (folder / "logs.yaml").write_text(yaml.safe_dump(settings))
+    compressed(folder / "logs.yaml", folder / "factors")
+    settings["logs"] = {"train": ["factors/*.factor"]}
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(settings))
+    return folder
