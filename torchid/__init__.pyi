@@ -22,6 +22,11 @@ from .fitting.cross_validation import (
     choose_ridge,
     cross_validate,
 )
+from .fitting.factor_files import (
+    FactorFile,
+    read_factors,
+    write_factors,
+)
 from .fitting.fit import (
     LogFitter,
     frozen_parameters,
@@ -32,6 +37,11 @@ from .fitting.noise import (
 from .fitting.robust import (
     RobustLoss,
     fit_robustly,
+)
+from .fitting.row_model import (
+    RowModel,
+    require_same_noise,
+    require_same_rows,
 )
 from .identifiability.base_parameters import (
     BaseParameters,
@@ -70,6 +80,12 @@ from .problem import (
     compress_parts,
     linear_problem,
 )
+from .problem.compressed_log import (
+    CompressedLog,
+    compress_log,
+    fold_compressed,
+    merge_blocks,
+)
 from .problem.compression import (
     split_into_folds,
 )
@@ -100,11 +116,13 @@ __all__ = [
     "BaseParameters",
     "Calibration",
     "Checked",
+    "CompressedLog",
     "Conditions",
     "Consistent",
     "Contact",
     "Estimate",
     "ExtraTerms",
+    "FactorFile",
     "FrameJacobian",
     "LeastSquares",
     "LinearProblem",
@@ -118,6 +136,7 @@ __all__ = [
     "Robot",
     "RobustLoss",
     "RowBuilder",
+    "RowModel",
     "SensorNoise",
     "SensorSet",
     "Sgd",
@@ -134,22 +153,29 @@ __all__ = [
     "choose_ridge",
     "chosen_sensors",
     "compress",
+    "compress_log",
     "compress_parts",
     "cross_validate",
     "estimate_extras",
     "estimate_noise",
     "fit_robustly",
+    "fold_compressed",
     "frozen_parameters",
     "split_into_folds",
     "linear_problem",
     "load_robot",
+    "merge_blocks",
     "motion_from_state",
     "named_sensors",
     "preprocess",
     "nearest_consistent",
+    "read_factors",
     "read_log",
+    "require_same_noise",
+    "require_same_rows",
     "structural_problem",
     "violations",
     "with_ft_sensors",
+    "write_factors",
     "write_log",
 ]

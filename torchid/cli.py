@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from torchid.problem.metrics import WorseThanNominal
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
+_COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
@@ -64,6 +65,11 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example estimator.ridge=0.01")
     identify.add_argument("--resume", action="store_true", help="continue an interrupted training (sgd)")
     identify.set_defaults(command=_identify)
+    compress = commands.add_parser("compress", help=_COMPRESS, description=_COMPRESS)
+    compress.add_argument("file", help="experiment file (YAML)")
+    compress.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example overwrite=true")
+    compress.add_argument("--output", required=True, metavar="FOLDER", help="folder to write: a .factor file per log")
+    compress.set_defaults(command=_compress)
     evaluate = commands.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
     evaluate.add_argument("run", help="run folder")
     evaluate.add_argument(
@@ -211,6 +217,19 @@ def _mass_text(mass: TotalMass) -> str:
         return "not determined: confounded with offsets"
     known = f", standard error {mass.standard_error:.2g} kg" if isfinite(mass.standard_error) else ""
     return f"not determined by the data{known}"
+
+
+def _compress(options: argparse.Namespace) -> None:
+    with interrupts_deferred():
+        from torchid.commands.compress import compress
+        from torchid.config import load_config
+        from torchid.report.tables import compression_table, print_tables, state_table
+
+    done = compress(load_config(options.file, options.overrides), options.output)
+    print_tables(state_table([asdict(state) for state in done.states]))
+    _print_noise(done.noise)
+    print_tables(compression_table([asdict(file) for file in done.files]))
+    print(f"written to    {done.output}")
 
 
 def _evaluate(options: argparse.Namespace) -> None:

@@ -52,6 +52,11 @@ FREE_MESSAGES, MESSAGE_BYTES = 200_000, 40
 #: Topics of a bag: a humanoid's has 200.
 MAX_TOPICS = 10_000
 
+# -------------------------------------------------------------------------------------------------------- factors
+
+#: Bytes of the description of a compressed log, and triangles in it: one of a humanoid in 64 contact states has 3000.
+MAX_DESCRIPTION, MAX_TRIANGLES = 8 * MEBIBYTE, 50_000
+
 # --------------------------------------------------------------------------------------------------------- settings
 
 #: Bytes of a settings file, nesting, entries with aliases unfolded, and characters of one entry.

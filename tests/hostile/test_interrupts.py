@@ -13,7 +13,7 @@ from hostile_commands import Commands
 from refusals import files_in
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP)
-COMMANDS = ("identify", "train", "evaluate", "analyze", "convert")
+COMMANDS = ("identify", "train", "evaluate", "analyze", "convert", "compress")
 TIMES = [1, pytest.param(25, marks=pytest.mark.slow)]
 
 
@@ -36,6 +36,9 @@ def arguments(command: str, place: Path, run: Path, out: Path) -> tuple[list[str
         return ["evaluate", str(out / "run"), "--log", log], out / "run" / "evaluation" / "sway_test"
     if command == "convert":
         return ["convert", str(place / "demo" / "sway_train.npz"), str(out / "log.h5")], out / "log.h5"
+    if command == "compress":
+        line = ["compress", str(place / "demo" / "quadruped.yaml"), "--output", str(out / "factors")]
+        return line, out / "factors"
     if command == "analyze":
         return ["analyze", *experiment(place, out / "run")], out / "run.analysis"
     sgd = ["estimator={name: sgd, training: {epochs: 30, checkpoint_seconds: 0}}"] if command == "train" else []
@@ -85,7 +88,7 @@ def test_a_command_stopped_at_any_moment_leaves_all_or_nothing(
             assert hidden(out) == [], case
         if command == "train" and ended.status and (out / "run.training" / "checkpoint.pt").exists():
             line = [*line, "--resume"]
-        elif made.exists() and command in ("identify", "train", "analyze"):
+        elif made.exists() and command in ("identify", "train", "analyze", "compress"):
             line = [*line, "overwrite=true"]
         if command == "convert":
             line = [*line, "--overwrite"]

@@ -124,6 +124,8 @@ def analyze(config: AnalyzeConfig) -> Analysis:
     if not config.output.name:
         found = f"'{config.output}', no name for a folder"
         raise ConfigError.at_field("output", found, "a path to a new folder")
+    if config.logs is not None:
+        config.logs.require_samples("analyze")
     check_free(output, config.overwrite, ANALYSIS, inputs_of(config))
     scene = set_up_scene(config)
     request = AnalysisRequest.of(scene)

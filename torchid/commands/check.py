@@ -66,6 +66,7 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     if config.logs is None:
         raise ConfigError(path, "logs", "missing", "logs to check")
     with about_file(path):
+        config.logs.require_samples("check")
         scene = set_up_scene(config)
     files = [*config.logs.train, *config.logs.validation, *config.logs.test]
     checked = []

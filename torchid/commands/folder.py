@@ -20,6 +20,7 @@ TRAINING = FolderKind("a training", result=False)
 SIMULATION = FolderKind("a simulation")
 ANALYSIS = FolderKind("an analysis")
 STUDY = FolderKind("a study")
+COMPRESSED = FolderKind("compressed logs")
 
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the temporary folder's name is longer
 _TAKEN = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)  # by another run

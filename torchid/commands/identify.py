@@ -11,6 +11,7 @@ from functools import partial
 
 from rich.progress import Progress
 
+from torchid.commands.compress import read_fleet
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader
@@ -22,6 +23,7 @@ from torchid.estimators import Conditions, Estimate, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
 from torchid.fitting.experiment import Experiment, set_up, with_noise
+from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
@@ -29,6 +31,7 @@ from torchid.identifiability.base_parameters import StateReport, require_base, s
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts
+from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
 from torchid.problem.compression import Part, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import SETS
@@ -43,7 +46,7 @@ class _Clock:
     def __call__(self, name: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        self.seconds[name] = time.perf_counter() - start
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
 def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
@@ -66,18 +69,29 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
 
 
 @dataclass
-class _Prepared:
-    """Logs on their way to a fit: read, with the noise and the ridge settled, cut into folds and compressed."""
+class _Data:
+    """Training logs in folds, or factors of them, with the noise that they are weighed with, and compressed; test logs.
+
+    `experiment`: with that noise. `factors`: files that the training logs come from, none if they come from logs.
+    """
 
     experiment: Experiment
-    conditions: Conditions
     logs: dict[str, list[Samples]]
+    factors: list[FactorFile]
     excluded: Mapping[str, int]
     states: list[StateReport]
     noise: NoiseSummary
-    fitter: LogFitter
-    blocks: list[Samples]
+    builder: RowBuilder
+    blocks: Sequence[Block]
     parts: list[Part]
+
+
+@dataclass
+class _Prepared(_Data):
+    """Data with the ridge settled."""
+
+    conditions: Conditions
+    fitter: LogFitter
     ridge: RidgeChoice | None
 
 
@@ -87,31 +101,43 @@ def _prepare(config: ExperimentConfig, clock: _Clock, bars: Progress) -> _Prepar
         conditions = experiment.conditions()
         if config.estimator.name == "sgd":
             descent_settings(config)  # before any work
+    data = (_data_of_factors if config.logs.compressed else _data_of_logs)(experiment, clock, bars)
+    with clock("ridge"):
+        experiment, ridge = _with_ridge(data.experiment, data.parts, data.blocks, data.builder, conditions, bars)
+    fitter = experiment.fitter(data.builder, conditions)
+    return _Prepared(**vars(data) | {"experiment": experiment}, conditions=conditions, fitter=fitter, ridge=ridge)
+
+
+def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
+    """The logs of an experiment, read and compressed."""
+    with clock("read"):
         reader = LogReader(experiment)
         logs = _read(reader, experiment, bars)
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
-        require_base(states, config.sensors.on_base_lost)
+        require_base(states, experiment.config.sensors.on_base_lost)
         noise = experiment.estimate_noise(logs["train"], experiment.sensors)
         experiment = with_noise(experiment, noise)
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
         blocks = split_into_folds(logs["train"], builder)
         parts = _compressed(builder, blocks, bars)
-    with clock("ridge"):
-        experiment, ridge = _with_ridge(experiment, parts, blocks, builder, conditions, bars)
-    return _Prepared(
-        experiment=experiment,
-        conditions=conditions,
-        logs=logs,
-        excluded=reader.excluded,
-        states=states,
-        noise=noise,
-        fitter=experiment.fitter(builder, conditions),
-        blocks=blocks,
-        parts=parts,
-        ridge=ridge,
-    )
+    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts)
+
+
+def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
+    """The logs of an experiment that fits factors of logs."""
+    with clock("read"):
+        fleet = read_fleet(experiment, bars)
+        require_base(fleet.states, experiment.config.sensors.on_base_lost)
+        reader = LogReader(experiment)
+        logs = _read(reader, experiment, bars)
+    with clock("compress"):
+        builder = fleet.experiment.builder(fleet.experiment.sensors)
+        blocks = fold_compressed([one.log for one in fleet.files], builder)
+        parts = merge_blocks(blocks, builder)
+    excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
+    return _Data(fleet.experiment, logs, fleet.files, excluded, fleet.states, fleet.noise, builder, blocks, parts)
 
 
 def _identify(config: ExperimentConfig, resume: bool) -> Identification:
@@ -128,14 +154,14 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
                 evaluate = partial(_identified_metrics, evaluation, logs)
                 solve = partial(training.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
             fit = fitter.fit(ready.parts, solve)
-            fit, robust = _robust(fit, experiment, fitter, blocks, bars)
+            fit, robust = _robust(fit, experiment, fitter, [x for x in blocks if isinstance(x, Samples)], bars)
             ready.parts = []
             estimate, problem = fit.estimate, fit.assembly.problem
             mass = require_plausible(fit, experiment)
             warn_of_confounded(fit.extras)
             warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
-            whole = merge_folds(fit.parts, builder)
+            whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
             alone = _by_state(fitter, whole)
             added = _contributions(experiment, builder, whole, logs["train"], problem, bars)
         with clock("evaluate"):
@@ -156,7 +182,8 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             metrics=metrics,
             violations=broken,
             seconds=clock.seconds,
-            samples=sum(map(len, logs["train"])),
+            samples=sum(map(len, blocks)),
+            factors=ready.factors,
             excluded=ready.excluded,
             mass=mass,
             validation=validation,
@@ -164,14 +191,14 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
         )
         require_not_worse(run.worse, experiment)
         bars.add_task("writing", total=None)
-        write_run(run, evaluation, (logs["test"] or logs["train"])[0], compared, training)
+        write_run(run, evaluation, next(iter([*logs["test"], *logs["train"]]), None), compared, training)
     return run
 
 
 def _with_ridge(
     experiment: Experiment,
     parts: Sequence[Part],
-    blocks: Sequence[Samples],
+    blocks: Sequence[Block],
     builder: RowBuilder,
     conditions: Conditions,
     bars: Progress,
@@ -188,14 +215,18 @@ def _with_ridge(
 
 
 def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str, list[Samples]]:
-    """Logs by use; those that are trained on, or decide when to stop, have every sensor of the set."""
-    files = experiment.config.logs
-    reading = bars.add_task("reading logs", total=len(files.train) + len(files.validation) + len(files.test))
+    """Logs by use; those that are trained on, or decide when to stop, have every sensor of the set.
+
+    Those of which there are but factors are left out.
+    """
+    settings = experiment.config.logs
+    files = {name: getattr(settings, name) for name in ("train", "validation", "test")}
+    if settings.compressed:
+        files["train"] = []
+    reading = bars.add_task("reading logs", total=sum(map(len, files.values())))
     return {
-        name: reader.read(
-            getattr(files, name), None if name == "test" else experiment.sensors, lambda _: bars.advance(reading)
-        )
-        for name in ("train", "validation", "test")
+        name: reader.read(paths, None if name == "test" else experiment.sensors, lambda _: bars.advance(reading))
+        for name, paths in files.items()
     }
 
 
@@ -222,6 +253,13 @@ def _robust(
         message = f"estimator.robust: not settled after {robust.summary.passes} passes; accepted: more passes"
         warn_about_file(message, NumericalWarning)
     return robust.fit, robust.summary
+
+
+def _with_states(parts: Sequence[Part], factors: Sequence[FactorFile]) -> Sequence[Part]:
+    """The parts of a fit, by contact state where they come from factors, too."""
+    if not factors:
+        return parts
+    return [*(part for one in factors for part in one.log.by_state), *(part for part in parts if part.unloaded)]
 
 
 def _by_state(fitter: LogFitter, parts: Sequence[Part]) -> dict[str, Estimate]:
@@ -255,7 +293,7 @@ def _contributions(
 def _metrics(
     scorer: Scorer,
     test: Sequence[Samples],
-    blocks: Sequence[Samples],
+    blocks: Sequence[Block],
     parts: Sequence[Part],
     compared: Comparison[Calibration],
     without_folds: Sequence[Comparison[Calibration]],

@@ -113,7 +113,7 @@ def make_manifest(folder: Path, kind: FolderKind, name: str, growing: Sequence[s
         growing: patterns of files in it that are written on.
     """
     files = {
-        path.relative_to(folder).as_posix(): (path.stat().st_size, _checksum(path))
+        path.relative_to(folder).as_posix(): (path.stat().st_size, file_checksum(path))
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path != folder / MANIFEST
     }
@@ -212,13 +212,14 @@ def _entries(folder: Path) -> Iterator[tuple[str, Path]]:
 
 def _is(path: Path, size: int, checksum: str) -> bool:
     """Whether a file still is what was written."""
-    return path.stat().st_size == size and _checksum(path) == checksum
+    return path.stat().st_size == size and file_checksum(path) == checksum
 
 
-def _checksum(path: Path) -> str:
-    """SHA-256 of a file."""
+def file_checksum(*paths: Path) -> str:
+    """SHA-256 of a file, or of several one after the other."""
     digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            digest.update(block)
+    for path in paths:
+        with path.open("rb") as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
     return digest.hexdigest()

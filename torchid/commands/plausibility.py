@@ -183,9 +183,9 @@ def _unexplained(fit: Fit) -> str | None:
 
 
 def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
-    """Findings on a large part of a training log, the most severe first."""
+    """Findings on a large part of a training log, the most severe first; none without its samples."""
     files = scene.config.logs
-    if files is None:
+    if files is None or files.compressed:
         return
     findings = []
     for path in files.train:

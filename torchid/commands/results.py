@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +18,7 @@ from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate, Viola
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
+from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary
 from torchid.identifiability.base_parameters import StateReport
@@ -66,6 +67,7 @@ class Identification:
         violations: conditions that the identified parameters break.
         seconds: by step of the run.
         samples: number of training samples.
+        factors: the training logs, where they came compressed.
         excluded: condemned samples left out, by log.
         mass: the total mass and how well it is known.
         validation: errors on held-out blocks, None where the samples are too few to leave some out.
@@ -84,6 +86,7 @@ class Identification:
     violations: list[Violation]
     seconds: dict[str, float]
     samples: int
+    factors: Sequence[FactorFile]
     excluded: Mapping[str, int]
     mass: TotalMass
     validation: CrossValidation | None
@@ -114,7 +117,7 @@ class Identification:
 def write_run(
     run: Identification,
     evaluation: Evaluation,
-    plotted: Samples,
+    plotted: Samples | None,
     compared: Comparison[Calibration],
     training: Training | None,
 ) -> None:
@@ -123,13 +126,13 @@ def write_run(
     Args:
         run: what to write.
         evaluation: for the predicted forces.
-        plotted: log of the figure of forces, as recorded.
+        plotted: log of the figure of forces, as recorded; None: no such figure.
         compared: parameters, with the extra parameters that suit them.
         training: whose curves go into the folder, and whose checkpoint is then no longer needed.
     """
     config, robot = run.experiment.config, run.experiment.robot
     figures = {
-        "forces": draw_forces(evaluation, plotted, compared),
+        **({} if plotted is None else {"forces": draw_forces(evaluation, plotted, compared)}),
         "errors": error_figure(run.metrics),
         "parameters": parameter_figure(
             robot.body_names, robot.nominal, run.phi, run.estimate.standard_error.reshape(-1, PER_BODY)
@@ -186,6 +189,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "condition_number": estimate.condition_number if estimate.rank else None,
         "samples": run.samples,
         "excluded_samples": run.excluded,
+        **({"factors": [_factor_entry(one) for one in run.factors]} if run.factors else {}),
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
         "total_mass": run.mass.value if run.mass.determined else None,
@@ -205,6 +209,13 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "identifiability": _identifiability_document(run),
         "seconds": run.seconds,
     }
+
+
+def _factor_entry(factors: FactorFile) -> dict[str, object]:
+    """Which log a file of factors is of."""
+    log = factors.log
+    names = {"file": log.source, "log": factors.name, "sha256": factors.sha256, "torchid": factors.version}
+    return names | {"samples": log.samples, "duration_s": factors.duration}
 
 
 def _validation_document(run: Identification) -> dict[str, object] | None:
@@ -256,7 +267,7 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
             for step, phi in enumerate((robot.nominal.flatten(), estimate.phi)):
                 events.write_errors(step, {name: pair[step] for name, pair in run.metrics.items()})
                 events.write_eigenvalues(step, body_eigenvalues(robot, phi))
-            events.write_solution(estimate, run.samples / run.seconds["compress"])
+            events.write_solution(estimate, None if run.factors else run.samples / run.seconds["compress"])
         else:  # what was not worked out by epoch
             for step, which in ((0, 0), (epochs, 1)):
                 events.write_errors(step, {name: pair[which] for name, pair in run.metrics.items()}, (WHITENED,))

@@ -26,7 +26,7 @@ from torchid.config.sensors import (
 )
 from torchid.errors import ConfigError, about_file, warn_about_file
 from torchid.logs import Topics
-from torchid.logs.containers import list_bag_files
+from torchid.logs.containers import FACTORS, READABLE, list_bag_files
 from torchid.logs.ros_topics import check_topics
 from torchid.settings import NotNegative, Positive, Seed
 
@@ -109,13 +109,29 @@ class ActuatorsConfig:
 class LogsConfig:
     """Logs to fit on, held-out logs for the early stopping of a descent, and logs for tests alone.
 
-    A name with `*` or `?` is a pattern for all files that match. `topics` describes the topics of bags.
+    A name with `*` or `?` is a pattern for all files that match. `topics` describes the topics of bags. The logs to fit
+    on may be factors of logs, from `torchid compress`.
     """
 
     train: Annotated[list[Path], Field(min_length=1)]
     test: list[Path] = dataclasses.field(default_factory=list)
     validation: list[Path] = dataclasses.field(default_factory=list)
     topics: Topics | None = None
+
+    @property
+    def compressed(self) -> bool:
+        """Whether the logs to fit on are factors."""
+        return any(path.suffix == FACTORS for path in self.train)
+
+    def require_samples(self, command: str) -> None:
+        """Refuse factors where samples are needed.
+
+        Raises:
+            ConfigError: names the file.
+        """
+        if self.compressed:
+            found = f"{self.train[0]}, factors of a log, where torchid {command} needs its samples"
+            raise ConfigError.at_field("logs.train", found, f"logs ({', '.join(READABLE)})")
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -312,7 +328,31 @@ def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:
         raise ConfigError.at_field("logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
     if logs.topics is not None:
         check_topics(logs.topics)
-    return LogsConfig(**files, topics=logs.topics)
+    checked = LogsConfig(**files, topics=logs.topics)
+    _check_factors(config, checked)
+    return checked
+
+
+def _check_factors(config: _Common, logs: LogsConfig) -> None:
+    """Refuse factors of logs beside logs, for tests, and for whatever needs samples."""
+    for key in ("test", "validation"):
+        for path in getattr(logs, key):
+            if path.suffix == FACTORS:
+                raise ConfigError.at_field(f"logs.{key}", f"{path}, factors without samples to predict", "logs")
+    if not logs.compressed:
+        return
+    for path in logs.train:
+        if path.suffix != FACTORS:
+            found = f"{path} beside factors of other logs"
+            raise ConfigError.at_field("logs.train", found, f"logs alone, or {FACTORS} files alone")
+    reason, logs_too = "but logs.train names factors, which have no samples", ", or the logs"
+    if config.estimator.name == "sgd":
+        raise ConfigError.at_field("estimator.name", f"sgd, {reason}", f"least_squares or consistent{logs_too}")
+    if config.estimator.robust is not None:
+        raise ConfigError.at_field("estimator.robust", f"set, {reason}", f"null{logs_too}")
+    if config.preprocessing.exclude_condemned:
+        accepted = f"false, as torchid compress has left them out if it was told so{logs_too}"
+        raise ConfigError.at_field("preprocessing.exclude_condemned", f"true, {reason}", accepted)
 
 
 def _matching(field: str, paths: Sequence[Path]) -> list[Path]:

@@ -18,6 +18,7 @@ from torchid.fitting.robust import RobustLoss, fit_extras_robustly
 from torchid.identifiability.confounding import ExtraEstimate, disagreements, estimate_extras
 from torchid.parameters import Array
 from torchid.problem import Evaluation, RowBuilder, Samples, assemble, compress_parts
+from torchid.problem.compressed_log import Block, CompressedBlock
 from torchid.problem.compression import Part
 from torchid.problem.extras import Extra
 from torchid.problem.predict import calibrate_readings
@@ -82,7 +83,7 @@ class Calibration:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""
         return np.append(self.phi, self._known(evaluation.builder.extras, ""))
 
-    def columns(self, builder: RowBuilder, log: Samples) -> Tensor:
+    def columns(self, builder: RowBuilder, log: Block) -> Tensor:
         """Parameters in a builder's columns for the rows of a log, (width,)."""
         return builder.to_columns(np.append(self.phi, self._values_for(log))[None])[0]
 
@@ -96,7 +97,7 @@ class Calibration:
         """Values of extra parameters of a log and of all logs, 0 where none is known."""
         return np.array([self.values.get((log if x.per_log else "", x.label), 0.0) for x in extras])
 
-    def _values_for(self, log: Samples) -> Array:
+    def _values_for(self, log: Block) -> Array:
         extras = self.builder.extras
         values, own = self._known(extras, log.source), np.array([x.per_log for x in extras])
         if own.any() and not any(source == log.source for source, _ in self.values):
@@ -105,9 +106,16 @@ class Calibration:
             values[own] = self._of_new_logs[log.source]
         return values
 
-    def _fitted(self, log: Samples, shared: Array) -> Array | float:
+    def _fitted(self, log: Block, shared: Array) -> Array | float:
         """Extra parameters of a log, with everything else known."""
         builder = self._on_cpu
+
+        def solve(parts: list[Part]) -> Array:
+            elimination = assemble(parts, builder, self.robot).eliminations[0]
+            return elimination.inverse @ (elimination.z - elimination.C @ np.append(self.phi, shared))
+
+        if isinstance(log, CompressedBlock):
+            return solve(log.parts)
         try:
             require_forces(log, self.robot, builder.contacts, builder.sensors)
         except LogError as error:
@@ -115,10 +123,6 @@ class Calibration:
             warn(message)
             return 0.0
         own = np.array([x.per_log for x in builder.extras])
-
-        def solve(parts: list[Part]) -> Array:
-            elimination = assemble(parts, builder, self.robot).eliminations[0]
-            return elimination.inverse @ (elimination.z - elimination.C @ np.append(self.phi, shared))
 
         def columns(values: Array) -> Tensor:
             extras = np.empty(len(own))

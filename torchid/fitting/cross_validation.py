@@ -16,6 +16,7 @@ from torchid.fitting.robust import RobustLoss
 from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback, one_thread
+from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part, merge_states, split_into_folds
 from torchid.problem.extras import recorded_components
 from torchid.problem.metrics import ForceSums
@@ -87,7 +88,7 @@ def cross_validate(
 
 def choose_ridge(
     parts: Sequence[Part],
-    blocks: Sequence[Samples],
+    blocks: Sequence[Block],
     fitter: LogFitter,
     estimators: Sequence[BatchEstimator],
     loss: RobustLoss | None = None,
@@ -105,7 +106,7 @@ def choose_ridge(
 
     Args:
         parts: of the blocks, compressed.
-        blocks: training logs, as `split_into_folds` cuts them.
+        blocks: training logs, as `split_into_folds` or `fold_compressed` cuts them.
         fitter: of their rows.
         estimators: one for each ridge to try, ascending.
         loss: as in `Calibration`.
@@ -139,7 +140,7 @@ def choose_ridge(
 def _held_out_squares(
     fold: int,
     parts: Sequence[Part],
-    blocks: Sequence[Samples],
+    blocks: Sequence[Block],
     fitter: LogFitter,
     estimators: Sequence[BatchEstimator],
     loss: RobustLoss | None,
@@ -159,7 +160,7 @@ def _held_out_squares(
     return np.array(out)
 
 
-def _too_few(logs: Sequence[Samples]) -> LogError:
+def _too_few(logs: Sequence[Block]) -> LogError:
     found = "the training samples are too few to leave blocks of them out"
     return LogError(logs[0].source if logs else "logs", "samples", found, "longer logs")
 
@@ -192,7 +193,7 @@ class Scorer:
 
     def score_training(
         self,
-        logs: Sequence[Samples],
+        logs: Sequence[Block],
         parts: Sequence[Part],
         compared: Comparison[Calibration],
         without_folds: Sequence[Comparison[Calibration]],
@@ -201,7 +202,8 @@ class Scorer:
         """Errors of the fit on the training logs, and of fits without a fold each on that fold, in one pass.
 
         Args:
-            logs: as `split_into_folds` has cut them.
+            logs: as `split_into_folds` or `fold_compressed` has cut them; compressed ones give only the whitened
+                projected residual.
             parts: compressed, with the weights of a robust fit.
             compared: parameters of the fit.
             without_folds: those of a fit without each fold, by its number; none without cross-validation.
@@ -222,12 +224,26 @@ class Scorer:
 
     def _sums(
         self,
-        logs: Sequence[Samples],
+        logs: Sequence[Block],
         parts: Sequence[Part],
         calibrations: Sequence[Calibration],
         progress: ProgressCallback | None,
     ) -> list[tuple[ForceSums, ForceSums]]:
         """Of the measured forces and of the errors, for each calibration."""
+        pairs = self._force_sums([log for log in logs if isinstance(log, Samples)], calibrations, progress)
+        squares = sum_residuals(self.builder, logs, parts, calibrations)
+        for (measured, error), own in zip(pairs, squares, strict=True):
+            for sums, square in ((measured, own.measured), (error, own.error)):
+                sums.whitened.add_squares(square, own.rows)
+        return pairs
+
+    def _force_sums(
+        self, logs: Sequence[Samples], calibrations: Sequence[Calibration], progress: ProgressCallback | None
+    ) -> list[tuple[ForceSums, ForceSums]]:
+        """As `_sums`, without the rows of a fit; empty without samples."""
+        rows = self.evaluation.robot.n_rows
+        if not logs:
+            return [(ForceSums(rows), ForceSums(rows)) for _ in calibrations]
         phi = np.stack([one.parameters(self.evaluation) for one in calibrations])
         if not calibrations[0].changes_readings:
             measured, *errors = self.evaluation.force_sums(logs, phi, progress)
@@ -243,10 +259,6 @@ class Scorer:
                     readings, phi[number : number + 1], progress if number else None
                 )
                 pairs.append((measured, error))
-        squares = sum_residuals(self.builder, logs, parts, calibrations)
-        for (measured, error), own in zip(pairs, squares, strict=True):
-            for sums, square in ((measured, own.measured), (error, own.error)):
-                sums.whitened.add_squares(square, own.rows)
         return pairs
 
     def _metrics(self, sums: Sequence[Sequence[tuple[ForceSums, ForceSums]]]) -> list[Metrics]:
@@ -268,7 +280,7 @@ class ResidualSquares:
 
 @one_thread()
 def sum_residuals(
-    builder: RowBuilder, logs: Sequence[Samples], parts: Sequence[Part], calibrations: Sequence[Calibration]
+    builder: RowBuilder, logs: Sequence[Block], parts: Sequence[Part], calibrations: Sequence[Calibration]
 ) -> list[ResidualSquares]:
     """Squares of the residuals of compressed rows at the parameters of each calibration.
 

@@ -22,6 +22,7 @@ from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
+from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.extras import CHANNELS, measured_channels
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
@@ -57,7 +58,7 @@ class Scene:
     @property
     def noise(self) -> SensorNoise:
         """Noise of the sensors, as stated; a guess where it is not."""
-        return SensorNoise(**_stated(self.config.sensors.noise))
+        return SensorNoise(**stated_noise(self.config.sensors.noise))
 
     @property
     def terms(self) -> ExtraTerms:
@@ -138,16 +139,16 @@ class Scene:
             sensors = recorded_sensors(self.robot, self.contacts, logs, self.noise)
         # without conditions: of the estimator, only the ridge and the rank tolerance matter
         fitter = self.fitter(self.builder(sensors), Conditions(names=self.robot.body_names))
-        return estimate_noise(logs, fitter, _stated(self.config.sensors.noise).keys())
+        return estimate_noise(logs, fitter, stated_noise(self.config.sensors.noise).keys())
 
     def choose_ridge(
-        self, parts: Sequence[Part], blocks: Sequence[Samples], fitter: LogFitter, conditions: Conditions
+        self, parts: Sequence[Part], blocks: Sequence[Block], fitter: LogFitter, conditions: Conditions
     ) -> RidgeChoice:
         """The ridge that predicts held-out folds best, for the estimator of the settings.
 
         Args:
             parts: of the blocks, compressed.
-            blocks: training logs, as `split_into_folds` cuts them.
+            blocks: training logs, as `split_into_folds` or `fold_compressed` cuts them.
             fitter: of their rows.
             conditions: on the parameters.
 
@@ -179,14 +180,15 @@ def with_noise(scene: S, summary: NoiseSummary) -> S:
     config = scene.config
     keys = {one.group.partition(".")[0] for one in summary.groups}
     estimated = {name: x for name, x in vars(summary.noise).items() if name in keys}
-    noise = NoiseConfig(**estimated | _stated(config.sensors.noise))
+    noise = NoiseConfig(**estimated | stated_noise(config.sensors.noise))
     stated = replace(scene, config=replace(config, sensors=replace(config.sensors, noise=noise)))
     if isinstance(stated, Experiment):
         return replace(stated, sensors=replace(stated.sensors, noise=summary.noise))
     return stated
 
 
-def _stated(noise: NoiseConfig) -> dict[str, Any]:
+def stated_noise(noise: NoiseConfig) -> dict[str, Any]:
+    """The noise that settings state, by key."""
     return {name: x for name, x in vars(noise).items() if x is not None}
 
 

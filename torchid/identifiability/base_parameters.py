@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from itertools import accumulate, chain
 from typing import NamedTuple
 
 import numpy as np
@@ -329,9 +329,42 @@ def _base_statistics(values: Tensor, weight: Tensor) -> tuple[int, float, float,
     """Rank, median, share at rank 6 and shares by rank, from singular values (B, 6) of samples with weights (B,)."""
     ranks = base_rank(values)
     shares = {int(rank): float(weight[ranks == rank].sum() / weight.sum()) for rank in ranks.unique().flip(0)}
-    cumulative = accumulate(shares.values())
-    common_rank = next(rank for rank, so_far in zip(shares, cumulative, strict=True) if so_far >= _MOST)
-    return common_rank, float(values[:, -1].median()), shares.get(6, 0.0), shares
+    return _common_rank(shares), float(values[:, -1].median()), shares.get(6, 0.0), shares
+
+
+def merge_state_reports(of_logs: Iterable[Sequence[StateReport]]) -> list[StateReport]:
+    """Reports of several logs together, most frequent first; singular values are medians of those of the logs."""
+    by_name: dict[str, list[StateReport]] = {}
+    for report in chain.from_iterable(of_logs):
+        by_name.setdefault(report.name, []).append(report)
+    return sorted(map(_merged, by_name.values()), key=lambda report: -report.samples)
+
+
+def _merged(same: Sequence[StateReport]) -> StateReport:
+    """The report of one contact state from those of several logs."""
+    samples = sum(report.samples for report in same)
+    shares = defaultdict[int, float](float)
+    for report in same:
+        for rank, share in report.base_rank_shares.items():
+            shares[rank] += share * report.samples / samples
+    ranks = dict(sorted(shares.items(), reverse=True))
+    values = sorted((report.base_singular_value or 0.0, report.samples) for report in same)
+    middle = sum(below <= samples / 2 for below in accumulate(count for _, count in values))
+    merged = replace(same[0], samples=samples, rows=max(report.rows for report in same))
+    if not ranks:
+        return merged
+    return replace(
+        merged,
+        base_rank=_common_rank(ranks),
+        base_singular_value=values[min(middle, len(values) - 1)][0],
+        base_full_share=ranks.get(6, 0.0),
+        base_rank_shares=ranks,
+    )
+
+
+def _common_rank(shares: Mapping[int, float]) -> int:
+    """The rank that at least half of the samples reach, from shares by rank, descending."""
+    return next(rank for rank, so_far in zip(shares, accumulate(shares.values()), strict=True) if so_far >= _MOST)
 
 
 def _describe_rank(report: StateReport) -> str:

@@ -78,7 +78,7 @@ def contributions(
 
     Args:
         parts: of the logs.
-        logs: bound logs.
+        logs: bound logs; none: sensors are not left out, which takes samples.
         builder: of their rows.
         problem: of all parts, for its scales and free parameters.
         dof_names: of the robot.
@@ -93,8 +93,10 @@ def contributions(
     by_log = leave_one_out(data, [part.source for part in parts], rank_tolerance)
     by_state = leave_one_out(data, [state_name(builder.contacts, part.state) for part in parts], rank_tolerance)
     by_state.sort(key=lambda state: -state.samples)
-    information = _sensor_information(logs, builder, directions, nuisance, done)
-    sensors = _sensors(information.marginal(nuisance.of_all), builder, dof_names)
+    sensors: list[SensorContribution] = []
+    if logs:
+        information = _sensor_information(logs, builder, directions, nuisance, done)
+        sensors = _sensors(information.marginal(nuisance.of_all), builder, dof_names)
     return Contributions(InformationGain.of(data.everything**2), by_log, by_state, sensors)
 
 

@@ -26,6 +26,8 @@ from torchid.staging import atomic_file
 #: Containers of named arrays.
 ARRAYS = (".npz", ".h5", ".hdf5")
 TABLES = (".csv", ".parquet")
+#: Logs that torchid compress has made factors of.
+FACTORS = ".factor"
 #: Files of ROS 1 (.bag) and ROS 2; those of ROS 2 may also lie in a folder.
 BAGS = (".bag", ".mcap", ".db3")
 WRITABLE = (*ARRAYS, *TABLES)
@@ -135,7 +137,7 @@ def open_container(path: Path, whole: bool = True) -> Iterator[Container]:
         with reader_errors_explained("file", kind):
             container: Container
             if suffix == ".npz":
-                container = _Npz(stack.enter_context(_open_archive(path)))
+                container = stack.enter_context(open_npz(path))
             else:
                 h5py = import_h5py(path)
                 container = Hdf5(stack.enter_context(h5py.File(path, "r")), h5py, path.stat().st_size)
@@ -187,6 +189,13 @@ def _open_archive(path: Path) -> zipfile.ZipFile:
         stream.seek(max(0, path.stat().st_size - _DIRECTORY_BYTES))
         check_fields((), stream.read().count(_ENTRY))
     return zipfile.ZipFile(path)
+
+
+@contextlib.contextmanager
+def open_npz(path: Path) -> Iterator[Container]:
+    """Open a .npz archive of any name; any exception where it is damaged or is none."""
+    with _open_archive(path) as archive:
+        yield _Npz(archive)
 
 
 class _Npz:

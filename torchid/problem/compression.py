@@ -23,7 +23,9 @@ from torchid.robot import Robot
 FOLDS = 5
 """Number of cross-validation folds of the training samples."""
 
-_LEAST_PER_FOLD = 20  # independent samples per fold: the filter correlates only a small part of these with neighbours
+LEAST_PER_FOLD = 20
+"""Independent samples per fold: the filter correlates only a small part of these with neighbours."""
+
 _MEMORY = 2**30  # [bytes] of factors
 _LEAST_READINGS = 16  # readings for one equation
 _BATCHES = 8  # batches of successive readings, whose means show drift
@@ -120,12 +122,30 @@ def _compress_chunks(
             weighted = rows if weight_rows is None else weight_rows(samples, support, rows)
             loaded.factor.add(support, weighted, samples.oversampling)
         for channel in unloaded_offset_equations(builder, samples):
-            unloaded = part(samples, state, True)
-            if channel.gated:
-                unloaded.gated.add(channel.offset)
-            else:
-                unloaded.factor.add(*channel.row(builder), samples.oversampling)
+            _add_equation(part(samples, state, True), channel, samples, builder)
     return list(parts.values())
+
+
+def _add_equation(part: Part, channel: UnloadedOffsetEquation, samples: Samples, builder: RowBuilder) -> None:
+    if channel.gated:
+        part.gated.add(channel.offset)
+    else:
+        part.factor.add(*channel.row(builder), samples.oversampling)
+
+
+def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:
+    """Those parts of `compress_parts` that are of readings in the air."""
+
+    def reduce(chunks: Iterator[tuple[Samples, ContactState]]) -> list[Part]:
+        parts: dict[_Key, Part] = {}
+        for samples, state in chunks:
+            key = (samples.source, state, samples.fold, True)
+            for channel in unloaded_offset_equations(builder, samples):
+                part = parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
+                _add_equation(part, channel, samples, builder)
+        return list(parts.values())
+
+    return _merge_parts(map_chunks(logs, builder, reduce))
 
 
 @one_thread()
@@ -213,41 +233,68 @@ def split_into_folds(logs: Sequence[Samples], builder: RowBuilder) -> list[Sampl
         logs: bound logs.
         builder: of their rows.
     """
-    total, count = sum(map(len, logs)), _fold_count(logs, builder)
-    out, preceding = [], 0
-    for log in logs:
-        blocks = max(1, round(count * len(log) / max(total, 1)))
-        ends = [len(log) * k // blocks for k in range(blocks + 1)]
-        for start, end in zip(ends, ends[1:], strict=False):
-            middle = preceding + (start + end) / 2
-            fold = min(int(count * middle / max(total, 1)), count - 1)
-            out.append(replace(log if blocks == 1 else log[start:end], fold=fold))
-        preceding += len(log)
-    used = sorted({block.fold for block in out})  # rounding may leave a fold empty
-    return [replace(block, fold=used.index(block.fold)) for block in out]
-
-
-def _fold_count(logs: Sequence[Samples], builder: RowBuilder) -> int:
-    independent = sum(len(log) / log.oversampling for log in logs)
     states: set[tuple[str, ContactState]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
-    size = 8 * (builder.width + 1) ** 2 * max(len(states), 1) * worker_count(builder.device)
-    return max(1, min(FOLDS, int(independent / _LEAST_PER_FOLD), _MEMORY // size))
+    count = fold_count(sum(len(log) / log.oversampling for log in logs), len(states), builder)
+    out = []
+    for log, blocks in zip(logs, lay_out_folds([len(log) for log in logs], count), strict=True):
+        for start, stop, fold in blocks:
+            out.append(replace(log if len(blocks) == 1 else log[start:stop], fold=fold))
+    return out
 
 
-@one_thread()
+def fold_count(independent: float, states: int, builder: RowBuilder) -> int:
+    """Number of folds, at most `FOLDS`.
+
+    Args:
+        independent: number of independent samples.
+        states: number of contact states, counted log by log.
+        builder: of the rows.
+    """
+    size = 8 * (builder.width + 1) ** 2 * max(states, 1) * worker_count(builder.device)
+    return max(1, min(FOLDS, int(independent / LEAST_PER_FOLD), _MEMORY // size))
+
+
+def lay_out_folds(
+    lengths: Sequence[int], count: int, most: Sequence[int] | None = None
+) -> list[list[tuple[int, int, int]]]:
+    """Blocks of each log: first sample, end and fold.
+
+    Args:
+        lengths: samples of each log.
+        count: number of folds.
+        most: blocks of each log at most.
+    """
+    total, preceding, out = sum(lengths), 0, []
+    for index, length in enumerate(lengths):
+        blocks = max(1, round(count * length / max(total, 1)))
+        spans = block_spans(length, blocks if most is None else min(blocks, most[index]))
+        middles = (preceding + (start + stop) / 2 for start, stop in spans)
+        folds = (min(int(count * middle / max(total, 1)), count - 1) for middle in middles)
+        out.append([(*span, fold) for span, fold in zip(spans, folds, strict=True)])
+        preceding += length
+    used = sorted({fold for blocks in out for _, _, fold in blocks})  # rounding may leave a fold empty
+    return [[(start, stop, used.index(fold)) for start, stop, fold in blocks] for blocks in out]
+
+
+def block_spans(length: int, blocks: int) -> list[tuple[int, int]]:
+    """First sample and end of each of some blocks of a log."""
+    ends = [length * k // blocks for k in range(blocks + 1)]
+    return list(zip(ends, ends[1:], strict=False))
+
+
 def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
     """Parts with the contact states of each log and fold merged; offset equations of unloaded sensors stay apart."""
-    return _merge_by_key(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
+    return merge_by_key(parts, [(part.source, part.fold, part.unloaded) for part in parts], builder)
+
+
+def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+    """Parts with the folds of each log and contact state merged; offset equations of unloaded sensors stay apart."""
+    return merge_by_key(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
 
 
 @one_thread()
-def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
-    """Parts with the folds of each log and contact state merged; offset equations of unloaded sensors stay apart."""
-    return _merge_by_key(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
-
-
-def _merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
-    """One part for each key, with the contact state and fold of the first."""
+def merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], builder: RowBuilder) -> list[Part]:
+    """One part for each key, with whatever else of the first; the factors of the parts stay as they are."""
     out: dict[tuple[object, ...], Part] = {}
     for part, key in zip(parts, keys, strict=True):
         if key not in out:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -114,6 +115,20 @@ class TriangularFactor:
         self._blocks: dict[tuple[int, ...], Tensor] = {}
         self._scratch: Tensor | None = None
 
+    @classmethod
+    def from_blocks(
+        cls, columns: int, rows: int, independent_rows: float, blocks: Mapping[tuple[int, ...], Tensor]
+    ) -> TriangularFactor:
+        """The factor that has these `blocks`, of so many rows."""
+        out = cls(columns)
+        out.rows, out.independent_rows, out._blocks = rows, independent_rows, dict(blocks)
+        return out
+
+    @property
+    def blocks(self) -> Mapping[tuple[int, ...], Tensor]:
+        """Rows (M, len(support) + 1) that stand for all that were added with the same columns, by these columns."""
+        return self._blocks
+
     @property
     def oversampling(self) -> float:
         """Rows per independent row, 1 without any."""
@@ -146,10 +161,18 @@ class TriangularFactor:
 
     def scaled(self, factor: float) -> TriangularFactor:
         """The factor of the same rows times a number."""
-        out = TriangularFactor(self.columns)
-        out.rows, out.independent_rows = self.rows, self.independent_rows
-        out._blocks = {support: factor * block for support, block in self._blocks.items()}
-        return out
+        blocks = {support: factor * block for support, block in self._blocks.items()}
+        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks)
+
+    def compact(self) -> TriangularFactor:
+        """The factor on the CPU, as one triangle in all columns if that has fewer numbers than its blocks."""
+        sizes = ((len(block), block.shape[1]) for block in self._blocks.values())
+        numbers = sum(rows * width - (rows * (rows - 1) // 2 if rows == width else 0) for rows, width in sizes)
+        if numbers <= (self.columns + 1) * (self.columns + 2) // 2:
+            blocks = {support: block.to("cpu", torch.float64) for support, block in self._blocks.items()}
+        else:
+            blocks = {tuple(range(self.columns)): self.triangle().triu()}
+        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks)
 
     def triangle(self) -> Tensor:
         """Upper triangular R, (columns + 1, columns + 1), float64 on the CPU."""

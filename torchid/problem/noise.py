@@ -55,6 +55,12 @@ def std_by_group(noise: SensorNoise) -> dict[str, float]:
     return dict(zip(NOISE_GROUPS, [*sensors, *noise.base_std.tolist(), *limb], strict=True))
 
 
+def noise_of_sensors(builder: RowBuilder) -> dict[str, float]:
+    """Standard deviation of every group that a builder's sensors have, in `NOISE_GROUPS`' order [N m, N]."""
+    names = set(_source_names(builder))
+    return {name: value for name, value in std_by_group(builder.sensors.noise).items() if name in names}
+
+
 def noise_of_groups(values: Mapping[str, float]) -> SensorNoise:
     """Sensor noise from standard deviations by group."""
     force, moment = (

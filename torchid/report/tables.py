@@ -172,8 +172,10 @@ def verdict_counts_table(by_state: Mapping[str, Estimate], together: Estimate) -
 
 
 def contribution_table(contributions: Contributions, max_rows: int = 12) -> Table:
-    """Information that each log, contact state and sensor contributes, the largest of each kind."""
-    table = Table(title="What each log, contact state and sensor adds: lost without it", title_justify="left")
+    """Information that each log, contact state and sensor (if known) contributes, the largest of each kind."""
+    of_sensors = "contact state and sensor" if contributions.sensors else "and contact state"
+    comma = "," if contributions.sensors else ""
+    table = Table(title=f"What each log{comma} {of_sensors} adds: lost without it", title_justify="left")
     for heading in ("", "samples", "rank alone", "rank lost", "combinations lost", "bits lost"):
         table.add_column(heading, justify="right" if heading else "left", overflow="fold")
     kinds: dict[str, Sequence[Contribution]] = {
@@ -205,6 +207,17 @@ def violation_table(violations: Sequence[Mapping[str, Any]], max_rows: int = 12)
     for violation in violations[:max_rows]:
         amount = Text(f"{violation['amount']:.3g} {violation['unit']}")
         table.add_row(Text(violation["body"] or "all"), Text(str(violation["condition"])), amount)
+    return table
+
+
+def compression_table(files: Sequence[Mapping[str, Any]]) -> Table:
+    """Files of factors: fields of `CompressedFile`."""
+    table = Table(title="Compressed logs", title_justify="left")
+    for heading in ("file", "samples", "rows", "contact states", "kB"):
+        table.add_column(heading, justify="left" if heading == "file" else "right", overflow="fold")
+    for file in files:
+        counts = (str(file[name]) for name in ("samples", "rows", "states"))
+        table.add_row(Text(str(file["name"])), *counts, f"{file['size'] / 1e3:.0f}")
     return table
 
 

@@ -90,17 +90,18 @@ class RunEvents:
         for tag, value in scalars.items():
             self._writer.add_scalar(tag, value, epoch.number)
 
-    def write_solution(self, estimate: Estimate, samples_per_second: float) -> None:
+    def write_solution(self, estimate: Estimate, samples_per_second: float | None) -> None:
         """Losses of a batch fit, in the charts of a descent.
 
         Args:
             estimate: the fit.
-            samples_per_second: of the stream through the logs.
+            samples_per_second: of the stream through the logs, None without one.
         """
         rows = max(estimate.rows, 1)
         self._writer.add_scalar("loss/data", estimate.nominal_cost / rows, 0)
         self._writer.add_scalar("loss/data", estimate.cost / rows, 1)
-        self._writer.add_scalar("descent/samples_per_second", samples_per_second, 1)
+        if samples_per_second is not None:
+            self._writer.add_scalar("descent/samples_per_second", samples_per_second, 1)
         if isinstance(estimate, ConstrainedEstimate):
             self._writer.add_scalar("loss/prior", estimate.objective - estimate.cost / rows, 1)
             self._writer.add_scalar("closed_form/distance", estimate.distance, 1)

@@ -1,0 +1,246 @@
+"""Factors of logs in place of the logs: the same fit, and what a run says then."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fleets import WALKS, compressed, demo_fleet, fitted, fitted_twice, walks
+from refusals import refusal
+from repository import DEMO
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import torchid
+from torchid.cli import main
+from torchid.commands import Identification
+from torchid.config import load_config
+from torchid.fitting.factor_files import FactorFile, read_factors, write_factors
+from torchid.problem.metrics import ERROR_GROUPS, WHITENED
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning"),
+    pytest.mark.filterwarnings("ignore::torchid.errors.NumericalWarning"),
+    pytest.mark.filterwarnings("ignore::torchid.errors.ConfoundedWarning"),
+    pytest.mark.filterwarnings("ignore:.*in the air:torchid.errors.TorchidWarning"),
+]
+SAME = 1e-12
+KEPT = 350  # of 400 samples: the filter leaves out what it cannot see both sides of
+STATED = {"joint_torque": 1.0, "contact_force": 4.0, "contact_moment": 0.5, "base_force": 5.0, "base_moment": 1.0}
+OFFSETS = {"set": "full", "offsets": "log"}
+
+
+def of_whitened(run: Identification) -> list[float]:
+    """Whitened residuals of nominal and identified parameters, on the training logs and on held-out blocks."""
+    assert run.validation is not None
+    held_out = (run.validation.nominal, run.validation.identified)
+    return [float(metrics.rms[WHITENED] or 0.0) for metrics in (*run.metrics["train"], *held_out)]
+
+
+def assert_same(logs: Identification, factors: Identification) -> None:
+    one, other = logs.estimate, factors.estimate
+    assert np.abs(one.phi - other.phi).max() < SAME * np.abs(one.phi).max()
+    assert (one.verdict == other.verdict).all()
+    assert other.residual_std == pytest.approx(one.residual_std, rel=SAME)
+    assert one.rank == other.rank
+    assert one.rows == other.rows
+    assert [x.extra.label for x in logs.extras] == [x.extra.label for x in factors.extras]
+    assert all(abs(x.value - y.value) < SAME * x.extra.size for x, y in zip(logs.extras, factors.extras, strict=True))
+    assert logs.validation is not None
+    assert factors.validation is not None
+    assert logs.validation.folds == factors.validation.folds > 1
+    assert of_whitened(factors) == pytest.approx(of_whitened(logs), rel=SAME)
+    assert logs.samples == factors.samples
+    assert {x.name: (x.samples, x.rows, x.base_rank) for x in logs.states} == {
+        x.name: (x.samples, x.rows, x.base_rank) for x in factors.states
+    }
+    for kind in ("logs", "states"):
+        one_kind, other_kind = (
+            {Path(x.name).stem: x.bits for x in getattr(run.contributions, kind)} for run in (logs, factors)
+        )
+        assert other_kind == pytest.approx(one_kind, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [(), ("estimator.ridge=auto",), ("estimator={name: consistent, ridge: 0.001}",)],
+    ids=["least squares", "ridge auto", "consistent"],
+)
+def test_the_demo_from_its_factor_is_the_demo_from_its_log(tmp_path: Path, overrides: tuple[str, ...]) -> None:
+    shutil.copytree(DEMO, tmp_path / "demo")
+    logs, factors = fitted_twice(tmp_path / "demo" / "quadruped.yaml", *overrides)
+    assert_same(logs, factors)
+    assert (logs.ridge is None) == (factors.ridge is None)
+    if logs.ridge is not None and factors.ridge is not None:
+        assert factors.ridge.ridge == logs.ridge.ridge
+        assert factors.ridge.mean_square == pytest.approx(logs.ridge.mean_square, rel=SAME)
+    for one, other in zip(logs.metrics["test"], factors.metrics["test"], strict=True):
+        assert {key: x for key, x in other.rms.items() if x is not None} == pytest.approx(
+            {key: x for key, x in one.rms.items() if x is not None}, rel=1e-10
+        )
+
+
+@pytest.mark.parametrize(
+    ("machine", "seconds", "settings"),
+    [
+        ("arm", (6.0,), {}),
+        ("arm", (3.0, 4.0, 3.0), {"actuators": {"armature": True, "torque_offset": True}}),
+        ("biped", (4.0, 3.0, 6.0), {"sensors": OFFSETS}),
+        ("biped", (8.0, 2.0, 2.0), {"sensors": OFFSETS, "estimator": {"name": "consistent", "ridge": 1e-3}}),
+        ("biped", (4.0, 3.0, 6.0), {"sensors": OFFSETS, "estimator": {"ridge": "auto"}}),
+    ],
+    ids=["arm", "arm, actuators", "biped", "biped, consistent", "biped, ridge auto"],
+)
+def test_several_logs_from_their_factors_are_fitted_as_from_the_logs(
+    tmp_path: Path, machine: str, seconds: tuple[float, ...], settings: dict[str, Any]
+) -> None:
+    """With offsets of every log, readings in the air, whole logs held out, and noise that is estimated."""
+    logs, factors = fitted_twice(walks(tmp_path, machine, seconds, **settings))
+    assert_same(logs, factors)
+    assert logs.noise.noise == factors.noise.noise
+    assert (logs.ridge is None) == (factors.ridge is None)
+    if logs.ridge is not None and factors.ridge is not None:
+        assert factors.ridge.ridge == logs.ridge.ridge
+
+
+def test_files_of_two_calls_with_stated_noise_fit_as_those_of_one(tmp_path: Path) -> None:
+    file = walks(tmp_path, "biped", (2.0, 2.0, 3.0), sensors=OFFSETS | {"noise": STATED})
+    compressed(file, tmp_path / "one")
+    compressed(file, tmp_path / "here", f"logs.train=[{tmp_path / WALKS[0]}]")
+    compressed(file, tmp_path / "there", f"logs.train=[{tmp_path / WALKS[1]}, {tmp_path / WALKS[2]}]")
+    names = [Path(name).with_suffix(".factor").name for name in WALKS]
+    places = [tmp_path / place / name for place, name in zip(("here", "there", "there"), names, strict=True)]
+    for name, place in zip(names, places, strict=True):
+        assert (tmp_path / "one" / name).read_bytes() == place.read_bytes()
+    together = fitted(file, "a", f"logs.train={[str(tmp_path / 'one' / name) for name in names]}")
+    apart = fitted(file, "b", f"logs.train={[str(place) for place in places]}")
+    assert np.array_equal(together.estimate.phi, apart.estimate.phi)
+    assert_same(fitted(file, "c"), apart)
+
+
+# ------------------------------------------------------------------------------------------------ what a run says then
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return demo_fleet(tmp_path_factory.mktemp("fleet") / "demo")
+
+
+def test_a_run_of_factors_says_what_it_can(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "run"
+    assert main(["identify", str(fleet / "experiment.yaml"), f"output={output}"]) == 0
+    printed = capsys.readouterr().out
+    assert "What each log and contact state adds" in printed
+    assert {path.name.split(".")[0] for path in output.glob("*.png")} == {
+        "errors", "parameters", "identifiability", "contributions"
+    }, "no figure of forces, which takes samples"  # fmt: skip
+    metrics = json.loads((output / "metrics.json").read_text())
+    assert metrics["train"][WHITENED] > 0.0
+    assert all(metrics["train"][f"{group}_rms"] is None for group in ERROR_GROUPS if group != WHITENED)
+    assert metrics["identifiability"]["sensors"] == []
+    assert metrics["samples"] == 2 * KEPT
+    by_log = {Path(one["file"]).name: one for one in metrics["factors"]}
+    assert set(by_log) == {"sway_train.factor", "sway_test.factor"}
+    assert by_log["sway_train.factor"]["log"] == "sway_train.npz"
+    config = load_config(output / "config.yaml")
+    assert [path.name for path in config.logs.train] == ["sway_test.factor", "sway_train.factor"]
+    assert {one["origin"] for one in metrics["noise"]["groups"]} == {"stated"}
+    events = EventAccumulator(str(output))
+    events.Reload()
+    assert "descent/samples_per_second" not in events.Tags()["scalars"]
+    assert main(["evaluate", str(output), "--log", str(fleet / "sway_test.npz")]) == 0
+
+
+def test_the_table_of_files_says_what_is_in_them(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f")]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if ".factor" in line]
+    size = (tmp_path / "f" / "sway_train.factor").stat().st_size
+    found = read_factors(tmp_path / "f" / "sway_train.factor").log
+    cells = ["sway_train.factor", str(KEPT), str(found.rows), str(len(found.by_state)), f"{size / 1e3:.0f}"]
+    assert [x.strip() for x in lines[0].strip("│").split("│")] == cells
+
+
+def test_nothing_is_replaced_but_what_torchid_wrote(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f")]
+    assert main(line) == 0
+    capsys.readouterr()
+    assert "not empty; accepted: a new folder, or overwrite=true" in refusal(line, tmp_path, capsys)
+    assert main([*line, "overwrite=true"]) == 0
+    (tmp_path / "f" / "mine.factor").write_text("mine")
+    capsys.readouterr()
+    assert "mine.factor, which torchid did not write" in refusal([*line, "overwrite=true"], tmp_path, capsys)
+
+
+def test_condemned_samples_are_left_out_when_logs_are_compressed(fleet: Path, tmp_path: Path) -> None:
+    with np.load(fleet / "sway_train.npz") as log:
+        fields = dict(log)
+    fields["joint_torque"] = fields["joint_torque"].copy()
+    fields["joint_torque"][100, 3] += 500.0
+    np.savez(tmp_path / "spike.npz", **fields)
+    overrides = [f"logs.train=[{tmp_path / 'spike.npz'}]", "preprocessing.exclude_condemned=true"]
+    assert main(["compress", str(fleet / "logs.yaml"), "--output", str(tmp_path / "f"), *overrides]) == 0
+    found = read_factors(tmp_path / "f" / "spike.factor")
+    assert found.excluded > 0
+    assert found.excluded + len(found.log) == KEPT
+
+
+def test_an_implausible_fit_is_refused_without_a_look_for_samples(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with np.load(fleet / "sway_train.npz") as log:
+        np.savez(tmp_path / "reversed.npz", **{**log, "joint_torque": -log["joint_torque"]})
+    logs = f"logs.train=[{tmp_path / 'reversed.npz'}]"
+    assert main(["compress", str(fleet / "logs.yaml"), logs, "--output", str(tmp_path / "f")]) == 0
+    capsys.readouterr()
+    looked: list[Path] = []
+    monkeypatch.setattr("torchid.commands.plausibility.read_log_to_check", lambda path, *_: looked.append(path))
+    factors = f"logs.train=[{tmp_path / 'f' / 'reversed.factor'}]"
+    message = refusal(["identify", str(fleet / "experiment.yaml"), factors], tmp_path, capsys)
+    assert "usual reasons: torques or wrenches of the opposite sign" in message
+    assert looked == []
+
+
+def test_a_file_reads_back_to_the_last_bit(fleet: Path, tmp_path: Path) -> None:
+    path = fleet / "factors" / "sway_train.factor"
+    found = read_factors(path)
+    assert found.version == torchid.__version__
+    assert found.duration == pytest.approx((KEPT - 1) * 0.01)
+    write_factors(tmp_path / "again.factor", found)
+    assert (tmp_path / "again.factor").read_bytes() == path.read_bytes()
+
+
+def test_a_file_is_written_whole_or_not_at_all(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = read_factors(fleet / "factors" / "sway_train.factor")
+
+    def interrupted(stream: Any, **arrays: Any) -> None:
+        stream.write(b"half of it")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_factors(tmp_path / "a.factor", found)
+    with pytest.raises(KeyboardInterrupt):
+        main_compress(fleet, tmp_path / "f")
+    assert list(tmp_path.iterdir()) == []
+
+
+def main_compress(fleet: Path, output: Path) -> None:
+    compressed(fleet / "logs.yaml", output)
+
+
+def test_only_factor_files_are_written_and_read(fleet: Path, tmp_path: Path) -> None:
+    found: FactorFile = read_factors(fleet / "factors" / "sway_train.factor")
+    with pytest.raises(torchid.TorchidError, match=r"extension '.npz'; accepted: .factor"):
+        write_factors(tmp_path / "a.npz", replace(found))
+    for name in ("missing.factor", "a.factor"):
+        (tmp_path / "a.factor").mkdir(exist_ok=True)
+        with pytest.raises(torchid.TorchidError, match="accepted: a whole .factor file"):
+            read_factors(tmp_path / name)

@@ -1,0 +1,113 @@
+"""Logs compressed one by one are cut into folds as their samples would be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from walking import MACHINES, recorded, robot_of, truth
+
+from torchid.logs.preprocess import preprocess
+from torchid.problem import ExtraTerms, RowBuilder, Samples, TriangularFactor, bind_log, compress_parts
+from torchid.problem.compressed_log import compress_log, fold_compressed, merge_blocks, piece_spans
+from torchid.problem.compression import FOLDS, Part, block_spans, merge_folds, merge_states, split_into_folds
+from torchid.sensing import named_sensors
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[RowBuilder, Samples]:
+    """A biped with offsets in its soles, which are lifted."""
+    machine = MACHINES["biped"]
+    robot, contacts = robot_of(machine), machine.contacts
+    sensors = named_sensors("full", robot.n, len(contacts))
+    log = preprocess(recorded(machine, truth(machine, 1, seconds=8.0)), 10.0)
+    builder = RowBuilder(robot, contacts, sensors, ExtraTerms(offsets={"contact_force": "log"}))
+    return builder, bind_log(log, robot, contacts, sensors)
+
+
+def logs_of(walk: Samples, lengths: Sequence[int]) -> list[Samples]:
+    starts = np.cumsum([0, *lengths])
+    assert starts[-1] <= len(walk)
+    return [replace(walk[a:b], source=str(a)) for a, b in zip(starts, starts[1:], strict=False)]
+
+
+def gram(factor: TriangularFactor) -> torch.Tensor:
+    R = factor.triangle()
+    return R.T @ R
+
+
+def assert_same(found: Sequence[Part], expected: Sequence[Part]) -> None:
+    def by_key(parts: Sequence[Part], of_state: bool) -> dict[tuple[object, ...], Part]:
+        return {(x.source, x.fold, x.unloaded, x.state if of_state else None): x for x in parts}
+
+    for unloaded in (False, True):
+        one, other = (by_key([x for x in parts if x.unloaded == unloaded], unloaded) for parts in (found, expected))
+        assert one.keys() == other.keys()
+        for key, part in one.items():
+            same, G = other[key], gram(other[key].factor)
+            assert (part.samples, part.factor.rows, part.gated) == (same.samples, same.factor.rows, same.gated)
+            assert part.factor.independent_rows == pytest.approx(same.factor.independent_rows, rel=1e-12)
+            assert (gram(part.factor) - G).abs().max() <= 1e-12 * G.abs().max()
+
+
+@pytest.mark.parametrize(
+    "lengths", [(1500,), (700, 800), (750, 750), (1200, 150, 150), (300, 1200), (100,) * 14, (700, 30, 700)]
+)
+def test_blocks_of_compressed_logs_are_those_of_their_samples(
+    walk: tuple[RowBuilder, Samples], lengths: tuple[int, ...]
+) -> None:
+    """Logs that are cut or held out as a whole, and readings in the air, whose means are of whole blocks."""
+    builder, samples = walk
+    logs = logs_of(samples, lengths)
+    expected = split_into_folds(logs, builder)
+    found = fold_compressed([compress_log(log, builder) for log in logs], builder)
+    assert [(x.source, x.fold, len(x)) for x in found] == [(x.source, x.fold, len(x)) for x in expected]
+    parts = compress_parts(expected, builder)
+    merged = merge_states([part for part in parts if not part.unloaded], builder)
+    unloaded = [part for part in parts if part.unloaded]
+    assert unloaded
+    assert_same(merge_blocks(found, builder), [*merged, *unloaded])
+
+
+def test_contact_states_of_a_compressed_log_are_those_of_its_samples(walk: tuple[RowBuilder, Samples]) -> None:
+    builder, log = walk
+    parts = [part for part in compress_parts([log], builder) if not part.unloaded]
+    expected = {part.state: part for part in merge_folds(parts, builder)}
+    found = {part.state: part for part in compress_log(log, builder).by_state}
+    assert found.keys() == expected.keys()
+    assert len(found) > 1
+    for state, part in found.items():
+        G = gram(expected[state].factor)
+        assert part.samples == expected[state].samples
+        assert (gram(part.factor) - G).abs().max() <= 1e-12 * G.abs().max()
+
+
+@pytest.mark.parametrize("samples", [1, 3, 7, 59, 60, 1001])
+def test_pieces_make_up_the_blocks_of_any_number_of_blocks(samples: int) -> None:
+    for most in range(1, FOLDS + 1):
+        pieces = piece_spans(samples, most)
+        assert [start for start, _ in pieces[1:]] == [stop for _, stop in pieces[:-1]]
+        assert (pieces[0][0], pieces[-1][1]) == (0, samples)
+        ends = {end for piece in pieces for end in piece}
+        assert all(end in ends for count in range(1, most + 1) for span in block_spans(samples, count) for end in span)
+
+
+def test_what_a_log_compresses_to_does_not_grow_with_it(walk: tuple[RowBuilder, Samples]) -> None:
+    builder, log = walk
+
+    def numbers(samples: Samples) -> int:
+        compressed = compress_log(samples, builder)
+        parts = [*compressed.pieces, *compressed.by_state]
+        return sum(block.numel() for part in parts for block in part.factor.blocks.values())
+
+    def repeated(times: int) -> Samples:
+        tensors: dict[str, Any] = {
+            name: torch.cat([x] * times) for name, x in vars(log).items() if isinstance(x, torch.Tensor)
+        }
+        return replace(log, base=log.base.map(lambda x: torch.cat([x] * times)), **tensors)
+
+    assert numbers(repeated(8)) <= 1.005 * numbers(repeated(4))

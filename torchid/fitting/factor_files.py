@@ -1,0 +1,354 @@
+"""Files of compressed logs: factors by contact state and block, with whatever says which of them belong together."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, field
+from dataclasses import dataclass as plain_dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic.dataclasses import dataclass
+
+from torchid import __version__
+from torchid.errors import LogError, about_file, during, excerpt
+from torchid.fitting.row_model import RowModel, Value
+from torchid.guards import MAX_ARRAYS, MAX_DESCRIPTION, MAX_LETTERS, MAX_TRIANGLES, check_unpacked_size
+from torchid.identifiability.base_parameters import StateReport
+from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_explained
+from torchid.parameters import Array
+from torchid.problem import TriangularFactor
+from torchid.problem.compressed_log import CompressedLog, piece_spans
+from torchid.problem.compression import FOLDS, Part, block_spans
+from torchid.settings import NotNegative, Number
+from torchid.staging import atomic_file
+
+FORMAT = 1
+"""Version of the format, a whole number that grows whenever a reader of an older version would be wrong."""
+
+_ACCEPTED = f"a whole {FACTORS} file, as torchid compress writes it"
+_GEOMETRY = ("T_parent_joint", "T_joint_link", "joint_map", "joint_constant", "contact_node", "T_node_contact")
+_EXTRAS = ("sensors.offsets", "sensors.scales", "actuators")
+_LARGEST = 1e30  # of a number: squares stay within the range of float64
+_STRICT = ConfigDict(extra="forbid")
+_Whole = Annotated[int, Field(ge=0, le=2**53)]
+_Text = Annotated[str, Field(max_length=10 * MAX_LETTERS)]
+
+
+@plain_dataclass(frozen=True)
+class FactorFile:
+    """A compressed log with what its rows were formed with, and where it comes from.
+
+    Attributes:
+        log: factors of the log.
+        model: what the rows were formed with.
+        name: of the log's file; `sha256`: its checksum, "" if it is not known.
+        duration: of the log [s].
+        excluded: condemned samples that were left out.
+        states: contact states of the log.
+        version: of torchid that compressed it.
+    """
+
+    log: CompressedLog
+    model: RowModel
+    name: str = ""
+    sha256: str = ""
+    duration: float = 0.0
+    excluded: int = 0
+    states: list[StateReport] = field(default_factory=list)
+    version: str = __version__
+
+
+@dataclass(config=_STRICT, frozen=True)
+class _State:
+    name: _Text
+    samples: _Whole
+    rows: _Whole
+    base_rank: _Whole | None
+    base_singular_value: NotNegative | None
+    base_full_share: NotNegative | None
+    base_rank_shares: dict[int, NotNegative]
+
+
+@dataclass(config=_STRICT, frozen=True)
+class _Part:
+    """`state`: a digit for each contact; `triangles`: number of the support, rows, whether packed as a triangle."""
+
+    state: str
+    samples: _Whole
+    rows: _Whole
+    independent_rows: NotNegative
+    gated: list[_Whole]
+    triangles: list[tuple[_Whole, _Whole, bool]]
+
+
+@dataclass(config=_STRICT, frozen=True)
+class _Unloaded:
+    start: _Whole
+    stop: _Whole
+    parts: list[_Part]
+
+
+@dataclass(config=_STRICT, frozen=True)
+class _Description:
+    format: int
+    torchid: _Text
+    log: _Text
+    sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64})?$")]
+    samples: Annotated[int, Field(ge=1, le=2**53)]
+    oversampling: Annotated[Number, Field(ge=1.0)]
+    duration_s: NotNegative
+    excluded: _Whole
+    blocks: Annotated[int, Field(ge=1, le=FOLDS)]
+    settings: dict[str, Value]
+    noise: dict[str, Annotated[Number, Field(gt=0.0)]]
+    pieces: list[_Part]
+    by_state: list[_Part]
+    unloaded: list[_Unloaded]
+    supports: list[list[_Whole]]
+    states: list[_State]
+
+
+_DESCRIPTION: TypeAdapter[_Description] = TypeAdapter(_Description)
+
+
+def write_factors(path: str | Path, factors: FactorFile) -> None:
+    """Write a compressed log, whole or not at all.
+
+    From Python::
+
+        model = torchid.RowModel.of(robot, builder, {"cutoff_hz": 8.0})
+        torchid.write_factors("walk.factor", torchid.FactorFile(torchid.compress_log(log, builder), model))
+
+    Args:
+        path: ends in .factor.
+        factors: what to write.
+
+    Raises:
+        LogError: another extension, or the file cannot be written.
+    """
+    path = Path(path)
+    _require_suffix(path)
+    description, values = _packed(factors)
+    arrays: dict[str, Any] = dict(factors.model.geometry)
+    arrays["description"] = np.frombuffer(json.dumps(description, allow_nan=False).encode(), np.uint8)
+    arrays["values"] = values
+    try:
+        with atomic_file(path, result=False) as new, during("writing", path), new.open("xb") as stream:
+            np.savez(stream, **arrays)
+    except OSError as error:
+        raise LogError(path, "file", f"cannot be written ({error})", "a path in a writable folder") from error
+
+
+def read_factors(path: str | Path) -> FactorFile:
+    """Read a compressed log; its name in a fit is that of the file.
+
+    From Python::
+
+        logs = [torchid.read_factors(path).log for path in sorted(Path("factors").glob("*.factor"))]
+        blocks = torchid.fold_compressed(logs, builder)
+
+    Whether its rows are those of a builder, `require_same_rows` and `require_same_noise` say.
+
+    Raises:
+        LogError: no such file, one of another format, or a damaged one.
+    """
+    path = Path(path)
+    _require_suffix(path)
+    if not os.path.isfile(path):
+        found = "no such file" if not os.path.lexists(path) else "no regular file"
+        raise LogError(path, "file", found, _ACCEPTED)
+    with about_file(path), reader_errors_explained("file", _ACCEPTED), open_npz(path) as container:
+        sizes = container.declared_bytes()
+        check_unpacked_size(path, sum(sizes.values()))
+        if sum(sizes.values()) > MAX_ARRAYS or sizes.get("description", 0) > MAX_DESCRIPTION:
+            raise ValueError("more bytes than a compressed log has")
+        return _read(path, container)
+
+
+def _require_suffix(path: Path) -> None:
+    if path.suffix != FACTORS:
+        raise LogError(path, "file", f"extension '{path.suffix}'", FACTORS)
+
+
+# ------------------------------------------------------------------------------------------------------------- writing
+
+
+def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
+    """The description, and the numbers of all triangles."""
+    log, supports = factors.log, dict[tuple[int, ...], int]()
+    values: list[Array] = []
+
+    def entries(parts: Sequence[Part]) -> list[dict[str, object]]:
+        out: list[dict[str, object]] = []
+        for part in parts:
+            triangles = []
+            for support, block in part.factor.blocks.items():
+                rows = block.cpu().numpy()
+                packed = len(rows) == rows.shape[1] and not np.tril(rows, -1).any()
+                values.append(rows[np.triu_indices(len(rows))] if packed else rows.ravel())
+                triangles.append((supports.setdefault(support, len(supports)), len(rows), packed))
+            out.append(
+                {
+                    "state": "".join("01"[active] for active in part.state),
+                    "samples": part.samples,
+                    "rows": part.factor.rows,
+                    "independent_rows": part.factor.independent_rows,
+                    "gated": sorted(part.gated),
+                    "triangles": triangles,
+                }
+            )
+        return out
+
+    description = {
+        "format": FORMAT,
+        "torchid": factors.version,
+        "log": factors.name,
+        "sha256": factors.sha256,
+        "samples": log.samples,
+        "oversampling": log.oversampling,
+        "duration_s": factors.duration,
+        "excluded": factors.excluded,
+        "blocks": log.blocks,
+        "settings": factors.model.settings,
+        "noise": factors.model.noise,
+        "pieces": entries(log.pieces),
+        "by_state": entries(log.by_state),
+        "unloaded": [{"start": a, "stop": b, "parts": entries(parts)} for (a, b), parts in log.unloaded.items()],
+        "supports": list(supports),
+        "states": [asdict(state) for state in factors.states],
+    }
+    return description, np.concatenate([np.empty(0), *values])
+
+
+# ------------------------------------------------------------------------------------------------------------- reading
+
+
+def _read(path: Path, container: Container) -> FactorFile:
+    """The content of an open file; any exception where it is damaged."""
+    text = _array(container, "description", np.uint8, 1).tobytes()
+    document = json.loads(text)
+    found = document.get("format") if isinstance(document, dict) else None
+    if found != FORMAT:
+        version = "none" if found is None else f"{excerpt(str(found))}, of another version of torchid"
+        raise LogError.at_field("format", version, f"{FORMAT}, as torchid {__version__} writes it")
+    description = _DESCRIPTION.validate_json(text)
+    geometry = {name: _array(container, name, np.float64) for name in _GEOMETRY}
+    log = _log(str(path), description, _array(container, "values", np.float64, 1))
+    return FactorFile(
+        log,
+        RowModel(description.settings, dict(description.noise), geometry),
+        description.log,
+        description.sha256,
+        description.duration_s,
+        description.excluded,
+        [StateReport(**vars(state)) for state in description.states],
+        description.torchid,
+    )
+
+
+def _array(container: Container, name: str, dtype: type, dimensions: int | None = None) -> NDArray[Any]:
+    array = container.load(name)
+    if array.dtype != dtype or dimensions not in (None, array.ndim):
+        raise ValueError(f"{name} is no array of {dtype.__name__}")
+    if array.dtype == np.float64 and not (np.abs(array) <= _LARGEST).all():
+        raise ValueError(f"{name} has a number that is not finite")
+    return array
+
+
+def _log(source: str, description: _Description, values: Array) -> CompressedLog:
+    """The compressed log; ValueError if it cannot be one."""
+    samples, blocks = description.samples, description.blocks
+    parts = _Parts(source, description, values)
+    pieces, by_state = ([parts.read(one) for one in same] for same in (description.pieces, description.by_state))
+    unloaded = {(x.start, x.stop): [parts.read(one, unloaded=True) for one in x.parts] for x in description.unloaded}
+    spans = {span for count in range(1, blocks + 1) for span in block_spans(samples, count)}
+    if not set(unloaded) <= spans or len(unloaded) != len(description.unloaded):
+        raise ValueError("readings in the air of what is no block of the log")
+    if [part.samples for part in pieces] != [stop - start for start, stop in piece_spans(samples, blocks)]:
+        raise ValueError("pieces of other samples than those of the log")
+    if sum(part.samples for part in by_state) != samples or len({part.state for part in by_state}) != len(by_state):
+        raise ValueError("contact states of other samples than those of the log")
+    if parts.numbers_left:
+        raise ValueError("more numbers than are described")
+    return CompressedLog(source, samples, description.oversampling, blocks, pieces, by_state, unloaded)
+
+
+class _Parts:
+    """Parts of a log, read one after the other; ValueError where one cannot be that of a log."""
+
+    def __init__(self, source: str, description: _Description, values: Array) -> None:
+        settings = description.settings
+        columns, contacts = settings.get("columns"), settings.get("contacts")
+        if not isinstance(columns, int) or columns < 1 or not isinstance(contacts, list):
+            raise ValueError("neither columns nor contacts")
+        self._source, self._columns, self._contacts = source, columns, len(contacts)
+        labels = (settings.get(key) for key in _EXTRAS)
+        self._extras = sum(len(x) for x in labels if isinstance(x, list))
+        self._supports = [_support(one, columns) for one in description.supports]
+        self._stream, self._triangles = _Stream(values), 0
+
+    @property
+    def numbers_left(self) -> int:
+        """Numbers that belong to no part so far."""
+        return self._stream.left
+
+    def read(self, one: _Part, unloaded: bool = False) -> Part:
+        """The next part."""
+        self._triangles += 1 + len(one.triangles)
+        if self._triangles > MAX_TRIANGLES:
+            raise ValueError(f"more than {MAX_TRIANGLES} triangles")
+        if len(one.state) != self._contacts or set(one.state) - {"0", "1"}:
+            raise ValueError(f"contact state {one.state[:MAX_LETTERS]!r}")
+        if max(one.gated, default=-1) >= self._extras or (unloaded and one.samples):
+            raise ValueError("readings in the air of a sensor that is none")
+        if not one.independent_rows <= one.rows or (one.rows and not one.independent_rows):
+            raise ValueError(f"{one.independent_rows:g} independent of {one.rows} rows")
+        triangles = {}
+        for number, rows, packed in one.triangles:
+            support = self._supports[number]
+            triangles[support] = self._stream.triangle(len(support) + 1, rows, packed)
+        if len(triangles) != len(one.triangles):
+            raise ValueError("the same columns twice")
+        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles)
+        state = tuple(digit == "1" for digit in one.state)
+        return Part(self._source, state, factor, one.samples, unloaded=unloaded, gated=set(one.gated))
+
+
+def _support(columns: list[int], count: int) -> tuple[int, ...]:
+    if len(set(columns)) != len(columns) or max(columns, default=0) >= count:
+        raise ValueError(f"columns that are not among {count}")
+    return tuple(columns)
+
+
+class _Stream:
+    """The numbers of all triangles, one after the other."""
+
+    def __init__(self, values: Array) -> None:
+        self._values, self._taken = values, 0
+
+    @property
+    def left(self) -> int:
+        """How many are left."""
+        return len(self._values) - self._taken
+
+    def triangle(self, width: int, rows: int, packed: bool) -> torch.Tensor:
+        """The next triangle, or rows too few to make one, (rows, width); ValueError if there are not enough."""
+        if rows > width or (packed and rows != width):
+            raise ValueError(f"{rows} rows of {width} numbers")
+        size = width * (width + 1) // 2 if packed else rows * width
+        if size > self.left:
+            raise ValueError("fewer numbers than are described")
+        values = self._values[self._taken : self._taken + size]
+        self._taken += size
+        if not packed:
+            return torch.from_numpy(values.reshape(rows, width).copy())
+        triangle = np.zeros((width, width))
+        triangle[np.triu_indices(width)] = values
+        return torch.from_numpy(triangle)
