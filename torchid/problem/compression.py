@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid import parameters
+from torchid import parameters, ranks
 from torchid.parameters import Array
 from torchid.problem.chunks import CHUNK, ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
@@ -231,7 +231,8 @@ def _fold_count(logs: Sequence[Samples], builder: RowBuilder) -> int:
     independent = sum(len(log) / log.oversampling for log in logs)
     states: set[tuple[str, ContactState]] = {(log.source, state) for log in logs for state, _ in chunks_by_state(log)}
     size = 8 * (builder.width + 1) ** 2 * max(len(states), 1) * worker_count(builder.device)
-    return max(1, min(FOLDS, int(independent / _LEAST_PER_FOLD), _MEMORY // size))
+    count = max(1, min(FOLDS, int(independent / _LEAST_PER_FOLD), _MEMORY // size))
+    return ranks.as_first(count, "folds")
 
 
 @one_thread()

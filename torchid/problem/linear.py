@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -113,6 +114,16 @@ class TriangularFactor:
         self.independent_rows = 0.0
         self._blocks: dict[tuple[int, ...], Tensor] = {}
         self._scratch: Tensor | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        """What another process gets: on the CPU, as it may have another device, and without the scratch memory."""
+        blocks = {support: block.cpu().numpy() for support, block in self._blocks.items()}
+        return vars(self) | {"_blocks": blocks, "_scratch": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what another process sent."""
+        blocks = {support: torch.from_numpy(block) for support, block in state["_blocks"].items()}
+        vars(self).update(state | {"_blocks": blocks})
 
     @property
     def oversampling(self) -> float:
