@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.contact_state import ContactState
 from torchid.problem.predict import predict_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -79,8 +80,8 @@ class MiniBatches:
             batch_size: samples per batch; the last of a chunk may hold fewer.
             seed: of all random orders.
             memory: bytes of rows to cache; the others are computed again in each epoch.
-            share: number of this process, and of all that share every batch: it takes each so-many-th sample of a
-                chunk, and batches hold what is in them of these.
+            share: number of this process, and of all that share every batch: it takes every so-many-th sample of
+                a chunk, and batches hold what is in them of these.
         """
         if batch_size < 1:
             raise ValueError(f"batch_size: found {batch_size}; accepted: at least 1")
@@ -160,8 +161,7 @@ class MiniBatches:
     def _rows(self, chunk: int) -> Batch:
         if chunk in self._cache:
             return self._cache[chunk]
-        rank, size = self.share
-        batch = self._compute_rows(self._chunks[chunk][rank::size])
+        batch = self._compute_rows(self._chunks[chunk])
         if batch.nbytes <= self._memory_left:
             self._memory_left -= batch.nbytes
             self._cache[chunk] = batch
@@ -169,14 +169,20 @@ class MiniBatches:
 
     @torch.no_grad()
     def _compute_rows(self, index: Tensor) -> Batch:
-        if not len(index):  # of a chunk with fewer samples than processes
-            return self._compute_rows(torch.zeros(1, dtype=torch.long))[:0]
-        parts = []
+        """Rows of numbered samples, sorted by log and contact state; this share has every so-many-th of these."""
+        parts: list[Batch] = []
+        (rank, size), before = self.share, 0
         with one_thread():
             for log, start, end in zip(self._logs, self._starts, self._starts[1:], strict=False):
                 samples = log[index[(index >= start) & (index < end)] - start].to(self.builder.device)
                 for state, where in chunks_by_state(samples, len(index)):
                     chosen = samples[where]
-                    rows, W = self.builder.rows_by_sample(chosen, state)
-                    parts.append(Batch(rows[..., :-1], rows[..., -1], W, *chosen.coordinates()))
+                    own, before = chosen[(rank - before) % size :: size], before + len(chosen)
+                    if len(own) or not parts:  # of a chunk with fewer samples than processes at least the shapes
+                        parts.append(self._batch(own if len(own) else chosen[:1], state)[: len(own)])
         return Batch(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Batch)))
+
+    def _batch(self, samples: Samples, state: ContactState) -> Batch:
+        """Rows of samples that share a contact state."""
+        rows, W = self.builder.rows_by_sample(samples, state)
+        return Batch(rows[..., :-1], rows[..., -1], W, *samples.coordinates())
