@@ -74,21 +74,21 @@ def run_in_ranks(program: str, run: Callable[[], int]) -> int:
         program: its name.
         run: the whole command, from its arguments to its exit status.
 
-    Raises:
-        SystemExit: as `run` does.
+    Returns:
+        The exit status; a process that torchrun has started does not return.
     """
     try:
-        with ranks.launched():
-            with nullcontext() if ranks.is_launched_first() else _silence():
-                try:
-                    status = run()
-                except SystemExit as leaving:  # usage
-                    ranks.agree(2 if leaving.code else 0)
-                    raise
-            return ranks.agree(status)
+        if not ranks.join_launched():
+            return run()
     except ranks.ConnectionFailedError as error:
         _print_line(program, str(error))
         return 1
+    with nullcontext() if ranks.is_launched_first() else _silence():
+        try:
+            status = run()
+        except SystemExit as leaving:  # of argparse
+            status = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+    return ranks.leave_launched(status)
 
 
 @contextmanager

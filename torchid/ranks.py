@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -222,22 +223,22 @@ def is_launched_first() -> bool:
     return _launched is None or _launched.rank == 0
 
 
-@contextmanager
-def launched() -> Iterator[None]:
-    """Join the processes that torchrun has started, if it has started this one.
+def join_launched() -> bool:
+    """Join the processes that torchrun has started, if it has started this one, which then ends in `leave_launched`.
 
     On machines with GPUs, `cuda` is a GPU of its own for each process of the machine, as far as there are some.
+
+    Raises:
+        ConnectionFailedError: they do not reach each other.
     """
     global _launched
     if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not all(name in os.environ for name in _LAUNCHED):
-        yield
-        return
+        return False
     import torch
     import torch.distributed as dist
 
     if dist.is_initialized():  # by whoever calls the command line
-        yield
-        return
+        return False
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
     try:
@@ -245,23 +246,23 @@ def launched() -> Iterator[None]:
     except (RuntimeError, ValueError) as error:
         raise ConnectionFailedError(f"the processes of this run do not reach each other ({error})") from error
     _launched = _Ranks(dist.group.WORLD, dist.get_rank(), dist.get_world_size())
-    try:
-        yield
-    finally:
-        _launched = None
-        dist.destroy_process_group()
+    return True
 
 
-def agree(status: int) -> int:
-    """The exit status of all processes that torchrun has started: they wait for the first, which prints before."""
-    if _launched is None or _launched.lost:
-        return status
-    _launched.failed = False  # all know
-    try:
-        statuses = _launched.exchange(_STATUS, status)
-    except LostRankError:
-        return status
-    return statuses[0] or max(statuses)
+def leave_launched(status: int) -> int:
+    """End this process, with the exit status of the first one, which has printed before any other ends.
+
+    At once: Gloo's threads now and then abort a process that ends in order (one in some dozens, torch 2.13).
+    """
+    if _launched is not None and not _launched.lost:
+        _launched.failed = False  # all know
+        with suppress(LostRankError):
+            statuses = _launched.exchange(_STATUS, status)
+            status = statuses[0] or max(statuses)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status)
 
 
 def is_restart() -> bool:
