@@ -73,6 +73,9 @@ from .problem import (
 from .problem.compression import (
     split_into_folds,
 )
+from .ranks import (
+    share_work,
+)
 from .regressor import (
     FrameJacobian,
     Motion,
@@ -148,6 +151,7 @@ __all__ = [
     "preprocess",
     "nearest_consistent",
     "read_log",
+    "share_work",
     "structural_problem",
     "violations",
     "with_ft_sensors",

@@ -23,7 +23,7 @@ from shared_work import (
     finish,
     is_running,
     run_all,
-    start,
+    started,
     write_experiments,
 )
 
@@ -261,7 +261,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], bytes, f
 
 def killed_after(seconds: float, command: list[str], victim: int) -> int:
     """Exit status of a command of which one process was killed, all others having ended."""
-    with start(command) as process:
+    with started(command) as process:
         time.sleep(seconds)
         workers = children(process)
         if victim < len(workers):
@@ -297,7 +297,7 @@ def test_torchrun_starts_again_where_a_training_was(runs: dict[int, Path], exper
     folder: Path = runs[2].parent / "again"
     more = [*DESCENT, "estimator.training.checkpoint_seconds=0", f"output={folder / 'run'}"]
     command = [*TWO, "--max-restarts", "1", "-m", "torchid", "identify", str(experiments["quadruped"]), *more]
-    with start(command) as process:
+    with started(command) as process:
         until, workers = time.monotonic() + 60.0, []
         while time.monotonic() < until and not (folder / "run.training" / CHECKPOINT).is_file():
             time.sleep(0.01)

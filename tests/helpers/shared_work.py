@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,12 +79,24 @@ def write_experiments(folder: Path) -> dict[str, Path]:
     return out
 
 
-def start(command: Sequence[str], **options: Any) -> subprocess.Popen[str]:
-    """Start a command with one thread a process, its output kept."""
+@contextmanager
+def started(command: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
+    """A command with one thread a process, its output kept; whatever it has started ends with the block."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "helpers")])
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": path} | options.pop("env", {})
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": path}
     pipe = subprocess.PIPE
-    return subprocess.Popen([*command], env=environment, stdout=pipe, stderr=pipe, text=True, **options)
+    process = subprocess.Popen(
+        [*command], env=environment, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        for group in (*children(process), process.pid):  # torchrun gives each of them a session of its own
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(group, signal.SIGKILL)
+        with suppress(ValueError):  # both streams are read already
+            process.communicate()
 
 
 def children(process: subprocess.Popen[str]) -> list[int]:
@@ -102,10 +115,10 @@ def is_running(pid: int) -> bool:
     return state not in "ZX"
 
 
-def finish(command: Sequence[str], **options: Any) -> tuple[int, str, str]:
+def finish(command: Sequence[str]) -> tuple[int, str, str]:
     """Exit status, standard output and standard error of a command."""
-    with start(command, **options) as process:
-        printed, complained = process.communicate(timeout=300)
+    with started(command) as process:
+        printed, complained = process.communicate(timeout=200)
     return process.returncode, printed, complained
 
 
