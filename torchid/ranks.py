@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import os
 import pickle
+import secrets
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -27,6 +29,7 @@ T = TypeVar("T")
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # torchrun sets them
 #: For one exchange: processes wait for the slowest. Failures are told, and the death of a process ends its connections.
 _PATIENCE = timedelta(days=1)
+_POLL = 0.01  # [s]
 _FAILED, _END, _STATUS = "failed", "end", "status"
 
 
@@ -241,12 +244,39 @@ def join_launched() -> bool:
         return False
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    from torch.distributed.rendezvous import rendezvous
+
     try:
-        dist.init_process_group("gloo", timeout=_PATIENCE)
+        store, rank, size = next(rendezvous("env://", timeout=_PATIENCE))
+        own = dist.PrefixStore(_name_of_attempt(store, rank, size), store)  # type: ignore[attr-defined]
+        dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
         raise ConnectionFailedError(f"the processes of this run do not reach each other ({error})") from error
-    _launched = _Ranks(dist.group.WORLD, dist.get_rank(), dist.get_world_size())
+    _launched = _Ranks(dist.group.WORLD, rank, size)
     return True
+
+
+def _name_of_attempt(store: Any, rank: int, size: int) -> str:
+    """A name that the processes of this attempt have in common, and no attempt before.
+
+    torchrun starts processes again beside the store of the attempt before (torch 2.13), where they would wait at the
+    addresses of dead ones. What others have left is told from what they write now by answers to names just drawn.
+    """
+    drawn, place = secrets.token_hex(8), "torchid/{}".format
+    if rank:
+        store.set(place(rank), drawn)
+        name: str = store.get(place(drawn)).decode()  # waits for it
+        store.set(place(f"{name}/{rank}"), "")
+        return name
+    missing = set(range(1, size))
+    while missing:
+        for other in tuple(missing):
+            if store.check([place(other)]):
+                store.set(place(store.get(place(other)).decode()), drawn)
+            if store.check([place(f"{drawn}/{other}")]):
+                missing.remove(other)
+        time.sleep(_POLL)
+    return drawn
 
 
 def leave_launched(status: int) -> int:

@@ -303,7 +303,7 @@ def test_torchrun_starts_again_where_a_training_was(runs: dict[int, Path], exper
             time.sleep(0.01)
             workers = children(process)
         os.kill(workers[1], signal.SIGKILL)
-        _, complained = process.communicate(timeout=120)
+        _, complained = process.communicate(timeout=60)
     assert process.returncode == 0, complained
     expected = json.loads((runs[2] / "quadruped, descent" / "parameters.json").read_text())
     assert json.loads((folder / "run/parameters.json").read_text()) == expected
