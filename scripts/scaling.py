@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,10 +24,10 @@ from benchmark import CASES, Case, PerSample, medians, random_samples, robots_fo
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-import torchid
 from torchid.errors import TorchidWarning
 from torchid.estimators import LeastSquares
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
+from torchid.ranks import join_launched, share_work
 from torchid.report.figures import save_figure
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, named_sensors
@@ -68,7 +68,7 @@ def measure_bodies(case: Case, repeats: int) -> dict[str, float]:
     bench = Bench.of(case, 16384)
     few = bench.samples[torch.arange(0, len(bench.samples), 32)]
     peer = PerSample(robots_folder() / case.urdf, bench.robot, case)
-    pipelines = {
+    pipelines: dict[str, tuple[Callable[[], object], int]] = {
         "per sample, lstsq": (lambda: peer.by_stack(few), len(few)),
         "per sample, Gram": (lambda: peer.by_gram(few), len(few)),
         "torchid": (bench.fit, len(bench.samples)),
@@ -81,12 +81,11 @@ def measure_rank(count: int) -> None:
     bench = Bench.of(CASES[0], 4096)
     bench.fit()
     bench = Bench.of(CASES[0], count)
-    torch.distributed.init_process_group("gloo")
-    with torchid.share_work():
+    join_launched()
+    with share_work():
         before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
         bench.fit()
         seconds = time.perf_counter() - start
-    torch.distributed.destroy_process_group()
     added = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     if os.environ.get("RANK", "0") == "0":
         print(seconds, added / 1024.0)

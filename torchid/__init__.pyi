@@ -89,6 +89,9 @@ from .problem.compressed_log import (
 from .problem.compression import (
     split_into_folds,
 )
+from .ranks import (
+    share_work,
+)
 from .regressor import (
     FrameJacobian,
     Motion,
@@ -173,6 +176,7 @@ __all__ = [
     "read_log",
     "require_same_noise",
     "require_same_rows",
+    "share_work",
     "structural_problem",
     "violations",
     "with_ft_sensors",

@@ -9,9 +9,18 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
 
-from torchid.errors import BaseLostError, EscapedStream, InputError, TorchidWarning, activity_of, one_line
+from torchid import ranks
+from torchid.errors import (
+    BaseLostError,
+    EscapedStream,
+    InputError,
+    TorchidError,
+    TorchidWarning,
+    activity_of,
+    one_line,
+)
 from torchid.staging import list_written, reset_written, termination_as_interrupt
 
 #: Errors of the system, not of the user's files or the program: no room, no memory, no permission.
@@ -58,10 +67,43 @@ def run_guarded(program: str, command: Callable[[], int | None], debug: bool = F
             return status
 
 
+def run_in_ranks(program: str, run: Callable[[], int]) -> int:
+    """Run a command in this process, or in all that torchrun has started: the first prints, all end with one status.
+
+    Args:
+        program: its name.
+        run: the whole command, from its arguments to its exit status.
+
+    Returns:
+        The exit status; a process that torchrun has started does not return.
+    """
+    try:
+        if not ranks.join_launched():
+            return run()
+    except ranks.ConnectionFailedError as error:
+        _print_line(program, str(error))
+        return 1
+    with nullcontext() if ranks.is_launched_first() else _silence():
+        try:
+            status = run()
+        except SystemExit as leaving:  # of argparse
+            status = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+    return ranks.leave_launched(status)
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Drop standard output and error of Python."""
+    with open(os.devnull, "w", encoding="utf-8") as null, redirect_stdout(null), redirect_stderr(null):
+        yield
+
+
 def _describe_failure(error: Exception) -> tuple[int, str]:
     """Exit status and the line that reports an error."""
     if isinstance(error, (InputError, BaseLostError)):
         return 2, str(error)
+    if isinstance(error, TorchidError):  # of processes that share the work
+        return 1, str(error)
     activity = activity_of(error)
     where = f"{activity}: " if activity else ""
     if isinstance(error, MemoryError):

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from math import isfinite
 from textwrap import fill
 from typing import TYPE_CHECKING
 
 from torchid import __version__
-from torchid.boundary import plain_streams, run_guarded
+from torchid.boundary import plain_streams, run_guarded, run_in_ranks
 from torchid.errors import during
+from torchid.ranks import is_launched_first, share_work
 from torchid.staging import interrupts_deferred
 
 if TYPE_CHECKING:
@@ -28,11 +30,16 @@ _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
+_SHARED = ("identify", "evaluate", "analyze")  # by the processes that torchrun has started; the first runs all others
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad input, 1 on anything else."""
+    return run_in_ranks("torchid", lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     with plain_streams():  # argparse repeats unknown arguments in its errors
         options = _options(arguments)
     return run_guarded("torchid", lambda: _command(options), options.debug)
@@ -40,7 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _command(options: argparse.Namespace) -> int | None:
     target = getattr(options, "file", getattr(options, "run", getattr(options, "source", "")))
-    with during(options.name, target):
+    if options.name not in _SHARED and not is_launched_first():
+        return 0
+    with share_work() if options.name in _SHARED else nullcontext(), during(options.name, target):
         status: int | None = options.command(options)
         return status
 

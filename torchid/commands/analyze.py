@@ -6,12 +6,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.progress import Progress
 
+from torchid import ranks
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader
 from torchid.commands.sensor_set_accuracy import accuracies
@@ -62,7 +64,10 @@ class ScenarioAnalysis:
 
 @dataclass(frozen=True)
 class Analysis:
-    """Results by scenario, and the accuracy of sensor sets on logs."""
+    """Results by scenario, and the accuracy of sensor sets on logs.
+
+    Of processes that share the work, the first alone has the scenarios: to look for sensors is the work of one.
+    """
 
     scene: Scene
     scenarios: tuple[ScenarioAnalysis, ...]
@@ -126,21 +131,26 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         raise ConfigError.at_field("output", found, "a path to a new folder")
     if config.logs is not None:
         config.logs.require_samples("analyze")
-    check_free(output, config.overwrite, ANALYSIS, inputs_of(config))
+    ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
     scene = set_up_scene(config)
     request = AnalysisRequest.of(scene)
     with progress_bars() as bars:
         train, test = _read(request, bars)
         if train:
-            scene = with_noise(scene, scene.estimate_noise(train))
+            scene = with_noise(scene, ranks.from_first(partial(scene.estimate_noise, train), "noise"))
             request = AnalysisRequest.of(scene)
-        results = tuple(
-            _analyze_scenario(request, name, states, train, bars) for name, states in scenarios(scene, train).items()
-        )
-        compared = accuracies(scene, _sets_to_compare(request, results, train), train, test, bars) if train else {}
-        analysis = Analysis(scene, results, compared, output)
+        results: list[ScenarioAnalysis] = []
+
+        def plan() -> dict[str, SensorSet]:
+            for name, states in scenarios(scene, train).items():
+                results.append(_analyze_scenario(request, name, states, train, bars))
+            return _sets_to_compare(request, results, train)
+
+        sets = ranks.from_first(plan, "sensor sets")
+        compared = accuracies(scene, sets, train, test, bars) if train else {}
+        analysis = Analysis(scene, tuple(results), compared, output)
         bars.add_task("writing", total=None)
-        write_analysis(analysis)
+        ranks.from_first(partial(write_analysis, analysis), "analysis folder")
     return analysis
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchid import ranks
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
 from torchid.commands.results import draw_forces
@@ -30,7 +31,7 @@ class EvaluatedRun:
 
 
 def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = None) -> EvaluatedRun:
-    """Evaluate nominal and identified parameters.
+    """Evaluate nominal and identified parameters; of processes that share the work, the first writes.
 
     Results go to `RUN/evaluation/<name of the first log>` and replace an earlier evaluation of that name.
 
@@ -50,8 +51,12 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
     if again:
         raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
     output = folder / RUN.inner_folder / names[0]
-    refuse_link(output.parent)
-    check_free(output, True, EVALUATION, logs)
+
+    def check_output() -> None:
+        refuse_link(output.parent)
+        check_free(output, True, EVALUATION, logs)
+
+    ranks.from_first(check_output, "output")
     config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])
     with progress_bars() as bars:
         with about_file(folder / "config.yaml"):
@@ -77,11 +82,15 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
         }
         for path, count in reader.excluded.items():
             document[Path(path).stem]["excluded_samples"] = count
-        with during("writing", output), new_folder(output, True, EVALUATION) as new:
-            (new / "config.yaml").write_bytes(read_bytes(folder / "config.yaml", MAX_YAML))
-            write_json(new / "metrics.json", document)
-            save_figure(draw_forces(evaluation, samples[0], compared), new / "forces.png")
-            save_figure(error_figure(metrics), new / "errors.png")
+
+        def write() -> None:
+            with during("writing", output), new_folder(output, True, EVALUATION) as new:
+                (new / "config.yaml").write_bytes(read_bytes(folder / "config.yaml", MAX_YAML))
+                write_json(new / "metrics.json", document)
+                save_figure(draw_forces(evaluation, samples[0], compared), new / "forces.png")
+                save_figure(error_figure(metrics), new / "errors.png")
+
+        ranks.from_first(write, "evaluation folder")
     return EvaluatedRun(metrics, output)
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 from rich.progress import Progress
 
+from torchid import ranks
 from torchid.commands.compress import read_fleet
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
@@ -50,7 +51,7 @@ class _Clock:
 
 
 def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
-    """Fit the parameters and write the run folder.
+    """Fit the parameters and write the run folder; of processes that share the work, the first writes.
 
     Args:
         config: the experiment.
@@ -62,9 +63,16 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
     trains = config.estimator.name == "sgd"
-    with claim_folder(training_folder(config.output)) if trains else nullcontext():
-        require_trainable(config, resume)
-        check_free(config.output, config.overwrite, RUN, inputs_of(config))
+    resume = resume or (trains and ranks.is_restart())
+    with ExitStack() as stack:
+
+        def claim() -> None:
+            if trains:
+                stack.enter_context(claim_folder(training_folder(config.output)))
+            require_trainable(config, resume)
+            check_free(config.output, config.overwrite, RUN, inputs_of(config))
+
+        ranks.from_first(claim, "output")
         return _identify(config, resume)
 
 
@@ -116,7 +124,7 @@ def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Dat
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
         require_base(states, experiment.config.sensors.on_base_lost)
-        noise = experiment.estimate_noise(logs["train"], experiment.sensors)
+        noise = ranks.from_first(partial(experiment.estimate_noise, logs["train"], experiment.sensors), "noise")
         experiment = with_noise(experiment, noise)
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
@@ -163,7 +171,9 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
         with clock("identifiability"):
             whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
             alone = _by_state(fitter, whole)
-            added = _contributions(experiment, builder, whole, logs["train"], problem, bars)
+            added = ranks.from_first(
+                lambda: _contributions(experiment, builder, whole, logs["train"], problem, bars), "contributions"
+            )
         with clock("evaluate"):
             fits = (fit, *fitter.fit_without_folds(fit.parts))
             compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
@@ -191,7 +201,8 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
         )
         require_not_worse(run.worse, experiment)
         bars.add_task("writing", total=None)
-        write_run(run, evaluation, next(iter([*logs["test"], *logs["train"]]), None), compared, training)
+        plotted = next(iter([*logs["test"], *logs["train"]]), None)
+        ranks.from_first(partial(write_run, run, evaluation, plotted, compared, training), "run folder")
     return run
 
 
@@ -208,7 +219,8 @@ def _with_ridge(
     if not config.estimator.chooses_ridge:
         return experiment, None
     bar = bars.add_task("choosing the ridge", total=None)
-    choice = experiment.choose_ridge(parts, blocks, experiment.fitter(builder, conditions), conditions)
+    fitter = experiment.fitter(builder, conditions)
+    choice = ranks.from_first(partial(experiment.choose_ridge, parts, blocks, fitter, conditions), "ridge")
     bars.update(bar, total=1, completed=1)
     chosen = replace(config, estimator=replace(config.estimator, ridge=choice.ridge))
     return replace(experiment, config=chosen), choice

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchid import ranks
 from torchid.config.experiment import PreprocessingConfig
 from torchid.errors import LogError, about_file
 from torchid.fitting.experiment import Scene
@@ -89,7 +90,8 @@ class LogReader:
                 logs.append(self._large(path, required, together))
             if on_read is not None:
                 on_read(path)
-        return logs
+        names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
+        return [log if log.source == name else replace(log, source=name) for log, name in zip(logs, names, strict=True)]
 
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""

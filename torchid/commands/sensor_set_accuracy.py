@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from rich.progress import Progress
 
+from torchid import ranks
 from torchid.commands.plausibility import require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
 from torchid.fitting.calibration import Calibration
@@ -106,7 +108,8 @@ def _accuracy(
     blocks = split_into_folds(train, builder)
     parts = compress_parts(blocks, builder)
     if settings.chooses_ridge:
-        settings = replace(settings, ridge=scene.choose_ridge(parts, blocks, fitter, conditions).ridge)
+        choice = ranks.from_first(partial(scene.choose_ridge, parts, blocks, fitter, conditions), "ridge")
+        settings = replace(settings, ridge=choice.ridge)
     fit = fitter.fit(parts, batch_estimator(settings, conditions).solve)
     require_plausible(fit, scene)
     estimate, problem = fit.estimate, fit.assembly.problem

@@ -12,9 +12,10 @@ import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import torch
 import yaml
 from rich.progress import Progress
 
-from torchid import parameters
+from torchid import parameters, ranks
 from torchid.commands.folder import (
     EVENTS,
     TRAINING,
@@ -37,6 +38,7 @@ from torchid.config import ExperimentConfig, dump_config, inputs_of
 from torchid.config.reading import check_yaml
 from torchid.errors import ConfigError, InputError, SensorError, excerpt, warn
 from torchid.estimators import Epoch, Sgd, SgdEstimate, Trainer
+from torchid.estimators.optimizers import OPTIMIZERS
 from torchid.fitting.experiment import Experiment
 from torchid.guards import MAX_STATE, check_regular
 from torchid.parameters import Array
@@ -127,15 +129,21 @@ class Training:
         """
         training = self.config.estimator.training
         train, held_out = (
-            MiniBatches(logs[name], builder, training.batch_size, training.seed) for name in ("train", "validation")
+            MiniBatches(logs[name], builder, training.batch_size, training.seed, share=self._share())
+            for name in ("train", "validation")
         )
         trainer = Trainer(self.settings, problem, train, held_out if held_out.samples else None)
         if not trainer.closed_form.rank:
             raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors or contacts")
-        self._prepare(trainer, resume)
+        state = ranks.from_first(partial(self._prepare, trainer, resume), "checkpoint")
+        if state is not None:
+            with refusing_damage(self.folder):
+                trainer.load_state_dict(state)
+            self._saved = trainer.epoch
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
         since = trainer.epoch + 1 if trainer.epoch else 0
-        with self._interruptible(trainer), RunEvents(self.folder, self.robot.body_names, True, since) as events:
+        curves = partial(RunEvents, self.folder, self.robot.body_names, True, since)
+        with self._interruptible(trainer), curves() if ranks.is_first() else nullcontext() as events:
             if trainer.epoch == 0:
                 self._evaluate(0, trainer.phi(), evaluate, events)
                 self._save(trainer, events)
@@ -161,12 +169,20 @@ class Training:
             message = f"{self.folder}: stays: it holds what torchid did not write"
             warn(message)
 
-    def _train(self, trainer: Trainer, evaluate: Evaluate, events: RunEvents, progress: Callable[[str], None]) -> None:
+    def _share(self) -> tuple[int, int]:
+        """The part of every batch that this process takes; all take all of it where a line search asks for more."""
+        name = self.config.estimator.training.optimizer["name"]
+        return (0, 1) if OPTIMIZERS[name].full_batch else (ranks.rank(), ranks.world_size())
+
+    def _train(
+        self, trainer: Trainer, evaluate: Evaluate, events: RunEvents | None, progress: Callable[[str], None]
+    ) -> None:
         training = self.config.estimator.training
         saved = time.monotonic()
         while not trainer.finished:
             epoch = trainer.run_epoch()
-            events.write_epoch(epoch)
+            if events is not None:
+                events.write_epoch(epoch)
             if epoch.number % training.evaluate_every == 0 or trainer.finished:
                 self._evaluate(epoch.number, trainer.phi(), evaluate, events)
             if time.monotonic() - saved >= training.checkpoint_seconds or trainer.finished:
@@ -174,29 +190,33 @@ class Training:
                 saved = time.monotonic()
             progress(_described(epoch))
 
-    def _evaluate(self, step: int, phi: Array, evaluate: Evaluate, events: RunEvents) -> None:
-        events.write_errors(step, evaluate(phi))
-        events.write_eigenvalues(step, body_eigenvalues(self.robot, phi))
+    def _evaluate(self, step: int, phi: Array, evaluate: Evaluate, events: RunEvents | None) -> None:
+        errors = evaluate(phi)
+        if events is not None:
+            events.write_errors(step, errors)
+            events.write_eigenvalues(step, body_eigenvalues(self.robot, phi))
 
-    def _prepare(self, trainer: Trainer, resume: bool) -> None:
-        """Start a new folder, or take up what is in it."""
+    def _prepare(self, trainer: Trainer, resume: bool) -> dict[str, Any] | None:
+        """Start a new folder, or take up what is in it: the state of the trainer there."""
         if resume and (self.folder / CHECKPOINT).is_file():
             state = load_checkpoint(self.folder)
             with refusing_damage(self.folder):
                 self._check(state, trainer)
-                trainer.load_state_dict(state["trainer"])
-            self._saved = trainer.epoch
             before = read_manifest(self.folder) or Manifest(TRAINING.name, self.folder.name, {})
             replace(before, growing=(*before.growing, *_growing())).write(self.folder)
-            return
+            found: dict[str, Any] = state["trainer"]
+            return found
         with new_folder(self.folder, True, TRAINING, _growing()) as folder:
             (folder / "config.yaml").write_text(self._text)
+        return None
 
-    def _save(self, trainer: Trainer, events: RunEvents) -> None:
+    def _save(self, trainer: Trainer, events: RunEvents | None) -> None:
+        self._saved = trainer.epoch
+        if events is None:  # the first process saves
+            return
         events.flush()  # first: a resumed run's curves start where the checkpoint is
         state = {"config": self._text, "logs": _fingerprint(trainer), "trainer": trainer.state_dict()}
         save_checkpoint(self.folder, state)
-        self._saved = trainer.epoch
 
     def _check(self, state: Mapping[str, Any], trainer: Trainer) -> None:
         path = self.folder / CHECKPOINT
@@ -218,7 +238,8 @@ class Training:
             stopped = f"interrupted in epoch {trainer.epoch}; --resume goes on after epoch {self._saved}"
             raise KeyboardInterrupt(stopped) from error
         except InputError:  # it would diverge again; the curves stay, to be looked at
-            (self.folder / CHECKPOINT).unlink(missing_ok=True)
+            if ranks.is_first():
+                (self.folder / CHECKPOINT).unlink(missing_ok=True)
             raise
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchid import parameters
+from torchid import parameters, ranks
 from torchid.estimators.conditions import Conditions
 from torchid.estimators.learnable import LearnableParameters
 from torchid.estimators.least_squares import Regularized
@@ -160,6 +160,21 @@ class LossTerms:
         return LossTerms(losses, {name: self.squares.get(name, 0.0) + x for name, x in other.squares.items()})
 
 
+def add_up(terms: LossTerms, trained: Sequence[nn.Parameter]) -> LossTerms:
+    """Add up what the processes that share a batch have: the gradients of what is trained, and the terms, returned."""
+    trained = [x for x in trained if x.grad is not None]
+    own = [x.grad.cpu().numpy() for x in trained if x.grad is not None]
+    values = [{name: float(x) for name, x in sums.items()} for sums in (terms.losses, terms.squares)]
+    gradients, sums = zip(*ranks.gather((own, values), "gradients"), strict=True)
+    for x, parts in zip(trained, zip(*gradients, strict=True), strict=True):
+        x.grad = torch.from_numpy(np.sum(parts, axis=0)).to(x)
+    losses, squares = (
+        {name: torch.tensor(sum(one[name] for one in same), dtype=torch.float64) for name in same[0]}
+        for same in zip(*sums, strict=True)
+    )
+    return LossTerms(losses, squares)
+
+
 class Loss(nn.Module):
     """The loss of a batch; its mean over an epoch is the loss of all samples.
 
@@ -184,23 +199,30 @@ class Loss(nn.Module):
         self.residual_weight = settings.residual_weight
         self._columns = batches.columns
         self._per_row = batches.samples / max(problem.rows, 1)
+        self._processes = batches.share[1]
         self.register_buffer(
             "_bodies", torch.from_numpy(problem.free_bodies()).to(batches.columns.device), persistent=False
         )
 
-    def forward(self, batch: Batch) -> LossTerms:
-        """Terms of the loss of one batch."""
+    def forward(self, batch: Batch, size: int | None = None) -> LossTerms:
+        """Terms of the loss of one batch.
+
+        Args:
+            batch: or what this process has of it.
+            size: samples that all processes have in it, if they share it; their terms add up to those of the batch.
+        """
         settings, phi = self.settings, self.learnable()
         rigid, other = self.forces(batch, phi)
-        share = self._per_row / len(batch)
+        share, of_one = self._per_row / (size or len(batch)), 1.0 / self._processes
         misfit = (rigid if other is None else rigid + other) - batch.f
         losses = {"data": share * misfit.square().sum()}
         if settings.ridge:
             deviation = (phi - self.learnable.nominal) / self.learnable.scale
-            losses["prior"] = settings.ridge * deviation.square().sum()
+            losses["prior"] = of_one * settings.ridge * deviation.square().sum()
         if settings.consistency == "penalties":
             scaled, bodies = self.learnable.by_body(phi), self.get_buffer("_bodies")
-            losses |= penalties(scaled, bodies, settings.margin, settings.penalties)
+            terms = penalties(scaled, bodies, settings.margin, settings.penalties)
+            losses |= {name: of_one * x for name, x in terms.items()}
         forces = {"rigid_body": rigid, "measured": batch.f}
         if other is not None:
             forces["residual"] = other
@@ -227,6 +249,8 @@ class Loss(nn.Module):
                 rigid, other = self.forces(batch, phi)
                 misfit = (rigid if other is None else rigid + other) - batch.f
                 total, rows = total + float(misfit.square().sum()), rows + batch.rows
+        if batches.share[1] > 1:
+            total, rows = (sum(parts) for parts in zip(*ranks.gather((total, rows), "loss"), strict=True))
         return total / max(rows, 1)
 
     @contextmanager

@@ -19,7 +19,7 @@ from torchid.estimators.learnable import FreeParameters, LearnableParameters, Lo
 from torchid.estimators.least_squares import ConstrainedEstimate, report_rounding
 from torchid.estimators.optimizers import OPTIMIZERS, make_optimizer, make_schedule, step_schedule
 from torchid.estimators.residual import CANDIDATE_WEIGHTS, ResidualEffect, WeightChoice, choose_weight, residual_effect
-from torchid.estimators.sgd import Loss, LossTerms, Sgd, validate_state
+from torchid.estimators.sgd import Loss, LossTerms, Sgd, add_up, validate_state
 from torchid.parameters import Array
 from torchid.problem import Batch, LinearProblem, MiniBatches
 from torchid.problem.chunks import one_thread
@@ -79,7 +79,7 @@ class Trainer:
     """A descent on mini-batches, preconditioned by the compressed problem, with or without a residual module.
 
     The same settings, logs and seeds give the same numbers, also if the state is saved after an epoch and loaded into a
-    new trainer.
+    new trainer. Batches that processes share give all of them these numbers, up to the rounding of sums.
     """
 
     @report_rounding("sgd")
@@ -104,6 +104,9 @@ class Trainer:
         Raises:
             InputError: an optimizer or a schedule that does not work with its options.
         """
+        if batches.share[1] > 1 and (residual is not None or OPTIMIZERS[settings.optimizer["name"]].full_batch):
+            found = f"a share of {batches.share[1]}, with a residual module or {settings.optimizer['name']}"
+            raise ValueError(f"batches: {found}; accepted: whole batches")
         settings.try_out()
         self.settings, self.problem, self.batches, self.held_out = settings, problem, batches, held_out
         self._least_squares = settings.least_squares
@@ -347,25 +350,27 @@ class Trainer:
             )
             raise InputError("estimator", "training", found, _SMALLER)
 
-    def _steps(self) -> Iterator[tuple[Callable[[], Iterable[Batch]], int]]:
-        """Batches of each step of an epoch, with the number of their samples."""
+    def _steps(self) -> Iterator[tuple[Callable[[], Iterable[tuple[Batch, int]]], int]]:
+        """Batches of each step of an epoch with the number of samples of each, and of all of them."""
         if OPTIMIZERS[self.settings.optimizer["name"]].full_batch:
-            yield self.batches.chunks, self.batches.samples
+            yield self.batches.sized_chunks, self.batches.samples
         else:
-            for batch in self.batches.epoch(self.epoch):
-                yield partial(list, [batch]), len(batch)
+            for batch, size in self.batches.sized_epoch(self.epoch):
+                yield partial(list, [(batch, size)]), size
 
-    def _step(self, batches: Callable[[], Iterable[Batch]], samples: int) -> LossTerms:
+    def _step(self, batches: Callable[[], Iterable[tuple[Batch, int]]], samples: int) -> LossTerms:
         """Take one step of the optimizer; returns the terms before it."""
         evaluated: list[LossTerms] = []
 
         def closure() -> Tensor:
             self.optimizer.zero_grad()
             terms = LossTerms({}, {})
-            for batch in batches():
-                part, share = self.loss(batch), len(batch) / samples
+            for batch, size in batches():
+                part, share = self.loss(batch, size), size / samples
                 (share * part.total()).backward()
                 terms = terms.plus(part, share)
+            if self.batches.share[1] > 1:
+                terms = add_up(terms, [x for group in self._trained for x in group])
             if not OPTIMIZERS[self.settings.optimizer["name"]].full_batch:
                 for group in self.optimizer.param_groups:
                     nn.utils.clip_grad_norm_(group["params"], self.settings.clip)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchid import ranks
 from torchid.errors import UnknownNameError
 from torchid.estimators import ConstrainedEstimate
 from torchid.fitting.fit import Fit, LogFitter, Solve
@@ -130,7 +131,9 @@ def fit_robustly(
         reweighting = Reweighting(current, by_log, max(scale, _TINY))
         before, done = fit, done + 1
         fit = fitter.fit(compress_parts(logs, builder, progress=progress, weight_rows=reweighting), solve)
-        converged = current == loss and _settled(fit, before, scale, reweighting.median_scale)
+        reweighting.gather()
+        settled = current == loss and _settled(fit, before, scale, reweighting.median_scale)
+        converged = ranks.as_first(settled, "convergence")
         scale = reweighting.median_scale
     summary = RobustSummary(
         loss=loss.kind,
@@ -168,9 +171,11 @@ def fit_extras_robustly(
         current = _loss_of_pass(loss, done)
         reweighting = Reweighting(current, {log.source: columns(values)}, max(scale, _TINY))
         before, values = values, solve(compress_parts([log], builder, weight_rows=reweighting))
+        reweighting.gather()
         steady = abs(reweighting.median_scale - scale) <= _STEADY * scale
         scale = reweighting.median_scale
-        if current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME):
+        settled = current == loss and steady and np.allclose(values, before, rtol=_SAME, atol=_SAME)
+        if ranks.as_first(settled, "convergence"):
             break
     return values
 
@@ -205,6 +210,12 @@ class Reweighting:
             self._histogram += counts
             self._sums += sums
         return rows * weight.sqrt()[:, None]
+
+    def gather(self) -> None:
+        """End the pass, where processes share the work: the statistics are those of all rows from now on."""
+        if ranks.world_size() > 1:
+            both = ranks.gather((self._histogram, self._sums), "residuals")
+            self._histogram, self._sums = (np.sum(parts, axis=0) for parts in zip(*both, strict=True))
 
     @property
     def median_scale(self) -> float:

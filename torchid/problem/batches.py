@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.contact_state import ContactState
 from torchid.problem.predict import predict_forces
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -63,7 +64,13 @@ class MiniBatches:
     """
 
     def __init__(
-        self, logs: Sequence[Samples], builder: RowBuilder, batch_size: int = 256, seed: int = 0, memory: int = _MEMORY
+        self,
+        logs: Sequence[Samples],
+        builder: RowBuilder,
+        batch_size: int = 256,
+        seed: int = 0,
+        memory: int = _MEMORY,
+        share: tuple[int, int] = (0, 1),
     ) -> None:
         """Assign the samples to chunks.
 
@@ -73,6 +80,8 @@ class MiniBatches:
             batch_size: samples per batch; the last of a chunk may hold fewer.
             seed: of all random orders.
             memory: bytes of rows to cache; the others are computed again in each epoch.
+            share: number of this process, and of all that share every batch: it takes every so-many-th sample of
+                a chunk, and batches hold what is in them of these.
         """
         if batch_size < 1:
             raise ValueError(f"batch_size: found {batch_size}; accepted: at least 1")
@@ -82,6 +91,7 @@ class MiniBatches:
         self.columns = torch.from_numpy(builder.columns.parameter_map).to(builder.device)
         self.samples = sum(map(len, logs))
         self._logs, self._memory = tuple(logs), memory
+        self.share = share
         self._starts = torch.tensor([0, *(len(log) for log in logs)]).cumsum(0).tolist()
         chunk = max(_CHUNK // batch_size, 1) * batch_size
         self._chunks = torch.randperm(self.samples, generator=self._generator(0)).split(chunk)
@@ -109,20 +119,29 @@ class MiniBatches:
 
     def like(self, *logs: Samples) -> MiniBatches:
         """Mini-batches of other samples, with the same settings."""
-        return MiniBatches(logs, self.builder, self.batch_size, self.seed, self._memory)
+        return MiniBatches(logs, self.builder, self.batch_size, self.seed, self._memory, self.share)
 
     def epoch(self, number: int) -> Iterator[Batch]:
         """All samples in the order of an epoch, numbered from 1."""
-        generator = self._generator(number)
+        return (batch for batch, _ in self.sized_epoch(number))
+
+    def sized_epoch(self, number: int) -> Iterator[tuple[Batch, int]]:
+        """As `epoch`, each batch with the number of samples that all processes together have in it."""
+        generator, (rank, size) = self._generator(number), self.share
         for chunk in torch.randperm(len(self._chunks), generator=generator).tolist():
             order = torch.randperm(len(self._chunks[chunk]), generator=generator)
             rows = self._rows(chunk)
             for part in order.to(rows.f.device).split(self.batch_size):
-                yield rows[part]
+                own = part if size == 1 else part[part % size == rank] // size
+                yield rows[own], len(part)
 
     def chunks(self) -> Iterator[Batch]:
         """All samples, chunk by chunk, always in the same order."""
-        return (self._rows(chunk) for chunk in range(len(self._chunks)))
+        return (batch for batch, _ in self.sized_chunks())
+
+    def sized_chunks(self) -> Iterator[tuple[Batch, int]]:
+        """As `chunks`, each with the number of samples that all processes together have in it."""
+        return ((self._rows(number), len(chunk)) for number, chunk in enumerate(self._chunks))
 
     @torch.no_grad()
     def generalized_forces(self, phi: Array) -> Iterator[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
@@ -150,12 +169,20 @@ class MiniBatches:
 
     @torch.no_grad()
     def _compute_rows(self, index: Tensor) -> Batch:
-        parts = []
+        """Rows of numbered samples, sorted by log and contact state; this share has every so-many-th of these."""
+        parts: list[Batch] = []
+        (rank, size), before = self.share, 0
         with one_thread():
             for log, start, end in zip(self._logs, self._starts, self._starts[1:], strict=False):
                 samples = log[index[(index >= start) & (index < end)] - start].to(self.builder.device)
                 for state, where in chunks_by_state(samples, len(index)):
                     chosen = samples[where]
-                    rows, W = self.builder.rows_by_sample(chosen, state)
-                    parts.append(Batch(rows[..., :-1], rows[..., -1], W, *chosen.coordinates()))
+                    own, before = chosen[(rank - before) % size :: size], before + len(chosen)
+                    if len(own) or not parts:  # of a chunk with fewer samples than processes at least the shapes
+                        parts.append(self._batch(own if len(own) else chosen[:1], state)[: len(own)])
         return Batch(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Batch)))
+
+    def _batch(self, samples: Samples, state: ContactState) -> Batch:
+        """Rows of samples that share a contact state."""
+        rows, W = self.builder.rows_by_sample(samples, state)
+        return Batch(rows[..., :-1], rows[..., -1], W, *samples.coordinates())

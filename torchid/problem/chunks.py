@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
+from itertools import chain
 from typing import TypeVar
 
 import numpy as np
 import torch
 from threadpoolctl import ThreadpoolController
 
+from torchid import ranks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
@@ -37,10 +39,12 @@ def map_chunks(
 ) -> list[Result]:
     """Results of `reduce` over the chunks of some logs, one per worker.
 
+    Processes that share their work (`torchid.ranks`) each take some successive chunks; all get the results of all.
+
     Args:
         logs: each is moved to the builder's device chunk by chunk.
         builder: whose layouts and device are used.
-        reduce: given an iterator over some of the chunks and their contact states.
+        reduce: given an iterator over some of the chunks and their contact states; what it returns pickles.
         chunk: samples per chunk.
         threads: workers, each with one intra-op thread (small arrays do not profit from more); by default one per
             intra-op thread torch would use, one if the builder is on a GPU.
@@ -49,7 +53,10 @@ def map_chunks(
     tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, chunk)]
     for _, state, _ in tasks:
         builder.layout(state)
-    lock = threading.Lock()
+    sizes = [_size(samples, index) for samples, _, index in tasks]
+    ranks.require_same(hash(tuple((size, state) for size, (_, state, _) in zip(sizes, tasks, strict=True))), "logs")
+    share = ranks.own_share(sizes)
+    report = None if progress is None else _ProgressOfAll(progress, sum(sizes), sum(sizes[share]))
 
     def pieces(
         part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]],
@@ -57,11 +64,35 @@ def map_chunks(
         for samples, state, index in part:
             piece = samples[index].to(builder.device)
             yield piece, state
-            if progress is not None:
-                with lock:
-                    progress(len(piece))
+            if report is not None:
+                report(len(piece))
 
-    return run_in_workers(tasks, lambda part: reduce(pieces(part)), threads or worker_count(builder.device))
+    results = run_in_workers(tasks[share], lambda part: reduce(pieces(part)), threads or worker_count(builder.device))
+    if report is not None:
+        report(0)
+    return list(chain.from_iterable(ranks.gather(results, "chunks")))
+
+
+class _ProgressOfAll:
+    """Reports samples as if all processes were as far as this one, to a callback that need not be thread-safe."""
+
+    def __init__(self, progress: ProgressCallback, total: int, own: int) -> None:
+        self._progress, self._total, self._own = progress, total, own
+        self._lock, self._done, self._reported = threading.Lock(), 0, 0
+
+    def __call__(self, samples: int) -> None:
+        """Add samples that this process has done; 0 at the end of the pass."""
+        with self._lock:
+            self._done += samples
+            reached = self._total * self._done // self._own if self._own else self._total
+            if reached > self._reported:
+                self._progress(reached - self._reported)
+                self._reported = reached
+
+
+def _size(samples: Samples, index: slice | torch.Tensor) -> int:
+    """Number of samples of a chunk."""
+    return len(range(*index.indices(len(samples)))) if isinstance(index, slice) else len(index)
 
 
 def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[ContactState, slice | torch.Tensor]]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid import parameters
+from torchid import parameters, ranks
 from torchid.parameters import Array
 from torchid.problem.chunks import CHUNK, ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
@@ -251,7 +251,8 @@ def fold_count(independent: float, states: int, builder: RowBuilder) -> int:
         builder: of the rows.
     """
     size = 8 * (builder.width + 1) ** 2 * max(states, 1) * worker_count(builder.device)
-    return max(1, min(FOLDS, int(independent / LEAST_PER_FOLD), _MEMORY // size))
+    count = max(1, min(FOLDS, int(independent / LEAST_PER_FOLD), _MEMORY // size))
+    return ranks.as_first(count, "folds")
 
 
 def lay_out_folds(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -128,6 +129,16 @@ class TriangularFactor:
     def blocks(self) -> Mapping[tuple[int, ...], Tensor]:
         """Rows (M, len(support) + 1) that stand for all that were added with the same columns, by these columns."""
         return self._blocks
+
+    def __getstate__(self) -> dict[str, object]:
+        """What another process gets: on the CPU, as it may have another device, and without the scratch memory."""
+        blocks = {support: block.cpu().numpy() for support, block in self._blocks.items()}
+        return vars(self) | {"_blocks": blocks, "_scratch": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what another process sent."""
+        blocks = {support: torch.from_numpy(block) for support, block in state["_blocks"].items()}
+        vars(self).update(state | {"_blocks": blocks})
 
     @property
     def oversampling(self) -> float:

@@ -1,0 +1,310 @@
+"""Runs whose samples several processes share, started by torchrun: the results of one process, and its manners."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from demo import shortened_demo
+from repository import DEMO
+from shared_work import (
+    TORCHRUN,
+    children,
+    differences,
+    finish,
+    is_running,
+    run_all,
+    started,
+    write_experiments,
+)
+
+import torchid
+from torchid import ranks
+from torchid.commands.training import CHECKPOINT
+from torchid.parameters import Array
+from torchid.problem.linear import parameter_scale
+
+TWO = (*TORCHRUN, "2")
+DESCENT = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.ridge=0.1")
+RUNS = {
+    "quadruped, consistent": ("quadruped", ("estimator.name=consistent",)),
+    "arm, robust": ("arm", ("estimator.robust=tukey",)),
+    "biped": ("biped", ()),
+    "quadruped, descent": ("quadruped", DESCENT),
+    "short": ("short", ()),
+    "short, descent": ("short", DESCENT),
+}
+BY_FOUR = ("arm, robust", "quadruped, descent", "short", "short, descent")
+MORE = {
+    "quadruped": ("quadruped", ()),
+    "arm, ridge": ("arm", ("estimator.ridge=auto",)),
+    "arm, consistent": ("arm", ("estimator.name=consistent",)),
+    "biped, robust": ("biped", ("estimator.robust=huber",)),
+    "biped, consistent": ("biped", ("estimator.name=consistent", "estimator.robust=tukey")),
+    "arm, penalties": ("arm", (*DESCENT, "estimator.consistency=penalties")),
+    "quadruped, line search": ("quadruped", (*DESCENT, "estimator.training.optimizer={name: LBFGS}")),
+}
+
+
+@pytest.fixture(scope="module")
+def experiments(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Three robots; and the quadruped with a log of three samples, fewer than processes."""
+    files = write_experiments(tmp_path_factory.mktemp("experiments"))
+    short = files["quadruped"].parent.with_name("short")
+    shutil.copytree(files["quadruped"].parent, short)
+    with np.load(short / "log0.npz") as log:
+        fields = {key: x if "names" in key else x[:3] for key, x in log.items()}
+    np.savez(short / "log0.npz", **fields)
+    return files | {"short": short / "experiment.yaml"}
+
+
+@pytest.fixture(scope="module")
+def runs(experiments: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    """Folders with the runs of one, two and four processes."""
+    folder, out = tmp_path_factory.mktemp("runs"), {}
+    for processes in (1, 2, 4):
+        chosen = [(name, *RUNS[name]) for name in (BY_FOUR if processes == 4 else RUNS)]
+        out[processes] = folder / str(processes)
+        run_all(processes, out[processes], [(name, experiments[robot], more) for name, robot, more in chosen])
+    return out
+
+
+def identified(run: Path) -> Array:
+    bodies = json.loads((run / "parameters.json").read_text())["bodies"]
+    return np.array([[*body["identified"].values()] for body in bodies])
+
+
+def in_scale(run: Path, other: Path, urdf: Path, bolted: bool) -> float:
+    """Largest difference of the parameters of two runs, in units of their scale."""
+    robot = torchid.load_robot(urdf, fixed_base=bolted)
+    return float(np.abs((identified(run) - identified(other)) / parameter_scale(robot.nominal)).max())
+
+
+def robot_of(experiment: Path) -> tuple[Path, bool]:
+    document = yaml.safe_load(experiment.read_text())["robot"]
+    return Path(document["urdf"]), document["fixed_base"]
+
+
+def assert_same(shared: Path, one: Path, experiment: Path, descends: bool) -> None:
+    """Up to rounding, which a descent lets grow: Adam divides gradients that are nearly zero by their size."""
+    assert in_scale(shared, one, *robot_of(experiment)) < (1e-9 if descends else 1e-12)
+    before, now = (json.loads((run / "metrics.json").read_text()) for run in (one, shared))
+    for group in ("train", "train_nominal", "cross_validation", "noise", "robust", "total_mass", "samples", "rows"):
+        for where, difference in differences(before[group], now[group], group):
+            assert difference < (1e-7 if descends else 1e-10), where
+
+
+@pytest.mark.parametrize(("processes", "name"), [(2, name) for name in RUNS] + [(4, name) for name in BY_FOUR])
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_processes_together_find_what_one_finds(
+    runs: dict[int, Path], experiments: dict[str, Path], processes: int, name: str
+) -> None:
+    assert_same(runs[processes] / name, runs[1] / name, experiments[RUNS[name][0]], "descent" in name)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_processes_together_find_what_one_finds_with_other_settings(
+    experiments: dict[str, Path], tmp_path: Path
+) -> None:
+    chosen = [(name, experiments[robot], more) for name, (robot, more) in MORE.items()]
+    for processes in (1, 2, 3):
+        run_all(processes, tmp_path / str(processes), chosen)
+    for name, file, more in chosen:
+        for processes in ("2", "3"):
+            assert_same(tmp_path / processes / name, tmp_path / "1" / name, file, "estimator.name=sgd" in more)
+
+
+def test_the_same_number_of_processes_gives_the_same_bits(
+    runs: dict[int, Path], experiments: dict[str, Path], tmp_path: Path
+) -> None:
+    names = ("arm, robust", "quadruped, descent")
+    run_all(2, tmp_path / "again", [(name, experiments[RUNS[name][0]], RUNS[name][1]) for name in names])
+    for name in names:
+        assert (tmp_path / "again" / name / "parameters.json").read_bytes() == (
+            runs[2] / name / "parameters.json"
+        ).read_bytes()
+
+
+@pytest.mark.parametrize(("sizes", "size"), [([5] * 7, 3), ([1, 9, 1, 9], 2), ([3], 4), ([], 2), ([2048] * 9 + [3], 4)])
+def test_every_piece_has_one_owner_and_shares_are_even(
+    monkeypatch: pytest.MonkeyPatch, sizes: list[int], size: int
+) -> None:
+    shares = []
+    for rank in range(size):
+        monkeypatch.setattr(ranks, "_sharing", ranks._Ranks(None, rank, size))
+        shares.append(ranks.own_share(sizes))
+    numbers = range(len(sizes))
+    assert [number for share in shares for number in numbers[share]] == list(numbers)
+    assert all(abs(sum(sizes[share]) - sum(sizes) / size) <= max(sizes, default=0) for share in shares)
+
+
+def lines_of_torchid(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line.startswith("torchid: ") and "Warning" not in line]
+
+
+def test_a_mistake_that_all_see_is_told_once(tmp_path: Path) -> None:
+    command = (*TWO, "-m", "torchid", "identify", str(DEMO / "quadruped.yaml"), f"output={tmp_path / 'run'}")
+    status, printed, complained = finish((*command, "estimator.rigde=3"))
+    assert status != 0
+    assert not printed
+    (line,) = lines_of_torchid(complained)
+    assert line.endswith("estimator: unknown name 'rigde'; accepted: ridge")
+    assert "torchid/" not in complained.replace(line, ""), "a traceback"
+    assert "exitcode  : 2" in complained
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def two_machines(tmp_path: Path) -> tuple[list[str], Path, Path]:
+    """A command whose two processes work in folders of their own, as machines without a common disk do."""
+    folders = [tmp_path / f"machine{number}" for number in range(2)]
+    for folder in folders:
+        shortened_demo(folder, 300)
+    call = f"cd {tmp_path}/machine$LOCAL_RANK && exec {sys.executable} -m torchid identify quadruped.yaml"
+    return [*TWO, "--no-python", "bash", "-c", call], *folders
+
+
+def test_machines_need_no_common_disk(two_machines: tuple[list[str], Path, Path]) -> None:
+    command, first, second = two_machines
+    status, printed, complained = finish(command)
+    assert status == 0, complained
+    assert printed.count("written to") == 1
+    assert (first / "runs/quadruped/parameters.json").is_file()
+    assert not (second / "runs").exists()
+
+
+def test_a_mistake_that_one_process_meets_ends_all_at_once(two_machines: tuple[list[str], Path, Path]) -> None:
+    command, first, second = two_machines
+    (second / "sway_train.npz").unlink()
+    begin = time.monotonic()
+    status, _, complained = finish(command)
+    assert status != 0
+    assert time.monotonic() - begin < 60.0
+    (line,) = lines_of_torchid(complained)
+    assert "sway_train.npz" in line
+    assert not (first / "runs").exists()
+
+
+def test_machines_with_other_logs_are_told_apart(two_machines: tuple[list[str], Path, Path]) -> None:
+    command, _, second = two_machines
+    with np.load(second / "sway_train.npz") as log:
+        fields = {key: x if "names" in key else x[:-7] for key, x in log.items()}
+    np.savez(second / "sway_train.npz", **fields)
+    status, _, complained = finish(command)
+    assert status != 0
+    (line,) = lines_of_torchid(complained)
+    assert (
+        line == "torchid: logs: not the same in all processes; accepted: the same files and settings on every machine"
+    )
+
+
+def test_other_commands_run_once(tmp_path: Path) -> None:
+    for arguments, text in (
+        (["convert", str(DEMO / "sway_test.npz"), str(tmp_path / "log.h5")], "written to"),
+        (["--version"], f"torchid {torchid.__version__}"),
+    ):
+        status, printed, complained = finish((*TWO, "-m", "--", "torchid", *arguments))
+        assert status == 0, complained
+        assert printed.count(text) == 1
+
+
+def test_an_evaluation_is_that_of_one_process(
+    runs: dict[int, Path], experiments: dict[str, Path], tmp_path: Path
+) -> None:
+    log, documents = experiments["biped"].parent / "log1.npz", []
+    for name, before in (("one", (sys.executable, "-m")), ("two", (*TWO, "-m", "--"))):
+        shutil.copytree(runs[1] / "biped", tmp_path / name)
+        status, _, complained = finish((*before, "torchid", "evaluate", str(tmp_path / name), "--log", str(log)))
+        assert status == 0, complained
+        documents.append(json.loads((tmp_path / name / "evaluation/log1/metrics.json").read_text()))
+    for where, difference in differences(*documents):
+        assert difference < 1e-10, where
+
+
+def test_an_analysis_is_that_of_one_process(experiments: dict[str, Path], tmp_path: Path) -> None:
+    documents = []
+    for name, before in (("one", (sys.executable, "-m")), ("two", (*TWO, "-m"))):
+        output = tmp_path / name
+        status, printed, complained = finish(
+            (*before, "torchid", "analyze", str(experiments["arm"]), f"output={output}")
+        )
+        assert status == 0, complained
+        assert printed.count("Scenario logs") == 1
+        documents.append(json.loads((tmp_path / f"{name}.analysis/analysis.json").read_text()))
+    for where, difference in differences(documents[0]["accuracy"], documents[1]["accuracy"]):
+        assert difference < 1e-10, where
+
+
+# ------------------------------------------------------------------------------------------------ processes that end
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], bytes, float]:
+    """A command without its output, the parameters that it finds, and how long that takes [s]."""
+    folder = shortened_demo(tmp_path_factory.mktemp("killed") / "demo", 500)
+    command = [*TWO, "-m", "torchid", "identify", str(folder / "quadruped.yaml")]
+    begin = time.monotonic()
+    status, _, complained = finish([*command, f"output={folder / 'run'}"])
+    assert status == 0, complained
+    return command, (folder / "run/parameters.json").read_bytes(), time.monotonic() - begin
+
+
+def killed_after(seconds: float, command: list[str], victim: int) -> int:
+    """Exit status of a command of which one process was killed, all others having ended."""
+    with started(command) as process:
+        time.sleep(seconds)
+        workers = children(process)
+        if victim < len(workers):
+            os.kill(workers[victim], signal.SIGKILL)
+        process.communicate(timeout=60)
+    assert not any(is_running(pid) for pid in workers)
+    return process.returncode
+
+
+def assert_nothing_or_whole(output: Path, parameters: bytes, status: int) -> None:
+    assert not output.exists() or (output / "parameters.json").read_bytes() == parameters
+    assert output.exists() or status != 0
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))]
+)  # fmt: skip
+def test_a_killed_process_ends_all_and_leaves_nothing_or_all(
+    whole: tuple[list[str], bytes, float], tmp_path: Path, seed: int
+) -> None:
+    command, parameters, seconds = whole
+    drawn, output = random.Random(seed), tmp_path / "runs" / "run"
+    status = killed_after(seconds * drawn.uniform(0.3, 1.0), [*command, f"output={output}"], drawn.randrange(2))
+    assert_nothing_or_whole(output, parameters, status)
+    status, _, complained = finish([*command, f"output={output}", "overwrite=true"])
+    assert status == 0, complained
+    assert (output / "parameters.json").read_bytes() == parameters
+    assert [path.name for path in output.parent.iterdir()] == ["run"]
+
+
+def test_torchrun_starts_again_where_a_training_was(runs: dict[int, Path], experiments: dict[str, Path]) -> None:
+    """As `--resume`: the same bits as without the interruption."""
+    folder: Path = runs[2].parent / "again"
+    more = [*DESCENT, "estimator.training.checkpoint_seconds=0", f"output={folder / 'run'}"]
+    command = [*TWO, "--max-restarts", "1", "-m", "torchid", "identify", str(experiments["quadruped"]), *more]
+    with started(command) as process:
+        until, workers = time.monotonic() + 60.0, []
+        while time.monotonic() < until and not (folder / "run.training" / CHECKPOINT).is_file():
+            time.sleep(0.01)
+            workers = children(process)
+        os.kill(workers[1], signal.SIGKILL)
+        _, complained = process.communicate(timeout=60)
+    assert process.returncode == 0, complained
+    expected = json.loads((runs[2] / "quadruped, descent" / "parameters.json").read_text())
+    assert json.loads((folder / "run/parameters.json").read_text()) == expected
+    assert [path.name for path in folder.iterdir()] == ["run"]

@@ -1,0 +1,173 @@
+"""Experiments of three robots for processes that share the work, and the commands that start these.
+
+As a script: runs experiments one after the other, as one process or as each of those that torchrun has started.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node")
+RANDOM = {"noise": {"joint_torque": 0.1, "contact_force": 0.5, "contact_moment": 0.05}}
+
+
+def write_experiments(folder: Path) -> dict[str, Path]:
+    """Experiment files of a quadruped, a bolted arm and a biped with offsets of its own in each of two logs.
+
+    The arm's log has folds of more than one chunk, so that processes share them; the biped's are short.
+    """
+    from synthetic import PANDA, Oracle, load, make_log
+
+    from torchid.logs import write_log
+
+    demo = ROOT / "torchid" / "demo"
+    feet = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
+    walks = [[True] * 4, [True, False, False, True], [False, True, True, False]]
+    robots: dict[str, Any] = {
+        "quadruped": (demo / "quadruped.urdf", False, [(foot, 3) for foot in feet], walks, [2500], "joints"),
+        "arm": (PANDA, True, [], [[]], [10800], "joints"),
+        "biped": (
+            demo / "biped.urdf",
+            False,
+            [("l_sole", 6), ("r_sole", 6)],
+            [[True, True], [True, False], [False, True]],
+            [900, 700],
+            {"set": "full", "offsets": {"contact_force": "log", "contact_moment": "log"}},
+        ),
+    }
+    out = {}
+    for name, (urdf, bolted, contacts, states, counts, sensors) in robots.items():
+        (folder / name).mkdir(parents=True)
+        rng = np.random.default_rng(3)
+        oracle = Oracle.of(load(urdf, None, bolted))
+        oracle.perturb(rng, 0.1)
+        files = []
+        for number, count in enumerate(counts):
+            log = make_log(oracle, contacts, states, count, rng, tilt=None if bolted else 0.2)
+            assert log.joint_torque is not None
+            changed: dict[str, Any] = {"joint_torque": log.joint_torque + 0.1 * rng.normal(size=log.joint_torque.shape)}
+            changed["joint_torque"][::50, 0] += 20.0  # for robust losses
+            if contacts and log.contact_wrench_local is not None:
+                bias = rng.normal(size=log.contact_wrench_local.shape[1:])
+                changed["contact_wrench_local"] = log.contact_wrench_local + bias
+            files.append(f"log{number}.npz")
+            write_log(replace(log, **changed), folder / name / files[-1])
+        document = {
+            "robot": {"urdf": str(urdf), "fixed_base": bolted},
+            "contacts": [{"frame": frame, "type": "point" if size == 3 else "flat"} for frame, size in contacts],
+            "logs": {"train": files},
+            "sensors": (sensors if isinstance(sensors, dict) else {"set": sensors}) | RANDOM,
+            "estimator": {"name": "least_squares", "ridge": 1e-3},
+            "output": str(folder / name / "run"),
+        }
+        out[name] = folder / name / "experiment.yaml"
+        out[name].write_text(yaml.safe_dump(document))
+    return out
+
+
+@contextmanager
+def started(command: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
+    """A command with one thread a process, its output kept; whatever it has started ends with the block."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "helpers")])
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(
+        [*command], env=environment, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        for group in (*children(process), process.pid):  # torchrun gives each of them a session of its own
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(group, signal.SIGKILL)
+        with suppress(ValueError):  # both streams are read already
+            process.communicate()
+
+
+def children(process: subprocess.Popen[str]) -> list[int]:
+    """The processes that a process has started."""
+    with suppress(OSError):
+        return [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+    return []
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process has not ended."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in "ZX"
+
+
+def finish(command: Sequence[str]) -> tuple[int, str, str]:
+    """Exit status, standard output and standard error of a command."""
+    with started(command) as process:
+        printed, complained = process.communicate(timeout=200)
+    return process.returncode, printed, complained
+
+
+def run_all(processes: int, folder: Path, runs: Sequence[tuple[str, Path, Sequence[str]]]) -> None:
+    """Run experiments by name, file and overrides in some processes; each writes the folder of its name."""
+    jobs = folder / "jobs.json"
+    folder.mkdir(parents=True)
+    jobs.write_text(json.dumps([[name, str(file), [*more]] for name, file, more in runs]))
+    before = (sys.executable,) if processes == 1 else (*TORCHRUN, str(processes))
+    status, _, complained = finish((*before, __file__, str(jobs)))
+    assert status == 0, complained
+
+
+def differences(one: Any, other: Any, path: str = "") -> Iterator[tuple[str, float]]:
+    """Relative differences of all numbers of two documents, by place; infinite where anything else differs."""
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        for key in one.keys() - {"seconds"}:
+            yield from differences(one[key], other[key], f"{path}.{key}")
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        for number, (x, y) in enumerate(zip(one, other, strict=True)):
+            yield from differences(x, y, f"{path}.{number}")
+    elif isinstance(one, float) and isinstance(other, float):
+        yield path, abs(one - other) / max(abs(one), abs(other), 1e-300)
+    else:
+        yield path, 0.0 if one == other else float("inf")
+
+
+def _main() -> None:
+    import torch.distributed as dist  # noqa: TID251
+    from matplotlib.figure import Figure
+    from trainings import FIGURES
+
+    from torchid.commands import results
+    from torchid.commands.identify import identify
+    from torchid.config import load_config
+    from torchid.ranks import share_work
+
+    warnings.simplefilter("ignore")
+    for figure in FIGURES:  # which take most of the time
+        setattr(results, figure, lambda *_: Figure(figsize=(1.0, 1.0)))
+    if "RANK" in os.environ:
+        dist.init_process_group("gloo")
+    jobs = Path(sys.argv[1])
+    for name, file, more in json.loads(jobs.read_text()):
+        with share_work():
+            identify(load_config(file, [*more, f"output={jobs.parent / name}"]))
+    sys.stdout.flush()
+    os._exit(0)  # see torchid.ranks.leave_launched
+
+
+if __name__ == "__main__":
+    _main()

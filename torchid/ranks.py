@@ -1,0 +1,336 @@
+"""Processes that share the work of one run through torch.distributed (the only module that imports it).
+
+All of them run the same program on the same files, and exchange what each has reduced its share of the samples to.
+There is one kind of exchange, in which every process hands over a value or the error that ends it: a failure of one
+reaches the others at their next exchange, whatever that is about.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import secrets
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from torchid.errors import InputError, TorchidError
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup
+
+T = TypeVar("T")
+
+_LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # torchrun sets them
+#: For one exchange: processes wait for the slowest. Failures are told, and the death of a process ends its connections.
+_PATIENCE = timedelta(days=1)
+_POLL = 0.01  # [s]
+_FAILED, _END, _STATUS = "failed", "end", "status"
+
+
+class LostRankError(TorchidError):
+    """Another process that shares the work has ended without a word."""
+
+
+class ConnectionFailedError(TorchidError):
+    """The processes that torchrun has started do not reach each other."""
+
+
+class _RemoteError(Exception):
+    """Where another process failed, as the cause of the error that it sent."""
+
+
+class _Ranks:
+    """The processes of a group; `failed` once one has told of an error, `lost` once one has gone."""
+
+    def __init__(self, group: ProcessGroup | None, rank: int, size: int) -> None:
+        self.group, self.rank, self.size = group, rank, size
+        self.failed = self.lost = False
+
+    def exchange(self, about: str, value: object) -> list[Any]:
+        """The values of all processes, in their order.
+
+        Args:
+            about: what the value is, the same in all processes.
+            value: anything that pickles.
+
+        Raises:
+            LostRankError: a process has gone.
+            Exception: the error of a process that failed.
+        """
+        if self.size == 1:
+            return [value]
+        if self.failed or self.lost:
+            raise LostRankError("the processes of this run have parted; nothing more can be shared")
+        import torch.distributed as dist
+
+        out: list[Any] = [None] * self.size
+        try:
+            dist.all_gather_object(out, (about, value), group=self.group)
+        except RuntimeError as error:  # of the connection
+            self.lost = True
+            message = f"process {self.rank} of {self.size}: another process of this run has ended"
+            raise LostRankError(f"{message}; nothing more can be shared") from error
+        errors = [sent for what, sent in out if what == _FAILED]
+        if errors:
+            self.failed = True
+            if about == _FAILED:
+                return []
+            raise _received(*errors[0])
+        if any(what != about for what, _ in out):
+            self.lost = True
+            raise RuntimeError(f"processes differ in what they do: {', '.join(str(what) for what, _ in out)}")
+        return [sent for _, sent in out]
+
+    def tell(self, error: Exception) -> None:
+        """Send an error to all others, unless they know of it."""
+        with suppress(LostRankError):
+            if not (self.failed or self.lost):
+                self.exchange(_FAILED, _portable(error))
+
+
+_ALONE = _Ranks(None, 0, 1)
+_launched: _Ranks | None = None  # this process's group, if the command line has made it
+_sharing: _Ranks | None = None  # the processes that share the work now
+
+
+def rank() -> int:
+    """Number of this process among those that share the work, from 0."""
+    return 0 if _sharing is None else _sharing.rank
+
+
+def world_size() -> int:
+    """Number of processes that share the work, 1 outside of `share_work`."""
+    return 1 if _sharing is None else _sharing.size
+
+
+def is_first() -> bool:
+    """Whether this process is the one that writes and prints."""
+    return rank() == 0
+
+
+def gather(value: T, about: str) -> list[T]:
+    """The values of all processes, in their order, the same in each of them.
+
+    Args:
+        value: of this process; anything that pickles.
+        about: what it is, for the message if processes disagree.
+
+    Raises:
+        LostRankError: a process has ended.
+        Exception: whatever ended another process.
+    """
+    return [value] if _sharing is None else _sharing.exchange(about, value)
+
+
+def from_first(compute: Callable[[], T], about: str) -> T:
+    """What a function returns in the first process, which alone calls it; all get its value, or its error.
+
+    Args:
+        compute: whose passes over samples that process makes alone.
+        about: as for `gather`.
+
+    Raises:
+        Exception: what `compute` raises.
+    """
+    global _sharing
+    if _sharing is None:
+        return compute()
+    together, value = _sharing, None
+    if together.rank == 0:
+        _sharing = _ALONE
+        try:
+            value = compute()
+        finally:
+            _sharing = together
+    out: T = together.exchange(about, value)[0]
+    return out
+
+
+def as_first(value: T, about: str) -> T:
+    """The value of the first process, for decisions that rounding could turn on another machine.
+
+    Args:
+        value: that of this process.
+        about: as for `gather`.
+    """
+    return gather(value, about)[0]
+
+
+def require_same(value: object, about: str) -> None:
+    """Make sure that all processes have the same, before they share work on it.
+
+    Raises:
+        InputError: they have not.
+    """
+    if any(other != value for other in gather(value, about)):
+        raise InputError("", about, "not the same in all processes", "the same files and settings on every machine")
+
+
+def own_share(sizes: Sequence[int]) -> slice:
+    """The successive pieces, of these sizes, that this process works on; those of all processes are about equal.
+
+    Successive, as pieces of one log and contact state reduce to one result.
+    """
+    total, ends = max(sum(sizes), 1), list(accumulate(sizes))
+    owners = [
+        min(int(world_size() * (end - size / 2) / total), world_size() - 1)
+        for size, end in zip(sizes, ends, strict=True)
+    ]
+    return slice(owners.index(rank()), len(owners) - owners[::-1].index(rank())) if rank() in owners else slice(0)
+
+
+@contextmanager
+def share_work() -> Iterator[None]:
+    """Share passes over samples among the processes of the initialised `torch.distributed` group within the block.
+
+    Every process of the group enters the block and calls the same functions with the same arguments; each gets the
+    same results. Outside of the block nothing is shared, so that processes may call torchid on their own::
+
+        torch.distributed.init_process_group("gloo")
+        with torchid.share_work():
+            parts = torchid.compress_parts(logs, builder)
+
+    Without a group, or inside of another such block, the block is as any.
+
+    Raises:
+        LostRankError: another process has ended.
+        Exception: whatever ends the block of another process.
+    """
+    global _sharing
+    if _sharing is not None:
+        yield
+        return
+    with _group_of_cpus() as together:
+        _sharing = together
+        try:
+            yield
+            together.exchange(_END, None)
+        except Exception as error:
+            together.tell(error)
+            raise
+        except BaseException:  # an interrupt: others learn of it from the end of this process, not in some minutes
+            together.lost = True
+            raise
+        finally:
+            _sharing = None
+
+
+def is_launched_first() -> bool:
+    """Whether this process is the first of those that torchrun has started, or the only one."""
+    return _launched is None or _launched.rank == 0
+
+
+def join_launched() -> bool:
+    """Join the processes that torchrun has started, if it has started this one, which then ends in `leave_launched`.
+
+    On machines with GPUs, `cuda` is a GPU of its own for each process of the machine, as far as there are some.
+
+    Raises:
+        ConnectionFailedError: they do not reach each other.
+    """
+    global _launched
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or not all(name in os.environ for name in _LAUNCHED):
+        return False
+    import torch
+    import torch.distributed as dist
+
+    if dist.is_initialized():  # by whoever calls the command line
+        return False
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+    from torch.distributed.rendezvous import rendezvous
+
+    try:
+        store, rank, size = next(rendezvous("env://", timeout=_PATIENCE))
+        own = dist.PrefixStore(_name_of_attempt(store, rank, size), store)  # type: ignore[attr-defined]
+        dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=_PATIENCE)
+    except (RuntimeError, ValueError) as error:
+        raise ConnectionFailedError(f"the processes of this run do not reach each other ({error})") from error
+    _launched = _Ranks(dist.group.WORLD, rank, size)
+    return True
+
+
+def _name_of_attempt(store: Any, rank: int, size: int) -> str:
+    """A name that the processes of this attempt have in common, and no attempt before.
+
+    torchrun starts processes again beside the store of the attempt before (torch 2.13), where they would wait at the
+    addresses of dead ones. What others have left is told from what they write now by answers to names just drawn.
+    """
+    drawn, place = secrets.token_hex(8), "torchid/{}".format
+    if rank:
+        store.set(place(rank), drawn)
+        name: str = store.get(place(drawn)).decode()  # waits for it
+        store.set(place(f"{name}/{rank}"), "")
+        return name
+    missing = set(range(1, size))
+    while missing:
+        for other in tuple(missing):
+            if store.check([place(other)]):
+                store.set(place(store.get(place(other)).decode()), drawn)
+            if store.check([place(f"{drawn}/{other}")]):
+                missing.remove(other)
+        time.sleep(_POLL)
+    return drawn
+
+
+def leave_launched(status: int) -> int:
+    """End this process, with the exit status of the first one, which has printed before any other ends.
+
+    At once: Gloo's threads now and then abort a process that ends in order (one in some dozens, torch 2.13).
+    """
+    if _launched is not None and not _launched.lost:
+        _launched.failed = False  # all know
+        with suppress(LostRankError):
+            statuses = _launched.exchange(_STATUS, status)
+            status = statuses[0] or max(statuses)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status)
+
+
+def is_restart() -> bool:
+    """Whether torchrun runs the processes again after one of them had ended (`--max-restarts`)."""
+    return os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
+
+
+@contextmanager
+def _group_of_cpus() -> Iterator[_Ranks]:
+    """The processes of torch's default group, with connections between their CPUs."""
+    import torch.distributed as dist
+
+    if _launched is not None:
+        yield _launched
+    elif not dist.is_available() or not dist.is_initialized() or dist.get_world_size() == 1:
+        yield _ALONE
+    elif dist.get_backend() == "gloo":
+        yield _Ranks(dist.group.WORLD, dist.get_rank(), dist.get_world_size())
+    else:
+        group = dist.new_group(backend="gloo", timeout=_PATIENCE)
+        try:
+            yield _Ranks(group, dist.get_rank(), dist.get_world_size())
+        finally:
+            dist.destroy_process_group(group)
+
+
+def _portable(error: Exception) -> tuple[bytes, str]:
+    """An error as another process can read it, and where it came up."""
+    where = "".join(traceback.format_exception(error))
+    try:
+        data = pickle.dumps(error)
+        pickle.loads(data)
+    except Exception:  # noqa: B902 - an error may refuse either as it likes
+        data = pickle.dumps(RuntimeError(f"{type(error).__name__}: {error}"))
+    return data, where
+
+
+def _received(data: bytes, where: str) -> Exception:
+    error: Exception = pickle.loads(data)
+    error.__cause__ = _RemoteError(f"\n{where}")
+    return error
