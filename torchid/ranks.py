@@ -90,7 +90,7 @@ class _Ranks:
     def tell(self, error: Exception) -> None:
         """Send an error to all others, unless they know of it."""
         with suppress(LostRankError):
-            if not (self.failed or self.lost):
+            if self.size > 1 and not (self.failed or self.lost):
                 self.exchange(_FAILED, _portable(error))
 
 

@@ -160,7 +160,7 @@ def test_a_mistake_that_all_see_is_told_once(tmp_path: Path) -> None:
     assert not printed
     (line,) = lines_of_torchid(complained)
     assert line.endswith("estimator: unknown name 'rigde'; accepted: ridge")
-    assert "torchid/" not in complained.replace(line, ""), "a traceback"
+    assert "torchid/commands" not in complained, "a traceback"
     assert "exitcode  : 2" in complained
     assert list(tmp_path.iterdir()) == []
 

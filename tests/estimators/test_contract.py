@@ -254,6 +254,15 @@ class RowBatches:
         K, f = torch.from_numpy(problem.A)[:, None], torch.from_numpy(problem.b)[:, None]
         still = torch.zeros(rows, 0, dtype=torch.float64)
         self._all = Batch(K, f, torch.ones(rows, 1, 1, dtype=torch.float64), still, still, still)
+        self.share = (0, 1)
+
+    def sized_chunks(self) -> Iterator[tuple[Batch, int]]:
+        """As `chunks`, with the number of samples."""
+        return ((batch, len(batch)) for batch in self.chunks())
+
+    def sized_epoch(self, number: int) -> Iterator[tuple[Batch, int]]:
+        """As `epoch`, with the number of samples."""
+        return ((batch, len(batch)) for batch in self.epoch(number))
 
     def chunks(self) -> Iterator[Batch]:
         """All samples, chunk by chunk."""

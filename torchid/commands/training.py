@@ -137,7 +137,7 @@ class Training:
             raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors or contacts")
         state = ranks.from_first(partial(self._prepare, trainer, resume), "checkpoint")
         if state is not None:
-            with refusing_damage(self.folder):
+            if not ranks.is_first():
                 trainer.load_state_dict(state)
             self._saved = trainer.epoch
         bar = bars.add_task("training", total=self.settings.epochs, completed=trainer.epoch)
@@ -202,6 +202,7 @@ class Training:
             state = load_checkpoint(self.folder)
             with refusing_damage(self.folder):
                 self._check(state, trainer)
+                trainer.load_state_dict(state["trainer"])
             before = read_manifest(self.folder) or Manifest(TRAINING.name, self.folder.name, {})
             replace(before, growing=(*before.growing, *_growing())).write(self.folder)
             found: dict[str, Any] = state["trainer"]
