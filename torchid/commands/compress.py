@@ -1,4 +1,4 @@
-"""`torchid compress`: from the logs of an experiment to a small file of factors each; and reading these for a fit."""
+"""`torchid compress`: from the logs of an experiment to a small file of factors each."""
 
 from __future__ import annotations
 
@@ -12,20 +12,16 @@ from torchid.commands.folder import COMPRESSED, check_free, new_folder
 from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import LogReader
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import ConfigError, LogError, during, excerpt
-from torchid.fitting.experiment import Experiment, set_up, stated_noise, with_noise
-from torchid.fitting.factor_files import FactorFile, read_factors, write_factors
-from torchid.fitting.noise import GroupNoise, NoiseSummary
-from torchid.fitting.row_model import RowModel, require_same_noise, require_same_rows
+from torchid.errors import ConfigError, during, excerpt
+from torchid.fitting.experiment import Experiment, set_up, with_noise
+from torchid.fitting.factor_files import FactorFile, write_factors
+from torchid.fitting.fleet import row_model
+from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports, require_base, state_reports
 from torchid.logs.containers import FACTORS, list_bag_files
-from torchid.problem import RowBuilder, Samples
+from torchid.problem import Samples
 from torchid.problem.compressed_log import compress_log
-from torchid.problem.noise import noise_of_groups, std_by_group
 from torchid.report.tables import progress_bars
-
-_THE_EXPERIMENT = "the experiment file"
-_APART = ("exclude_condemned", "memory_gb")  # keys of preprocessing that do not change what a row is
 
 
 @dataclass(frozen=True)
@@ -133,75 +129,3 @@ def _write(path: Path, factors: FactorFile) -> CompressedFile:
     write_factors(path, factors)
     log = factors.log
     return CompressedFile(path.name, path.stat().st_size, len(log), log.rows, len(log.by_state))
-
-
-def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:
-    """What the rows of an experiment are formed with."""
-    settings = vars(experiment.config.preprocessing)
-    return RowModel.of(experiment.robot, builder, {name: x for name, x in settings.items() if name not in _APART})
-
-
-# ------------------------------------------------------------------------------------------------------ fits of factors
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """Compressed training logs of one fit, that belong together.
-
-    Attributes:
-        experiment: with the noise that they were weighed with.
-        files: the logs.
-        noise: that they were weighed with, as if it had been stated.
-        states: their contact states.
-    """
-
-    experiment: Experiment
-    files: list[FactorFile]
-    noise: NoiseSummary
-    states: list[StateReport]
-
-
-def read_fleet(experiment: Experiment, bars: Progress) -> Fleet:
-    """Read the compressed training logs of an experiment.
-
-    Raises:
-        LogError: a file that is damaged, or does not belong to the experiment or to the others.
-        ConfigError: the experiment states other noise.
-    """
-    paths = experiment.config.logs.train
-    reading = bars.add_task("reading factors", total=len(paths))
-    model = row_model(experiment, experiment.builder(experiment.sensors))
-    files: list[FactorFile] = []
-    for path in paths:
-        one = read_factors(path)
-        require_same_rows(path, one.model, model, _THE_EXPERIMENT)
-        files.append(one)
-        require_same_noise(path, one.model, files[0].model, paths[0])
-        bars.advance(reading)
-    _require_different_logs(paths, files)
-    _require_stated_noise(experiment, files[0].model, paths[0])
-    groups = files[0].model.noise
-    noise = noise_of_groups(std_by_group(experiment.noise) | groups)
-    listed = [GroupNoise(name, "N" if "force" in name else "N m", "stated", x, None) for name, x in groups.items()]
-    summary = NoiseSummary(noise, listed, {}, 0)
-    return Fleet(with_noise(experiment, summary), files, summary, merge_state_reports(one.states for one in files))
-
-
-def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) -> None:
-    seen: dict[str, Path] = {}
-    for path, one in zip(paths, files, strict=True):
-        if one.sha256 and one.sha256 in seen:
-            found = f"of the same log as {seen[one.sha256]} ({excerpt(one.name)})"
-            raise LogError(path, "sha256", found, "factors of every log once")
-        seen[one.sha256] = path
-
-
-def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -> None:
-    """Refuse an experiment that states other noise than factors were weighed with."""
-    used, stated = model.noise, std_by_group(experiment.noise)
-    for key in stated_noise(experiment.config.sensors.noise):
-        groups = [name for name in used if name.partition(".")[0] == key]
-        if any(abs(used[name] - stated[name]) > 1e-9 * used[name] for name in groups):
-            own, theirs = (", ".join(f"{x[name]:g}" for name in groups) for x in (stated, used))
-            accepted = f"{theirs}, or no such key, or the logs compressed with another"
-            raise ConfigError.at_field(f"sensors.noise.{key}", f"{own}, but {theirs} in {path}", accepted)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,44 +44,25 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
         InputError: the folder is no run, or a log does not fit its robot.
     """
     folder = Path(run)
-    if not (folder / "config.yaml").is_file():
-        raise ConfigError(folder, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
-    names = [Path(log).stem for log in logs]
-    again = [name for name in names if names.count(name) > 1]
-    if again:
-        raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
-    output = folder / RUN.inner_folder / names[0]
-
-    def check_output() -> None:
-        refuse_link(output.parent)
-        check_free(output, True, EVALUATION, logs)
-
-    ranks.from_first(check_output, "output")
+    output = _output(folder, logs)
     config = load_config(folder / "config.yaml", [f"device={device}"] if device else [])
     with progress_bars() as bars:
         with about_file(folder / "config.yaml"):
             experiment = set_up(config)
-        builder = experiment.builder(experiment.sensors)
+        builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
         compared = _calibrations(experiment, builder, folder / "parameters.json")
         reading = bars.add_task("reading logs", total=len(logs))
         reader = LogReader(experiment, folder)
         samples = reader.read([Path(log) for log in logs], None, lambda _: bars.advance(reading))
-        evaluation = experiment.evaluation()
-        scorer = Scorer(evaluation, builder)
         evaluating = bars.add_task("evaluating", total=sum(map(len, samples)))
+        scorer = Scorer(evaluation, builder)
         metrics = {}
         for log in samples:
             pair = scorer.score_logs([log], compared, lambda n: bars.advance(evaluating, n))
             metrics[Path(log.source).stem] = pair
             if not any(x is not None for x in pair.identified.rms.values()):
-                message = f"{log.source}: neither joint torques nor contact wrenches to compare predictions with"
-                warn(message)
-        document: dict[str, dict[str, object]] = {
-            name: {"identified": pair.identified.as_dict(), "nominal": pair.nominal.as_dict()}
-            for name, pair in metrics.items()
-        }
-        for path, count in reader.excluded.items():
-            document[Path(path).stem]["excluded_samples"] = count
+                warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
+        document = _document(metrics, reader.excluded)
 
         def write() -> None:
             with during("writing", output), new_folder(output, True, EVALUATION) as new:
@@ -92,6 +73,39 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
 
         ranks.from_first(write, "evaluation folder")
     return EvaluatedRun(metrics, output)
+
+
+def _output(run: Path, logs: Sequence[str | Path]) -> Path:
+    """The folder of an evaluation of some logs.
+
+    Raises:
+        ConfigError: the folder is no run, two logs have one name, or something else stands where results go.
+    """
+    if not (run / "config.yaml").is_file():
+        raise ConfigError(run, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
+    names = [Path(log).stem for log in logs]
+    again = [name for name in names if names.count(name) > 1]
+    if again:
+        raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
+    output = run / RUN.inner_folder / names[0]
+
+    def check() -> None:
+        refuse_link(output.parent)
+        check_free(output, True, EVALUATION, logs)
+
+    ranks.from_first(check, "output")
+    return output
+
+
+def _document(metrics: Mapping[str, Comparison[Metrics]], excluded: Mapping[str, int]) -> dict[str, dict[str, object]]:
+    """What `metrics.json` has, by name of a log."""
+    document: dict[str, dict[str, object]] = {
+        name: {"identified": pair.identified.as_dict(), "nominal": pair.nominal.as_dict()}
+        for name, pair in metrics.items()
+    }
+    for path, count in excluded.items():
+        document[Path(path).stem]["excluded_samples"] = count
+    return document
 
 
 def _calibrations(experiment: Experiment, builder: RowBuilder, path: Path) -> Comparison[Calibration]:

@@ -12,7 +12,6 @@ from functools import partial
 from rich.progress import Progress
 
 from torchid import ranks
-from torchid.commands.compress import read_fleet
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader
@@ -26,6 +25,7 @@ from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Score
 from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
+from torchid.fitting.fleet import read_fleet
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
@@ -136,7 +136,8 @@ def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Dat
 def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
     """The logs of an experiment that fits factors of logs."""
     with clock("read"):
-        fleet = read_fleet(experiment, bars)
+        reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
+        fleet = read_fleet(experiment, lambda _: bars.advance(reading))
         require_base(fleet.states, experiment.config.sensors.on_base_lost)
         reader = LogReader(experiment)
         logs = _read(reader, experiment, bars)

@@ -106,8 +106,12 @@ def _compress_chunks(
     chunks: Iterator[tuple[Samples, ContactState]],
     by_log: bool,
     weight_rows: RowWeighting | None = None,
+    loaded: bool = True,
 ) -> list[Part]:
-    """Compress chunks into parts: one per log, contact state and fold, or one per contact state unless `by_log`."""
+    """Compress chunks into parts: one per log, contact state and fold, or one per contact state unless `by_log`.
+
+    Without `loaded`, those of readings in the air alone.
+    """
     parts: dict[_Key, Part] = {}
     workspace = Workspace()
 
@@ -116,35 +120,24 @@ def _compress_chunks(
         return parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
 
     for samples, state in chunks:
-        loaded = part(samples, state, False)
-        loaded.samples += len(samples)
-        for support, rows in builder.rows(samples, state, workspace):
-            weighted = rows if weight_rows is None else weight_rows(samples, support, rows)
-            loaded.factor.add(support, weighted, samples.oversampling)
+        if loaded:
+            own = part(samples, state, False)
+            own.samples += len(samples)
+            for support, rows in builder.rows(samples, state, workspace):
+                weighted = rows if weight_rows is None else weight_rows(samples, support, rows)
+                own.factor.add(support, weighted, samples.oversampling)
         for channel in unloaded_offset_equations(builder, samples):
-            _add_equation(part(samples, state, True), channel, samples, builder)
+            in_the_air = part(samples, state, True)
+            if channel.gated:
+                in_the_air.gated.add(channel.offset)
+            else:
+                in_the_air.factor.add(*channel.row(builder), samples.oversampling)
     return list(parts.values())
-
-
-def _add_equation(part: Part, channel: UnloadedOffsetEquation, samples: Samples, builder: RowBuilder) -> None:
-    if channel.gated:
-        part.gated.add(channel.offset)
-    else:
-        part.factor.add(*channel.row(builder), samples.oversampling)
 
 
 def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:
     """Those parts of `compress_parts` that are of readings in the air."""
-
-    def reduce(chunks: Iterator[tuple[Samples, ContactState]]) -> list[Part]:
-        parts: dict[_Key, Part] = {}
-        for samples, state in chunks:
-            key = (samples.source, state, samples.fold, True)
-            for channel in unloaded_offset_equations(builder, samples):
-                part = parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
-                _add_equation(part, channel, samples, builder)
-        return list(parts.values())
-
+    reduce = partial(_compress_chunks, builder, by_log=True, loaded=False)
     return _merge_parts(map_chunks(logs, builder, reduce))
 
 

@@ -1,0 +1,92 @@
+"""Compressed logs of one fit: read from their files, and refused where they do not belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchid.errors import ConfigError, LogError, excerpt
+from torchid.fitting.experiment import Experiment, stated_noise, with_noise
+from torchid.fitting.factor_files import FactorFile, read_factors
+from torchid.fitting.noise import GroupNoise, NoiseSummary
+from torchid.fitting.row_model import RowModel, require_same_noise, require_same_rows
+from torchid.identifiability.base_parameters import StateReport, merge_state_reports
+from torchid.problem import RowBuilder
+from torchid.problem.noise import noise_of_groups, std_by_group
+
+_THE_EXPERIMENT = "the experiment file"
+_APART = ("exclude_condemned", "memory_gb")  # keys of preprocessing that do not change what a row is
+
+
+def row_model(experiment: Experiment, builder: RowBuilder) -> RowModel:
+    """What the rows of an experiment are formed with."""
+    settings = vars(experiment.config.preprocessing)
+    return RowModel.of(experiment.robot, builder, {name: x for name, x in settings.items() if name not in _APART})
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Compressed training logs of one fit, that belong together.
+
+    Attributes:
+        experiment: with the noise that they were weighed with.
+        files: the logs.
+        noise: that they were weighed with, as if it had been stated.
+        states: their contact states.
+    """
+
+    experiment: Experiment
+    files: list[FactorFile]
+    noise: NoiseSummary
+    states: list[StateReport]
+
+
+def read_fleet(experiment: Experiment, on_read: Callable[[Path], None] | None = None) -> Fleet:
+    """Read the compressed training logs of an experiment.
+
+    Args:
+        experiment: whose training logs are files of factors.
+        on_read: called after each file.
+
+    Raises:
+        LogError: a file that is damaged, or does not belong to the experiment or to the others.
+        ConfigError: the experiment states other noise.
+    """
+    paths = experiment.config.logs.train
+    model = row_model(experiment, experiment.builder(experiment.sensors))
+    files: list[FactorFile] = []
+    for path in paths:
+        one = read_factors(path)
+        require_same_rows(path, one.model, model, _THE_EXPERIMENT)
+        files.append(one)
+        require_same_noise(path, one.model, files[0].model, paths[0])
+        if on_read is not None:
+            on_read(path)
+    _require_different_logs(paths, files)
+    _require_stated_noise(experiment, files[0].model, paths[0])
+    groups = files[0].model.noise
+    noise = noise_of_groups(std_by_group(experiment.noise) | groups)
+    listed = [GroupNoise(name, "N" if "force" in name else "N m", "stated", x, None) for name, x in groups.items()]
+    summary = NoiseSummary(noise, listed, {}, 0)
+    return Fleet(with_noise(experiment, summary), files, summary, merge_state_reports(one.states for one in files))
+
+
+def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) -> None:
+    seen: dict[str, Path] = {}
+    for path, one in zip(paths, files, strict=True):
+        if one.sha256 and one.sha256 in seen:
+            found = f"of the same log as {seen[one.sha256]} ({excerpt(one.name)})"
+            raise LogError(path, "sha256", found, "factors of every log once")
+        seen[one.sha256] = path
+
+
+def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -> None:
+    """Refuse an experiment that states other noise than factors were weighed with."""
+    used, stated = model.noise, std_by_group(experiment.noise)
+    for key in stated_noise(experiment.config.sensors.noise):
+        groups = [name for name in used if name.partition(".")[0] == key]
+        if any(abs(used[name] - stated[name]) > 1e-9 * used[name] for name in groups):
+            own, theirs = (", ".join(f"{x[name]:g}" for name in groups) for x in (stated, used))
+            accepted = f"{theirs}, or no such key, or the logs compressed with another"
+            raise ConfigError.at_field(f"sensors.noise.{key}", f"{own}, but {theirs} in {path}", accepted)
