@@ -123,9 +123,11 @@ def _compress_chunks(
         if loaded:
             own = part(samples, state, False)
             own.samples += len(samples)
-            for support, rows in builder.rows(samples, state, workspace):
-                weighted = rows if weight_rows is None else weight_rows(samples, support, rows)
-                own.factor.add(support, weighted, samples.oversampling)
+            for support, stacked in builder.stacked_rows(samples, state, workspace):
+                if weight_rows is not None:
+                    rows = stacked[len(support) + 1 :]
+                    rows.copy_(weight_rows(samples, support, rows))
+                own.factor.add_in_place(support, stacked, samples.oversampling)
         for channel in unloaded_offset_equations(builder, samples):
             in_the_air = part(samples, state, True)
             if channel.gated:

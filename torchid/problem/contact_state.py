@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +13,7 @@ from torch import Tensor
 from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.extras import Extra, measured_components
+from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import reduced_layout, reduction_matrix
 from torchid.regressor.regressor import JointRow, joint_rows, wrench_transform
@@ -102,30 +103,21 @@ class ContactStateLayout:
 
     Attributes:
         contact_bodies: bodies in contact.
-        coupled_joints, uncoupled_joints: indices of independent joints.
-        moved: nodes that coupled joints move directly, ascending, with the joint's index among the coupled ones and the
-            ratio of its motion.
-        nodes: whose parameters coupled rows depend on, in the columns `inertial` and `friction`.
+        coupled_joints: indices of independent joints.
+        uncoupled_joints: indices of independent joints, with the block of each one's row.
         row_std: noise of the base rows and coupled joints [N, N m].
         wrench_std: noise of the measured components, body by body [N, N m].
         extras: columns of extra parameters.
+        blocks: of the coupled rows.
     """
 
     contact_bodies: tuple[ContactBody, ...]
     coupled_joints: tuple[int, ...]
-    uncoupled_joints: tuple[int, ...]
-    moved: tuple[tuple[int, int, float], ...]
-    nodes: range
-    inertial: range
-    friction: tuple[int, ...]
+    uncoupled_joints: Mapping[int, RowBlock]
     row_std: Tensor
     wrench_std: Tensor
     extras: tuple[int, ...]
-
-    @property
-    def support(self) -> tuple[int, ...]:
-        """Columns of coupled rows."""
-        return (*self.inertial, *self.friction, *self.extras)
+    blocks: RowBlocks
 
 
 class ContactStateLayouts:
@@ -166,36 +158,50 @@ class ContactStateLayouts:
             for index, joint in enumerate(coupled)
             for body, ratio in self.columns.joint_rows[joint].moved
         )
-        nodes_below, starts = self._nodes_below([body for body, _, _ in moved]), self.columns.layout.starts
+        extras = [
+            (self.columns.count + number, extra)
+            for number, extra in enumerate(self.extras)
+            if extra.dof in coupled or (extra.contact is not None and state[extra.contact[0]])
+        ]
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
         self._cache[state] = ContactStateLayout(
             bodies,
             coupled,
-            tuple(joint for joint in measured if joint not in moving),
-            tuple(moved),
-            nodes_below,
-            range(starts[nodes_below.start], starts[nodes_below.stop]),
-            tuple(self.columns.friction(body) + k for body, _, _ in moved for k in (0, 1)),
+            {joint: self._uncoupled(joint) for joint in measured if joint not in moving},
             self._tensor(np.append(noise.base_std[:base_rows], self.dof_std[list(coupled)])),
             self._tensor(noise.wrench_std[[k for body in bodies for _, k in body.components]]),
-            tuple(
-                self.columns.count + number
-                for number, extra in enumerate(self.extras)
-                if extra.dof in coupled or (extra.contact is not None and state[extra.contact[0]])
+            tuple(column for column, _ in extras),
+            RowBlocks(
+                self.columns.tree,
+                self.columns.layout,
+                moved,
+                [(self.columns.friction(body), self.columns.friction(body) + 1) for body, _, _ in moved],
+                [body.joints for body in bodies],
+                sum(len(body.unmeasured) for body in bodies),
+                [(column, *self._met(extra, coupled, bodies)) for column, extra in extras],
             ),
         )
         return self._cache[state]
 
+    def _uncoupled(self, joint: int) -> RowBlock:
+        columns, row = self.columns, self.columns.joint_rows[joint]
+        moved = [(node, 0, ratio, (columns.friction(node), columns.friction(node) + 1)) for node, ratio in row.moved]
+        extras = tuple(columns.count + number for number, extra in enumerate(self.extras) if extra.dof == joint)
+        return row_block(columns.tree, columns.layout, slice(0, 1), moved, extras=extras)
+
+    def _met(
+        self, extra: Extra, coupled: tuple[int, ...], bodies: Sequence[ContactBody]
+    ) -> tuple[tuple[int, ...], bool]:
+        """Coupled joints whose rows an extra parameter is in, and whether it is in those of the base."""
+        if extra.contact is None:
+            return (coupled.index(extra.dof),) if extra.dof in coupled else (), False
+        node = self.frames[extra.contact[0]][0]
+        joints = next(body.joints for body in bodies if body.body == node)
+        return joints, bool(self.columns.tree.base_rows)
+
     def clear(self) -> None:
         """Drop all layouts, when the robot's constants move to another device or precision."""
         self._cache.clear()
-
-    def _nodes_below(self, moved: list[int]) -> range:
-        """Hull of the subtrees of some nodes; with a floating base, all nodes."""
-        tree = self.columns.tree
-        if tree.base_rows:
-            return range(tree.n_nodes)
-        return range(min(moved, default=0), max((tree.subtree_end[body] for body in moved), default=0))
 
     def _contact_body(self, body: int, contacts: list[int], coupled: tuple[int, ...]) -> ContactBody:
         unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []

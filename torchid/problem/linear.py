@@ -114,7 +114,6 @@ class TriangularFactor:
         self.rows = 0
         self.independent_rows = 0.0
         self._blocks: dict[tuple[int, ...], Tensor] = {}
-        self._scratch: Tensor | None = None
 
     @classmethod
     def from_blocks(
@@ -131,9 +130,9 @@ class TriangularFactor:
         return self._blocks
 
     def __getstate__(self) -> dict[str, object]:
-        """What another process gets: on the CPU, as it may have another device, and without the scratch memory."""
+        """What another process gets: on the CPU, as it may have another device."""
         blocks = {support: block.cpu().numpy() for support, block in self._blocks.items()}
-        return vars(self) | {"_blocks": blocks, "_scratch": None}
+        return vars(self) | {"_blocks": blocks}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take over what another process sent."""
@@ -156,6 +155,28 @@ class TriangularFactor:
         self.rows += rows.shape[0]
         self.independent_rows += rows.shape[0] / oversampling
         self._absorb(support, rows)
+
+    def add_in_place(self, support: tuple[int, ...], stacked: Tensor, oversampling: float = 1.0) -> None:
+        """Add rows that have room above them, which are overwritten.
+
+        Args:
+            support: the columns in which they are not zero.
+            stacked: (len(support) + 1 + M, len(support) + 1), columns contiguous; the rows are the last M.
+            oversampling: rows per independent row, at least 1.
+        """
+        room = stacked.shape[1]
+        count = stacked.shape[0] - room
+        if count < room:
+            self.add(support, stacked[room:], oversampling)
+            return
+        self.rows += count
+        self.independent_rows += count / oversampling
+        kept = self._blocks.get(support)
+        above = 0 if kept is None else len(kept)
+        stacked[: room - above] = 0.0
+        if kept is not None:
+            stacked[room - above : room] = kept
+        self._blocks[support] = _triangularize(stacked)
 
     def merge(self, other: TriangularFactor) -> None:
         """Add the rows of another factor.
@@ -198,16 +219,12 @@ class TriangularFactor:
     @torch.no_grad()
     def _absorb(self, support: tuple[int, ...], rows: Tensor) -> None:
         kept = self._blocks.get(support)
-        above, width = (0 if kept is None else kept.shape[0]), rows.shape[1]
-        count = above + rows.shape[0]
-        if count < width:
-            self._blocks[support] = rows.clone() if kept is None else torch.cat([kept, rows])
-            return
-        if self._scratch is None or self._scratch.numel() < count * width:
-            self._scratch = rows.new_empty(count * width)
-        stacked = self._scratch[: count * width].view(width, count)  # columns contiguous: LAPACK works in place
-        if kept is not None:
-            stacked[:, :above] = kept.T
-        stacked[:, above:] = rows.T
-        torch.geqrf(stacked.T, out=(stacked.T, rows.new_empty(width)))
-        self._blocks[support] = stacked[:, :width].T.triu()
+        stacked = torch.cat([rows.T] if kept is None else [kept.T, rows.T], dim=1).T
+        self._blocks[support] = stacked if len(stacked) < stacked.shape[1] else _triangularize(stacked)
+
+
+def _triangularize(stacked: Tensor) -> Tensor:
+    """R of the factorization of rows (M, columns), columns contiguous, which it overwrites."""
+    # the same tensor twice: LAPACK then works in place
+    torch.geqrf(stacked, out=(stacked, stacked.new_empty(stacked.shape[1])))
+    return stacked[: stacked.shape[1]].triu()

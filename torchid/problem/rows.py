@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.contact_state import (
@@ -21,13 +21,12 @@ from torchid.problem.contact_state import (
     extra_columns,
 )
 from torchid.problem.extras import ExtraTerms, list_extras
+from torchid.problem.row_blocks import RowBlock
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import (
-    friction_columns,
     generalized_forces,
-    joint_row,
     wrench_transform,
     wrenches_at_base,
 )
@@ -38,18 +37,18 @@ from torchid.sensing.projection import null_space, whitened_null_space
 
 
 class Workspace:
-    """Named buffers of one worker; of each name only the latest is stored."""
+    """Named buffers of one worker, reused: fresh memory for large arrays takes as long as the arithmetic on them."""
 
     def __init__(self) -> None:
         """Start empty."""
         self._buffers: dict[str, Tensor] = {}
 
-    def zeros(self, name: str, like: Tensor, *shape: int) -> Tensor:
-        """A buffer that is zero wherever callers with the same name and shape never write."""
-        buffer = self._buffers.get(name)
-        if buffer is None or (buffer.shape, buffer.dtype, buffer.device) != (shape, like.dtype, like.device):
-            buffer = self._buffers[name] = torch.zeros(shape, dtype=like.dtype, device=like.device)
-        return buffer
+    def empty(self, name: str, like: Tensor, *shape: int) -> Tensor:
+        """A contiguous array with arbitrary values, valid until the next request with this name."""
+        buffer, size = self._buffers.get(name), math.prod(shape)
+        if buffer is None or buffer.numel() < size or (buffer.dtype, buffer.device) != (like.dtype, like.device):
+            buffer = self._buffers[name] = like.new_empty(size)
+        return buffer[:size].view(shape)
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,8 @@ class ChunkDynamics(ChunkKinematics):
     """Kinematics of B samples with the columns of the inertial parameters, from which rows are computed.
 
     Attributes:
-        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter.
+        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter; the forces of
+            inertias, which are zero, need not have been written.
     """
 
     wrenches: Tensor
@@ -94,6 +94,16 @@ class ChunkDynamics(ChunkKinematics):
             None if self.rotation_world_base is None else self.rotation_world_base[index],
             pick(self.wrenches),
         )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Samples of one rank: their generalized forces f, (base rows + coupled joints, B), and measured contact rows."""
+
+    samples: Samples
+    f: Tensor
+    measured: Tensor
+    dynamics: ChunkDynamics
 
 
 class RowBuilder(nn.Module):
@@ -162,7 +172,7 @@ class RowBuilder(nn.Module):
         """Dynamics of some samples; with a workspace, valid until the next call with the same."""
         kinematics, layout, out = self.kinematics(samples), self.columns.layout, None
         if workspace is not None:
-            out = workspace.zeros("wrenches", kinematics.screw_axes, 6, layout.count, len(samples))
+            out = workspace.empty("wrenches", kinematics.screw_axes, 6, layout.count, len(samples))
         return ChunkDynamics(**vars(kinematics), wrenches=all_wrench_columns(kinematics.states, layout, out))
 
     def rows(
@@ -174,13 +184,24 @@ class RowBuilder(nn.Module):
             (columns, rows): rows are (M, len(columns) + 1), the right-hand side last, valid until the next
                 is requested.
         """
+        for columns, stacked in self.stacked_rows(samples, state, workspace):
+            yield columns, stacked[len(columns) + 1 :]
+
+    def stacked_rows(
+        self, samples: Samples, state: ContactState, workspace: Workspace | None = None
+    ) -> Iterator[tuple[tuple[int, ...], Tensor]]:
+        """The same with room above each block for a triangular factor of as many rows as it has columns.
+
+        Yields:
+            (columns, stacked): (len(columns) + 1 + M, len(columns) + 1), columns contiguous.
+        """
         workspace = workspace or Workspace()
         layout, dynamics = self.layout(state), self.dynamics(samples, workspace)
-        for _, _, rows in self._coupled_rows(samples, layout, dynamics, workspace):
-            yield layout.support, rows.flatten(1).T
-        for joint in layout.uncoupled_joints:
-            columns, rows = self._uncoupled_row(joint, samples, dynamics)
-            yield columns, rows.T
+        for _, _, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
+            for block, stacked, _ in blocks:
+                yield block.support, stacked.T
+        for block, _, stacked, _ in self._uncoupled_rows(samples, layout, dynamics, workspace):
+            yield block.support, stacked.T
 
     def rows_by_sample(self, samples: Samples, state: ContactState) -> tuple[Tensor, Tensor]:
         """The same rows sample by sample, for samples that share a contact state.
@@ -195,15 +216,16 @@ class RowBuilder(nn.Module):
         rows = samples.time.new_zeros(len(samples), n_rows, self.width + 1)
         W = samples.time.new_zeros(len(samples), n_rows, n_rows)
         dofs = self._index([*range(base), *(base + joint for joint in layout.coupled_joints)])
-        support = self._index([*layout.support, self.width])
-        for index, basis, block in self._coupled_rows(samples, layout, dynamics, Workspace()):
-            sample = torch.arange(len(samples), device=self.device)[index][:, None, None]
-            slots = torch.arange(block.shape[1], device=self.device)
-            rows[sample, slots[:, None], support] = block.permute(2, 1, 0)
-            W[sample, dofs[:, None], slots] = basis
-        for slot, joint in enumerate(layout.uncoupled_joints, start=coupled):
-            columns, block = self._uncoupled_row(joint, samples, dynamics)
-            rows[:, slot, self._index([*columns, self.width])] = block.T
+        workspace, every = Workspace(), torch.arange(len(samples), device=self.device)
+        for index, basis, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
+            sample = every[index][:, None, None]
+            for block, _, values in blocks:
+                slots = torch.arange(block.rows.start, block.rows.stop, device=self.device)
+                rows[sample, slots[:, None], self._index([*block.support, self.width])] = values.permute(2, 1, 0)
+            W[sample, dofs[:, None], torch.arange(basis.shape[1], device=self.device)] = basis.permute(2, 0, 1)
+        uncoupled = self._uncoupled_rows(samples, layout, dynamics, workspace)
+        for slot, (block, joint, _, values) in enumerate(uncoupled, start=coupled):
+            rows[:, slot, self._index([*block.support, self.width])] = values[:, 0].T
             W[:, base + joint, slot] = 1.0 / self._layouts.dof_std[joint]
         return rows, W
 
@@ -251,22 +273,35 @@ class RowBuilder(nn.Module):
             return samples.time.new_full((len(samples), self.tree.n_dofs), torch.nan)
         return samples.torque
 
-    def _uncoupled_row(self, joint: int, samples: Samples, dynamics: ChunkDynamics) -> tuple[tuple[int, ...], Tensor]:
-        row = self.columns.joint_rows[joint]
-        inertial = joint_row(row, self.tree, self.columns.layout, dynamics.screw_axes, dynamics.wrenches)
-        friction = [x for _, *pair in friction_columns(row, self.tree, dynamics.joints) for x in pair]
-        own_extras = {
-            self.columns.count + number: extra for number, extra in enumerate(self.extras) if extra.dof == joint
-        }
-        extra = [dof_extra_column(extra, samples, self.tree) for extra in own_extras.values()]
-        block = torch.cat([inertial, torch.stack([*friction, *extra, self.recorded_torque(samples)[:, joint]])])
-        columns = (*range(row.start, row.end), *self.columns.friction_of(joint), *own_extras)
-        return columns, block / self._layouts.dof_std[joint]
+    @staticmethod
+    def _stack(name: str, like: Tensor, workspace: Workspace, *shape: int) -> tuple[Tensor, Tensor]:
+        """A buffer for rows, (columns, ..., B), below as many rows as columns: all as (columns, rows), and the rows."""
+        stacked = workspace.empty(name, like, shape[0], shape[0] + math.prod(shape[1:]))
+        return stacked, stacked[:, shape[0] :].unflatten(1, shape[1:])
+
+    def _uncoupled_rows(
+        self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
+    ) -> Iterator[tuple[RowBlock, int, Tensor, Tensor]]:
+        """Of each uncoupled joint the block, the joint, its rows with room above, the rows, (columns + 1, 1, B)."""
+        torque = self.recorded_torque(samples)
+        for joint, block in layout.uncoupled_joints.items():
+            weight = 1.0 / self._layouts.dof_std[joint]
+            W = torque.new_full((1, 1, len(samples)), weight)
+            stacked, X = self._stack("rows", W, workspace, len(block.support) + 1, 1, len(samples))
+            torch.mul(torque[:, joint], weight, out=X[-1, 0])
+            self._project(None, W, block, dynamics, X, workspace)
+            for number, column in enumerate(block.extras, start=len(block.inertial) + len(block.friction)):
+                extra = self.extras[column - self.columns.count]
+                torch.mul(dof_extra_column(extra, samples, self.tree), weight, out=X[number, 0])
+            yield block, joint, stacked, X
 
     def _coupled_rows(
         self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
-    ) -> Iterator[tuple[Tensor | slice, Tensor, Tensor]]:
-        """Samples of one rank, their W (B', base rows + coupled joints, r) and their rows (columns + 1, r, B')."""
+    ) -> Iterator[tuple[Tensor | slice, Tensor, Iterator[tuple[RowBlock, Tensor, Tensor]]]]:
+        """Samples of one rank, their W, (base rows + coupled joints, r, B'), and the blocks of their rows.
+
+        Of each block the rows with room above, and the rows, (columns + 1, rows of the block, B').
+        """
         if not (self.tree.base_rows or layout.coupled_joints):
             return
         unmeasured, measured = self._contact_rows(layout, dynamics)
@@ -275,71 +310,79 @@ class RowBuilder(nn.Module):
         if len(layout.wrench_std):
             f = f + (measured.mT @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
         axes = self.noise_axes(dynamics.rotation_world_base) if self.sensors.noise.base_axes_differ else None
-        for index, W in whitened_null_space(unmeasured, layout.row_std, measured, layout.wrench_std, axes):
-            chosen = dynamics.select(index)
-            rows = self._projected_rows(W.permute(1, 2, 0).contiguous(), f[index].T, layout, chosen, workspace)
-            if layout.extras:
-                rows[-1 - len(layout.extras) : -1] = self._extra_columns(
-                    samples[index], layout, chosen, measured[index], W
-                )
-            yield index, W, rows
+        std, order = (layout.row_std, layout.wrench_std), layout.blocks.order
+        for index, basis in whitened_null_space(unmeasured, std[0], measured, std[1], axes, order):
+            W = basis.permute(1, 2, 0).contiguous()
+            if layout.blocks.are_turned:
+                turn_rows(W)
+            part = _Part(samples[index], f[index].T, measured[index], dynamics.select(index))
+            yield index, W, self._projected_blocks(W, part, layout, workspace)
 
-    def _extra_columns(
-        self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, measured: Tensor, W: Tensor
-    ) -> Tensor:
-        """Columns of the extra parameters, (extras of the layout, r, B)."""
-        extras = [self.extras[column - self.columns.count] for column in layout.extras]
+    def _projected_blocks(
+        self, W: Tensor, part: _Part, layout: ContactStateLayout, workspace: Workspace
+    ) -> Iterator[tuple[RowBlock, Tensor, Tensor]]:
+        base = self.tree.base_rows
+        for block in layout.blocks.of_rank(W.shape[1]):
+            own = W[:, block.rows]
+            stacked, X = self._stack("rows", W, workspace, len(block.support) + 1, *own.shape[1:])
+            torch.sum(own * part.f[:, None], dim=0, out=X[-1])
+            self._project(own[:base] if base else None, own[base:], block, part.dynamics, X, workspace)
+            if block.extras:
+                X[-1 - len(block.extras) : -1] = self._extra_columns(part, layout, block, own)
+            yield block, stacked, X
+
+    def _extra_columns(self, part: _Part, layout: ContactStateLayout, block: RowBlock, W: Tensor) -> Tensor:
+        """Columns of a block's extra parameters, (extras, r, B)."""
+        extras = [self.extras[column - self.columns.count] for column in block.extras]
         touching = {extra.contact[0] for extra in extras if extra.contact is not None}
-        rotations = {k: self._rotation(k, dynamics) for k in touching} if samples.wrench_in_world else {}
-        return torch.stack(list(extra_columns(extras, samples, layout, self.tree, measured, W, rotations)))
+        rotations = {k: self._rotation(k, part.dynamics) for k in touching} if part.samples.wrench_in_world else {}
+        basis = W.permute(2, 0, 1)
+        columns = extra_columns(extras, part.samples, layout, self.tree, part.measured, basis, rotations)
+        return torch.stack(list(columns))
 
-    def _projected_rows(
-        self, W: Tensor, f: Tensor, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
-    ) -> Tensor:
-        """Rows W^T [K | f], (columns + 1, r, B), for a basis W, (base rows + coupled joints, r, B), and f, (..., B).
+    def _project(
+        self,
+        W_base: Tensor | None,
+        W_joints: Tensor,
+        block: RowBlock,
+        dynamics: ChunkDynamics,
+        X: Tensor,
+        workspace: Workspace,
+    ) -> None:
+        """Write the columns W^T K of a block, the first of `X`, (columns + 1, r, B), but those of extra parameters.
 
-        A wrench on body i does work on the base and on the joints above it only. Body i's columns of W^T K are thus
-        A_i^T times its wrench columns, with A_i the sum over its path of the rows of W times the joints' screw axes.
-        No joint row is ever formed. Columns are contiguous, as the factorization needs them.
+        `W_base`, (6, r, B), None for a fixed base, and `W_joints`, (joints, r, B): its part of the basis. A wrench on
+        body i does work on the base and on the joints above it only. Body i's columns of W^T K are thus A_i^T times its
+        wrench columns, with A_i the sum over its path of the rows of W times the joints' screw axes. No joint row is
+        ever formed. Columns are contiguous, as the factorization needs them.
         """
-        tree, column_layout, inertial = self.tree, self.columns.layout, layout.inertial
-        X = workspace.zeros("projected", W, len(layout.support) + 1, *W.shape[1:])
-        torch.sum(W * f[:, None], dim=0, out=X[-1])
-        moved = {body: index for index, (body, _, _) in enumerate(layout.moved)}
-        own = W[self._index(tree.base_rows + position for _, position, _ in layout.moved)]
-        own *= own.new_tensor([ratio for _, _, ratio in layout.moved])[:, None, None]
-        velocity = dynamics.joints.velocity[self._index(moved)][:, None]
-        friction = X[len(inertial) : len(inertial) + 2 * len(moved)].unflatten(0, (len(moved), 2))
-        torch.mul(own, tree.coulomb_sign(velocity), out=friction[:, 0])
-        torch.mul(own, velocity, out=friction[:, 1])
+        torques = [ratio * W_joints[joint] for _, joint, ratio, _ in block.moved]
+        for number, (torque, (node, _, _, _)) in enumerate(zip(torques, block.moved, strict=True)):
+            velocity, friction = dynamics.joints.velocity[node], X[len(block.inertial) + 2 * number :]
+            torch.mul(torque, self.tree.coulomb_sign(velocity), out=friction[0])
+            torch.mul(torque, velocity, out=friction[1])
 
-        path_sums = workspace.zeros("path_sums", W, 6, tree.n_nodes, *W.shape[1:])
-        if tree.base_rows:
-            path_sums[:, 0] = W[:6]
-        for body in range(1, tree.n_nodes):
-            parent = path_sums[:, tree.parents[body]]
-            if body in moved:
-                torch.addcmul(parent, dynamics.screw_axes[:, body, None], own[moved[body]], out=path_sums[:, body])
+        sums = [] if W_base is None or block.base == "none" else [W_base]
+        path_sums = workspace.empty("path_sums", W_joints, 6, len(sums) + len(torques), *W_joints.shape[1:])
+        for number, base in enumerate(sums):
+            path_sums[:, number] = base
+        for number, (torque, (node, _, _, above)) in enumerate(zip(torques, block.moved, strict=True), len(sums)):
+            screw_axis = dynamics.screw_axes[:, node, None]
+            if above is None:
+                torch.mul(screw_axis, torque, out=path_sums[:, number])
             else:
-                path_sums[:, body] = parent
-        for kept, bodies in column_layout.runs(layout.nodes):
-            if kept:
-                start, end = column_layout.starts[bodies.start], column_layout.starts[bodies.stop]
-                shape = (len(bodies), len(kept))
-                n_with_force = sum(column < parameters.INERTIA.start for column in kept)
-                columns = X[start - inertial.start : end - inertial.start].unflatten(0, shape)
-                wrenches = dynamics.wrenches[:, start:end].unflatten(1, shape)
-                self._multiply_wrenches(wrenches, path_sums[:, bodies.start : bodies.stop], n_with_force, columns)
-        return X
-
-    @staticmethod
-    def _multiply_wrenches(wrenches: Tensor, path_sums: Tensor, n_with_force: int, out: Tensor) -> None:
-        """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `n_with_force` c have forces."""
-        torch.mul(wrenches[3].unsqueeze(2), path_sums[3].unsqueeze(1), out=out)
-        for k in (4, 5):
-            out.addcmul_(wrenches[k].unsqueeze(2), path_sums[k].unsqueeze(1))
-        for k in (0, 1, 2):
-            out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), path_sums[k].unsqueeze(1))
+                torch.addcmul(path_sums[:, above], screw_axis, torque, out=path_sums[:, number])
+        start = 0
+        for run in block.nodes:
+            end = start + len(run.nodes) * len(run.kept)
+            columns = dynamics.wrenches[:, run.columns.start : run.columns.stop].unflatten(1, (-1, len(run.all_kept)))
+            _multiply_wrenches(
+                columns[:, :, : len(run.kept)],
+                path_sums[:, run.sources.start : run.sources.stop],
+                run.n_with_force,
+                X[start:end].unflatten(0, (len(run.nodes), len(run.kept))),
+            )
+            start = end
 
     def _contact_rows(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> tuple[Tensor, Tensor]:
         """Rows of J_C, unmeasured and measured, in base and coupled joints, (B, k, base rows + coupled joints)."""
@@ -370,3 +413,37 @@ class RowBuilder(nn.Module):
             for contact in {contact for contact, _ in components}
         }
         return torch.stack([local[contact][:, k] for contact, k in components], dim=1)
+
+
+def turn_rows(W: Tensor) -> None:
+    """Turn bases so that all but the last three columns are zero in the base's moment, all but six in its force too.
+
+    By Householder reflections from the right, one per base row, in place.
+
+    Args:
+        W: (base rows + coupled joints, r, B).
+    """
+    last = W.shape[1]
+    for row in (5, 4, 3, 2, 1, 0)[: 3 if last <= 6 else 6]:
+        if last < 2:
+            return
+        turned = W[:, :last]
+        v = turned[row].clone()
+        norm = torch.linalg.vector_norm(v, dim=0)
+        v[-1] += torch.copysign(norm, v[-1])
+        length = (v * v).sum(0)
+        v_scaled = v * torch.where(length > 0.0, 2.0 / length, 0.0)
+        turned.addcmul_((turned * v).sum(1, keepdim=True), v_scaled, value=-1)
+        last -= 1
+
+
+def _multiply_wrenches(wrenches: Tensor, path_sums: Tensor, n_with_force: int, out: Tensor) -> None:
+    """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `n_with_force` c have forces.
+
+    `path_sums`: (6, L', r, B), or (6, 1, r, B) if they are the same for all bodies.
+    """
+    torch.mul(wrenches[3].unsqueeze(2), path_sums[3].unsqueeze(1), out=out)
+    for k in (4, 5):
+        out.addcmul_(wrenches[k].unsqueeze(2), path_sums[k].unsqueeze(1))
+    for k in (0, 1, 2):
+        out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), path_sums[k].unsqueeze(1))

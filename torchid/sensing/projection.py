@@ -182,7 +182,12 @@ def null_space(A: Tensor, size: float = 1.0) -> Iterator[tuple[Tensor | slice, T
 
 
 def whitened_null_space(
-    A: Tensor, row_std: Tensor, J_m: Tensor, wrench_std: Tensor, axes: Tensor | None = None
+    A: Tensor,
+    row_std: Tensor,
+    J_m: Tensor,
+    wrench_std: Tensor,
+    axes: Tensor | None = None,
+    order: Sequence[int] | None = None,
 ) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Bases W of the null spaces of A under which the projected sensor noise is white, grouped by rank.
 
@@ -193,6 +198,7 @@ def whitened_null_space(
         wrench_std: (k_m,), noise of each measured wrench component [N, N m].
         axes: (B, 3, 3), columns are the unit vectors in the base frame that the base rows of `row_std` are along; None:
             the base's own axes.
+        order: of the m rows; where A is empty, column i of W is zero but in the first i + 1 of them.
 
     Yields:
         (index of the samples, W): W is (B', m, m - rank) with `A @ W = 0` and `W^T S W = I`, where S, the covariance of
@@ -200,8 +206,11 @@ def whitened_null_space(
     """
     if axes is not None:
         axes = axes.detach()
-        for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std):
+        for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std, None, order):
             yield index, _along(W.mT, axes[index].mT).mT
+        return
+    if not A.shape[1]:
+        yield slice(None), _triangular_root(row_std, J_m, wrench_std, order or range(A.shape[2]))
         return
     for index, V in null_space(A / row_std, float(torch.linalg.vector_norm(1.0 / row_std))):
         W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
@@ -211,6 +220,21 @@ def whitened_null_space(
             L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
             W = torch.linalg.solve_triangular(L, W.mT, upper=False).mT
         yield index, W
+
+
+def _triangular_root(row_std: Tensor, J_m: Tensor, wrench_std: Tensor, order: Sequence[int]) -> Tensor:
+    """W, (B, m, m), with `W^T S W = I` and S as in `whitened_null_space`; column i is zero but in `order[:i + 1]`."""
+    samples, _, m = J_m.shape
+    ordered = list(order)
+    identity = torch.eye(m, dtype=J_m.dtype, device=J_m.device)
+    W = (identity / row_std)[:, ordered].expand(samples, m, m)
+    if not len(wrench_std):
+        return W
+    through_contacts = (J_m / row_std)[..., ordered] * wrench_std[:, None]
+    L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
+    inverse = torch.linalg.solve_triangular(L, identity.expand_as(L), upper=False).mT
+    place = sorted(range(m), key=ordered.__getitem__)
+    return inverse[:, place] / row_std[:, None]
 
 
 def _along(X: Tensor, axes: Tensor) -> Tensor:
