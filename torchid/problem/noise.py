@@ -15,6 +15,7 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 import torch
+from scipy.stats import chi2, norm
 from torch import Tensor
 
 from torchid.parameters import Array
@@ -161,8 +162,9 @@ class SampledRows:
     def compress(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
         """The rows, whitened with these variances and compressed.
 
-        With parameters of an earlier fit in the builder's columns, by log, rows with large residuals count less, as in
-        Huber's loss: otherwise the effect of impacts on the parameters would look like noise of all rows.
+        With parameters of an earlier fit in the builder's columns, by log, samples with large residuals count less, as
+        in Huber's loss: otherwise the effect of impacts on the parameters would look like noise of all rows. A sample's
+        rows are taken together, as another basis of their span must not make a difference.
         """
         parts: dict[tuple[str, ContactState], Part] = {}
         every = tuple(range(self.builder.width))
@@ -170,12 +172,18 @@ class SampledRows:
             key = chunk.log, chunk.state
             part = parts.setdefault(key, Part(*key, TriangularFactor(self.builder.width), 0))
             part.samples += len(chunk.rows)
-            some = chunk.rows[chunk.sources.abs().sum(1) > 0.0]
+            rows, present = chunk.rows, chunk.sources.abs().sum(1) > 0.0
             if columns is not None:
-                residual = (some[:, :-1] @ columns[chunk.log] - some[:, -1]).abs()
-                some = some * (_CLIP / residual).clamp_max(1.0).sqrt()[:, None]
-            part.factor.add(every, some, chunk.oversampling)
+                size = torch.linalg.vector_norm(rows[..., :-1] @ columns[chunk.log] - rows[..., -1], dim=1)
+                limit = _radius(present.sum(1))
+                rows = rows * (limit / size).clamp_max(1.0).sqrt()[:, None, None]
+            part.factor.add(every, rows[present], chunk.oversampling)
         return list(parts.values())
+
+
+def _radius(rows: Tensor) -> Tensor:
+    """Size of whitened residuals of so many rows that is exceeded as seldom as `_CLIP` standard deviations by one."""
+    return torch.from_numpy(np.sqrt(chi2.isf(2.0 * norm.sf(_CLIP), rows.numpy())))
 
 
 def _source_names(builder: RowBuilder) -> list[str]:

@@ -1,0 +1,110 @@
+"""The zeros of coupled rows. That nothing else is left out, `test_rows_against_oracle.py` checks against Pinocchio."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from random_samples import random_samples, sensor_set
+
+import torchid
+from torchid import parameters
+from torchid.problem import RowBuilder, TriangularFactor
+from torchid.problem.row_blocks import RowBlock
+from torchid.problem.rows import turn_rows
+
+ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
+FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
+DIAGONAL = (True, False, False, True)  # front left, rear right
+
+
+def blocks_of(sensors: str, state: tuple[bool, ...], rank: int) -> tuple[RowBuilder, tuple[RowBlock, ...]]:
+    builder = RowBuilder(ROBOT, FEET, sensor_set(sensors, ROBOT, FEET))
+    return builder, builder.layout(state).blocks.of_rank(rank)
+
+
+def inertias(builder: RowBuilder, block: RowBlock) -> set[str]:
+    """Bodies with an inertia among the columns of a block."""
+    layout, names = builder.columns.layout, ROBOT.body_names
+    return {
+        names[builder.tree.body_of[node]]
+        for node, kept in enumerate(layout.kept)
+        for number, column in enumerate(kept, start=layout.starts[node])
+        if column >= parameters.INERTIA.start and number in block.inertial
+    }
+
+
+def test_rows_with_the_bases_force_leave_out_inertias_of_swinging_legs() -> None:
+    builder, (force, moment) = blocks_of("joints", DIAGONAL, 6)
+    assert (force.rows, moment.rows) == (slice(0, 3), slice(3, 6))
+    standing = {name for name in ROBOT.body_names if name.startswith(("front_left", "rear_right"))}
+    assert inertias(builder, force) == standing
+    assert inertias(builder, moment) == set(ROBOT.body_names)
+    assert len(moment.inertial) == builder.columns.layout.count > len(force.inertial)
+
+
+def test_measured_forces_leave_each_leg_its_own_rows() -> None:
+    builder, (*legs, force, moment) = blocks_of("full", (True,) * 4, 18)
+    assert [inertias(builder, leg) for leg in legs] == [
+        {name for name in ROBOT.body_names if name.startswith(side)}
+        for side in ("rear_right", "rear_left", "front_right", "front_left")
+    ]
+    assert inertias(builder, force) == set(ROBOT.body_names) - {ROBOT.body_names[0]}
+    assert inertias(builder, moment) == set(ROBOT.body_names)
+    assert [block.rows.stop - block.rows.start for block in (*legs, force, moment)] == [3] * 6
+
+
+def test_the_forces_of_a_base_alone_need_no_inertia_at_all() -> None:
+    builder, (force, moment) = blocks_of("contacts", (True,) * 4, 6)
+    assert not inertias(builder, force)
+    assert len(force.inertial) < 0.4 * len(moment.inertial)
+
+
+@pytest.mark.parametrize("sensors", ["full", "contacts", "joints", "mixed"])
+def test_the_basis_is_zero_where_blocks_say_so(sensors: str) -> None:
+    samples, _ = random_samples(ROBOT, FEET, 30, 3, states=1)
+    for state in (DIAGONAL, (True,) * 4, (True, False, False, False), (False,) * 4):
+        builder = RowBuilder(ROBOT, FEET, sensor_set(sensors, ROBOT, FEET))
+        _, W = builder.rows_by_sample(samples, state)
+        layout = builder.layout(state)
+        rank = 6 + len(layout.coupled_joints) - sum(len(body.unmeasured) for body in layout.contact_bodies)
+        W = W / W.abs().amax(dim=(0, 1))
+        for block in layout.blocks.of_rank(rank):
+            own = W[..., block.rows]
+            if block.base != "all":
+                assert own[:, 3:6].abs().sum() < 1e-11
+            if block.base == "none":
+                assert own[:, :6].abs().sum() < 1e-11
+            combined = {layout.coupled_joints[joint] for _, joint, _, _ in block.moved}
+            others = [6 + joint for joint in range(ROBOT.n) if joint not in combined]
+            assert own[:, others].abs().sum() < 1e-11
+
+
+@pytest.mark.parametrize("r", [1, 2, 3, 5, 6, 9])
+def test_turned_bases_span_what_they_did(r: int) -> None:
+    W = torch.randn(15, r, 40, generator=torch.Generator().manual_seed(r), dtype=torch.float64)
+    W[:6, :, 0] = 0.0  # no part in the base at all
+    W[3:6, :, 1] = 0.0
+    W[3:6, :, 2] = W[3, :, 2]  # moments of one direction
+    turned = W.clone()
+    turn_rows(turned)
+    square, turned_square = (torch.einsum("irb,jrb->bij", x, x) for x in (W, turned))
+    torch.testing.assert_close(turned_square, square, rtol=0.0, atol=1e-13 * float(square.abs().max()))
+    assert turned[3:6, : max(r - 3, 0)].abs().sum() < 1e-12
+    assert turned[:6, : max(r - 6, 0)].abs().sum() < 1e-12
+
+
+def test_rows_with_room_above_are_added_as_any() -> None:
+    rng = torch.Generator().manual_seed(0)
+    support, columns = (0, 2, 3), 5
+    plain, in_place = TriangularFactor(columns), TriangularFactor(columns)
+    for count in (2, 1, 20, 2, 50):  # fewer rows than columns as well
+        rows = torch.randn(count, 4, generator=rng, dtype=torch.float64)
+        stacked = torch.full((4, 4 + count), torch.nan, dtype=torch.float64).T  # whatever is above
+        stacked[4:] = rows
+        plain.add(support, rows, 2.0)
+        in_place.add_in_place(support, stacked, 2.0)
+        both = plain.triangle(), in_place.triangle()
+        torch.testing.assert_close(both[0].T @ both[0], both[1].T @ both[1], rtol=1e-13, atol=1e-13)
+    assert (in_place.rows, in_place.oversampling) == (plain.rows, plain.oversampling) == (75, 2.0)
