@@ -159,7 +159,7 @@ def base_rank(singular_values: Tensor) -> Tensor:
     return (singular_values > tolerance).sum(1)
 
 
-def null_space(A: Tensor, size: float = 1.0) -> Iterator[tuple[Tensor | slice, Tensor]]:
+def null_space(A: Tensor, size: float | Tensor = 1.0) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Orthonormal bases of the null spaces of a batch of matrices, grouped by rank.
 
     A QR factorization of the transpose serves samples of full row rank; only those that might have lost rank (straight
@@ -203,14 +203,23 @@ def whitened_null_space(
         for index, W in whitened_null_space(_along(A, axes), row_std, _along(J_m, axes), wrench_std):
             yield index, _along(W.mT, axes[index].mT).mT
         return
-    for index, V in null_space(A / row_std, float(torch.linalg.vector_norm(1.0 / row_std))):
+    for index, V in null_space(A / row_std, torch.linalg.vector_norm(1.0 / row_std).double()):
         W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
         if len(wrench_std):
             through_contacts = (J_m[index] @ W) * wrench_std[:, None]
             identity = torch.eye(W.shape[2], dtype=W.dtype, device=W.device)
-            L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
+            L = _cholesky(identity + through_contacts.mT @ through_contacts)
             W = torch.linalg.solve_triangular(L, W.mT, upper=False).mT
         yield index, W
+
+
+def _cholesky(covariance: Tensor) -> Tensor:
+    """Lower triangles of matrices (B, r, r) not below the identity: only numbers that are not finite can make it fail.
+
+    That is an error on the CPU alone: to hear of it, the host would wait for a GPU. There the triangle is not finite.
+    """
+    L: Tensor = torch.linalg.cholesky_ex(covariance, check_errors=covariance.device.type == "cpu").L
+    return L
 
 
 def _along(X: Tensor, axes: Tensor) -> Tensor:
@@ -218,7 +227,7 @@ def _along(X: Tensor, axes: Tensor) -> Tensor:
     return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)
 
 
-def _bases(A: Tensor, floor: float) -> Iterator[tuple[Tensor | slice, Tensor]]:
+def _bases(A: Tensor, floor: float | Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
     samples, k, m = A.shape
     if samples == 0:
         return
@@ -236,7 +245,7 @@ def _bases(A: Tensor, floor: float) -> Iterator[tuple[Tensor | slice, Tensor]]:
         ratio = negligible * torch.linalg.matrix_norm(inverse)
         suspect = ~(ratio < 1.0 / _SUSPECT)  # so written, infinite and undefined ones are suspect too
         V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
-        if not suspect.any():
+        if not _exists(suspect):
             yield slice(None), V
             return
         regular = torch.nonzero(~suspect)[:, 0]
@@ -250,12 +259,21 @@ def _bases(A: Tensor, floor: float) -> Iterator[tuple[Tensor | slice, Tensor]]:
         yield remaining[same], Vh[same, r:].mT
 
 
-def _differentiable(A: Tensor, V: Tensor, floor: float) -> Tensor:
+def _exists(suspect: Tensor) -> bool:
+    """Whether any sample needs its singular values: the one number of a chunk that the host waits for.
+
+    The shapes of whatever comes after it depend on it. Only where there are such samples, the host waits for their
+    numbers and ranks too.
+    """
+    return bool(suspect.any())
+
+
+def _differentiable(A: Tensor, V: Tensor, floor: float | Tensor) -> Tensor:
     """Bases `V` as functions of A: projected onto the null space of A and made orthonormal again.
 
     Their value does not change but by rounding. To first order dV = -A^+ dA V (Golub, Pereyra 1973).
     """
-    inverse = torch.linalg.pinv(A, atol=floor, rtol=_tolerance(A))
+    inverse = torch.linalg.pinv(A, atol=float(floor), rtol=_tolerance(A))
     inside = V - inverse @ (A @ V)
     L = torch.linalg.cholesky(inside.mT @ inside)
     return torch.linalg.solve_triangular(L, inside.mT, upper=False).mT
