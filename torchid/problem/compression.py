@@ -323,14 +323,14 @@ class UnloadedOffsetEquation:
     def row(self, builder: RowBuilder) -> tuple[tuple[int, ...], Tensor]:
         """The whitened equation `o - (s - 1) mean = mean` as a block of one row: its columns, and (1, columns + 1).
 
-        The scale's column holds the mean: the noise of single readings would bias the scale towards 0.
+        The scale's column holds the mean: the noise of single readings would bias the scale towards 0. The row is on
+        the CPU, where readings in the air are, and so is the block of such rows in a factor.
         """
         first, row = builder.columns.count, [1.0, self.mean]
         columns: tuple[int, ...] = (first + self.offset,)
         if self.scale is not None:
             columns, row = (*columns, first + self.scale), [1.0, -self.mean, self.mean]
-        like = builder.tree.ancestors
-        return columns, torch.tensor([row], dtype=like.dtype, device=like.device) / self.deviation
+        return columns, torch.tensor([row], dtype=builder.tree.ancestors.dtype) / self.deviation
 
 
 def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator[UnloadedOffsetEquation]:

@@ -203,7 +203,7 @@ class TriangularFactor:
         if count < width:
             self._blocks[support] = rows.clone() if kept is None else torch.cat([kept, rows])
             return
-        if self._scratch is None or self._scratch.numel() < count * width:
+        if self._scratch is None or self._scratch.device != rows.device or self._scratch.numel() < count * width:
             self._scratch = rows.new_empty(count * width)
         stacked = self._scratch[: count * width].view(width, count)  # columns contiguous: LAPACK works in place
         if kept is not None:

@@ -44,7 +44,7 @@ class Samples:
         share: (N, C), share of a constant contact reading that the filter leaves, as `Log.contact_share`; None if it is
             `active`.
         unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
-            `Log.contact_unloaded`; None without such readings.
+            `Log.contact_unloaded`, on the CPU; None without such readings.
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
     """
@@ -84,15 +84,15 @@ class Samples:
         return self._each(lambda x: x[index])
 
     def to(self, device: torch.device | str) -> Samples:
-        """The samples on another device."""
-        return self._each(lambda x: x.to(device))
+        """The samples on another device, all but readings in the air: these become a few means, on the CPU."""
+        return replace(self._each(lambda x: x.to(device)), unloaded=self.unloaded)
 
     def motion(self) -> Motion:
         """The motion of these samples, for the regressor."""
         base, zero = self.base, self.time.new_zeros(len(self), 3)
         force = base.specific_force
         if force is None:  # of a bolted base
-            force = zero - zero.new_tensor(GRAVITY_WORLD)
+            force = torch.stack([zero[:, 0] - g for g in GRAVITY_WORLD], dim=1)
             if (rotation := base.rotation) is not None:
                 force = (rotation.mT @ force[..., None])[..., 0]
         omega = zero if base.angular_velocity is None else base.angular_velocity
