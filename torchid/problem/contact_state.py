@@ -105,6 +105,7 @@ class ContactStateLayout:
         coupled_joints, uncoupled_joints: indices of independent joints.
         moved: nodes that coupled joints move directly, ascending, with the joint's index among the coupled ones and the
             ratio of its motion.
+        ratios: these ratios.
         nodes: whose parameters coupled rows depend on, in the columns `inertial` and `friction`.
         row_std: noise of the base rows and coupled joints [N, N m].
         wrench_std: noise of the measured components, body by body [N, N m].
@@ -115,6 +116,7 @@ class ContactStateLayout:
     coupled_joints: tuple[int, ...]
     uncoupled_joints: tuple[int, ...]
     moved: tuple[tuple[int, int, float], ...]
+    ratios: Tensor
     nodes: range
     inertial: range
     friction: tuple[int, ...]
@@ -148,6 +150,7 @@ class ContactStateLayouts:
         self._measured = measured_components(self.contacts, sensors)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
         self._cache: dict[ContactState, ContactStateLayout] = {}
+        self._rotations: dict[int, Tensor] = {}
 
     def layout(self, state: ContactState) -> ContactStateLayout:
         """The layout of a contact state, cached."""
@@ -173,6 +176,7 @@ class ContactStateLayouts:
             coupled,
             tuple(joint for joint in measured if joint not in moving),
             tuple(moved),
+            self._tensor(np.array([ratio for _, _, ratio in moved])),
             nodes_below,
             range(starts[nodes_below.start], starts[nodes_below.stop]),
             tuple(self.columns.friction(body) + k for body, _, _ in moved for k in (0, 1)),
@@ -186,9 +190,16 @@ class ContactStateLayouts:
         )
         return self._cache[state]
 
+    def frame_rotation(self, contact: int) -> Tensor:
+        """Axes of a contact frame in its node's joint frame, (3, 3), cached."""
+        if contact not in self._rotations:
+            self._rotations[contact] = self._tensor(self.frames[contact][1][:3, :3])
+        return self._rotations[contact]
+
     def clear(self) -> None:
         """Drop all layouts, when the robot's constants move to another device or precision."""
         self._cache.clear()
+        self._rotations.clear()
 
     def _nodes_below(self, moved: list[int]) -> range:
         """Hull of the subtrees of some nodes; with a floating base, all nodes."""

@@ -240,9 +240,8 @@ class RowBuilder(nn.Module):
 
     def _rotation(self, contact: int, kinematics: ChunkKinematics) -> Tensor:
         """Rotation contact frame to world, (B, 3, 3), or to a bolted base whose orientation is unknown."""
-        body, T_joint_frame = self.frames[contact]
-        in_body = kinematics.screw_axes.new_tensor(T_joint_frame[:3, :3])
-        rotation = kinematics.states.rotation[:, :, body].permute(2, 0, 1) @ in_body
+        body, _ = self.frames[contact]
+        rotation = kinematics.states.rotation[:, :, body].permute(2, 0, 1) @ self._layouts.frame_rotation(contact)
         return rotation if kinematics.rotation_world_base is None else kinematics.rotation_world_base @ rotation
 
     def recorded_torque(self, samples: Samples) -> Tensor:
@@ -270,7 +269,7 @@ class RowBuilder(nn.Module):
         if not (self.tree.base_rows or layout.coupled_joints):
             return
         unmeasured, measured = self._contact_rows(layout, dynamics)
-        torque = self.recorded_torque(samples)[:, list(layout.coupled_joints)]
+        torque = self.recorded_torque(samples)[:, self._index(layout.coupled_joints)]
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(layout.wrench_std):
             f = f + (measured.mT @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
@@ -307,7 +306,7 @@ class RowBuilder(nn.Module):
         torch.sum(W * f[:, None], dim=0, out=X[-1])
         moved = {body: index for index, (body, _, _) in enumerate(layout.moved)}
         own = W[self._index(tree.base_rows + position for _, position, _ in layout.moved)]
-        own *= own.new_tensor([ratio for _, _, ratio in layout.moved])[:, None, None]
+        own *= layout.ratios[:, None, None]
         velocity = dynamics.joints.velocity[self._index(moved)][:, None]
         friction = X[len(inertial) : len(inertial) + 2 * len(moved)].unflatten(0, (len(moved), 2))
         torch.mul(own, tree.coulomb_sign(velocity), out=friction[:, 0])
@@ -360,7 +359,7 @@ class RowBuilder(nn.Module):
         return tuple(both.permute(2, 0, 1).split(sizes, dim=1))
 
     def _index(self, indices: Iterable[int]) -> Tensor:
-        return torch.tensor(list(indices), dtype=torch.int64, device=self.device)
+        return self.tree.index(indices)
 
     def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""
