@@ -244,7 +244,10 @@ def _bases(A: Tensor, floor: float | Tensor) -> Iterator[tuple[Tensor | slice, T
         negligible = (tolerance * torch.linalg.matrix_norm(R)).clamp_min(floor)
         ratio = negligible * torch.linalg.matrix_norm(inverse)
         suspect = ~(ratio < 1.0 / _SUSPECT)  # so written, infinite and undefined ones are suspect too
-        V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
+        if A.device.type == "cpu":
+            V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
+        else:
+            V = complement(reflectors, tau)
         if not _exists(suspect):
             yield slice(None), V
             return
@@ -257,6 +260,21 @@ def _bases(A: Tensor, floor: float | Tensor) -> Iterator[tuple[Tensor | slice, T
     for r in rank.unique().tolist():
         same = rank == r
         yield remaining[same], Vh[same, r:].mT
+
+
+def complement(reflectors: Tensor, tau: Tensor) -> Tensor:
+    """The last m - k columns of Q, (B, m, m - k), from what `torch.geqrf` returns of (B, m, k).
+
+    All samples at once, from the product of their reflections in closed form, `1 - Y T Y^T` (Schreiber, Van Loan 1989):
+    on a GPU, `torch.ormqr` takes one sample after the other. On a CPU that is the faster of the two.
+    """
+    m, k = reflectors.shape[1:]
+    Y = reflectors.tril(-1)
+    Y.diagonal(dim1=1, dim2=2).fill_(1.0)
+    D = tau[:, :, None]
+    last = Y[:, k:].mT  # Y^T of the last columns of the identity
+    T_last = torch.linalg.solve_triangular(D * (Y.mT @ Y).triu(1), D * last, upper=True, unitriangular=True)
+    return nn.functional.pad(torch.eye(m - k, dtype=Y.dtype, device=Y.device), (0, 0, k, 0)) - Y @ T_last
 
 
 def _exists(suspect: Tensor) -> bool:
