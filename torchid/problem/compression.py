@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchid import parameters, ranks
 from torchid.parameters import Array
-from torchid.problem.chunks import CHUNK, ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
+from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder, Workspace
@@ -59,7 +59,7 @@ class Part:
 def compress(
     logs: Sequence[Samples],
     builder: RowBuilder,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> TriangularFactor:
@@ -73,7 +73,7 @@ def compress(
 def compress_by_state(
     logs: Sequence[Samples],
     builder: RowBuilder,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> dict[ContactState, TriangularFactor]:
@@ -85,7 +85,7 @@ def compress_by_state(
 def compress_parts(
     logs: Sequence[Samples],
     builder: RowBuilder,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     weight_rows: RowWeighting | None = None,

@@ -83,9 +83,25 @@ class Samples:
         """Some of the samples."""
         return self._each(lambda x: x[index])
 
-    def to(self, device: torch.device | str) -> Samples:
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Samples:
         """The samples on another device, all but readings in the air: these become a few means, on the CPU."""
-        return replace(self._each(lambda x: x.to(device)), unloaded=self.unloaded)
+        return self._each_that_moves(lambda x: x.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> Samples:
+        """The samples with page-locked copies of what `to` moves, which a GPU can read while the host goes on."""
+        return self._each_that_moves(torch.Tensor.pin_memory)
+
+    def keep_for(self, stream: torch.Stream) -> None:
+        """Keep the memory of what `to` has moved until a stream of the device has done what it was given so far."""
+
+        def kept(x: Tensor) -> Tensor:
+            x.record_stream(stream)
+            return x
+
+        self._each_that_moves(kept)
+
+    def _each_that_moves(self, change: Callable[[Tensor], Tensor]) -> Samples:
+        return replace(replace(self, unloaded=None)._each(change), unloaded=self.unloaded)
 
     def motion(self) -> Motion:
         """The motion of these samples, for the regressor."""
