@@ -139,17 +139,11 @@ def from_first(compute: Callable[[], T], about: str) -> T:
     Raises:
         Exception: what `compute` raises.
     """
-    global _sharing
-    if _sharing is None:
-        return compute()
-    together, value = _sharing, None
-    if together.rank == 0:
-        _sharing = _ALONE
-        try:
+    value = None
+    if is_first():
+        with apart():
             value = compute()
-        finally:
-            _sharing = together
-    out: T = together.exchange(about, value)[0]
+    out: T = gather(value, about)[0]  # type: ignore[assignment]
     return out
 
 
@@ -200,16 +194,21 @@ def share_out(items: Sequence[T], compute: Callable[[T], Result], about: str, si
     Raises:
         Exception: what `compute` raises, in any process.
     """
-    global _sharing
-    if _sharing is None:
-        return [compute(item) for item in items]
-    together, own = _sharing, items[own_share(sizes)]
-    _sharing = _ALONE
-    try:
+    own = items[own_share(sizes)]
+    with apart():
         results = [compute(item) for item in own]
+    return list(chain.from_iterable(gather(results, about)))
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Share nothing within the block, in which processes do different things."""
+    global _sharing
+    together, _sharing = _sharing, _ALONE
+    try:
+        yield
     finally:
         _sharing = together
-    return list(chain.from_iterable(together.exchange(about, results)))
 
 
 @contextmanager
