@@ -24,6 +24,7 @@ from torchid.fitting.fleet import row_model
 from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports, require_base, state_reports
 from torchid.logs.containers import FACTORS, list_bag_files
+from torchid.logs.remote import is_url
 from torchid.problem import Samples
 from torchid.problem.compressed_log import compress_log
 from torchid.problem.noise import LogElsewhere
@@ -72,6 +73,8 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
         InputError: whatever does not fit; nothing has been written then.
         BaseLostError: the sensors cannot see the base.
     """
+    if is_url(str(output)):
+        raise ConfigError(output, "output", "a URL", "a folder on this machine, to be copied from there")
     output = Path(output)
     config.logs.require_samples("compress")
     ranks.from_first(partial(check_free, output, config.overwrite, COMPRESSED, inputs_of(config)), "output")
