@@ -1,11 +1,14 @@
 """Time the regressor and the whole pipeline against a per-sample pipeline of Pinocchio and NumPy, in one run.
 
-    python scripts/benchmark.py [--samples 65536] [--repeats 5]
+    python scripts/benchmark.py [--samples 65536] [--repeats 5] [--device cuda]
 
 Needs the packages pin and example-robot-data (extra `[oracle]`) and Clarabel (extra `[certified]`). Pipelines
 start from the arrays of a log and end with parameters. Sensors are `joints` (torques measured, contact forces not); all
 feet are in contact in two thirds of the samples. Consistent parameters are timed on noisy data of Solo12 that were
 generated with other, physically consistent parameters.
+
+With `--device cuda` torchid's part runs on a GPU, the per-sample pipelines on the CPU as ever. A second table has the
+stages of the compression beside their floors, see `scripts/stages.py`.
 """
 
 from __future__ import annotations
@@ -23,16 +26,20 @@ import pinocchio as pin
 import torch
 from rich.console import Console
 from rich.table import Table
+from stages import Limits, Stages, measure_stages, stage_table, synchronize
 
 from torchid.errors import TorchidWarning, how_to_install
 from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
+from torchid.problem.chunks import chunk_size
 from torchid.problem.rows import ChunkDynamics
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors
+
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -166,7 +173,7 @@ def torques_of(robot: Robot, case: Case, samples: Samples, phi: Array, noise: fl
     return replace(samples, torque=noisy)
 
 
-def measure_consistent(count: int, repeats: int) -> dict[str, float]:
+def measure_consistent(count: int, repeats: int, device: torch.device) -> dict[str, float]:
     """Median seconds from the arrays of a log of Solo12 to parameters."""
     case = CASES[0]
     with warnings.catch_warnings():
@@ -174,7 +181,8 @@ def measure_consistent(count: int, repeats: int) -> dict[str, float]:
         robot = load_robot(robots_folder() / case.urdf)
     contacts = [Contact(foot, case.kind) for foot in case.feet]
     noise = 0.1
-    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts), SensorNoise(noise)))
+    sensors = named_sensors("joints", robot.n, len(contacts), SensorNoise(noise))
+    builder = RowBuilder(robot, contacts, sensors).to(device)
     phi = perturb_parameters(robot.nominal, 0.2, np.random.default_rng(0))
     phi[1:, FRICTION] = 0.1
     samples = torques_of(robot, case, random_samples(robot, len(contacts), count), phi.flatten(), noise)
@@ -187,37 +195,44 @@ def measure_consistent(count: int, repeats: int) -> dict[str, float]:
     def pipeline(estimator: LeastSquares | Consistent) -> Callable[[], object]:
         return lambda: estimator.solve(linear_problem(compress([samples], builder), builder, robot))
 
-    return medians({name: (pipeline(estimator), 10**6) for name, estimator in estimators.items()}, repeats)
+    return medians({name: (pipeline(estimator), 10**6) for name, estimator in estimators.items()}, repeats, device)
 
 
-def medians(pipelines: dict[str, tuple[Callable[[], object], int]], repeats: int) -> dict[str, float]:
+def medians(
+    pipelines: dict[str, tuple[Callable[[], object], int]], repeats: int, device: torch.device = _CPU
+) -> dict[str, float]:
     """Median microseconds per sample; the pipelines take turns, so that other load affects all alike."""
     times: dict[str, list[float]] = {name: [] for name in pipelines}
     for work, _ in pipelines.values():
         work()
     for _ in range(repeats):
         for name, (work, size) in pipelines.items():
-            times[name].append(microseconds(work, size))
+            times[name].append(microseconds(work, size, device))
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def microseconds(work: Callable[[], object], samples: int) -> float:
-    """Wall time per sample of one call."""
+def microseconds(work: Callable[[], object], samples: int, device: torch.device) -> float:
+    """Wall time per sample of one call, until a GPU has done what it was given."""
+    synchronize(device)
     start = time.perf_counter()
     work()
+    synchronize(device)
     return (time.perf_counter() - start) / samples * 1e6
 
 
-def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
-    """Medians of microseconds per sample of one robot."""
+def measure(
+    case: Case, count: int, repeats: int, device: torch.device, limits: Limits
+) -> tuple[dict[str, float], Stages]:
+    """Medians of microseconds per sample of one robot, and its stages."""
     urdf = robots_folder() / case.urdf
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
         robot = load_robot(urdf)
     contacts = [Contact(foot, case.kind) for foot in case.feet]
-    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts)))
+    builder = RowBuilder(robot, contacts, named_sensors("joints", robot.n, len(contacts))).to(device)
     samples = random_samples(robot, len(contacts), count)
-    per_sample, regressor = PerSample(urdf, robot, case), Regressor(robot)
+    per_sample, regressor = PerSample(urdf, robot, case), Regressor(robot).to(device)
+    there, step = samples.to(device), 1024 if device.type == "cpu" else chunk_size(device)
     few = samples[torch.arange(0, count, 32)]
 
     def pipeline() -> None:
@@ -226,8 +241,8 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
     def in_chunks(work: Callable[[Samples], object]) -> Callable[[], None]:
         def run() -> None:
             with torch.inference_mode():
-                for start in range(0, count, 1024):
-                    work(samples[start : start + 1024])
+                for start in range(0, count, step):
+                    work(there[start : start + step])
 
         return run
 
@@ -242,7 +257,7 @@ def measure(case: Case, count: int, repeats: int) -> dict[str, float]:
         "per sample, Gram": (lambda: per_sample.by_gram(few), len(few)),
         "torchid": (pipeline, count),
     }
-    return medians(pipelines, repeats)
+    return medians(pipelines, repeats, device), measure_stages(builder, samples, limits)
 
 
 def main() -> None:
@@ -250,10 +265,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--samples", type=int, default=65536)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--device", type=torch.device, default=_CPU, help="cpu or cuda")
     arguments = parser.parse_args()
-    table = Table(title=f"Median microseconds per sample, {torch.get_num_threads()} threads, float64")
-    results = {case.name: measure(case, arguments.samples, arguments.repeats) for case in CASES}
-    measured = measure_consistent(10_500, arguments.repeats)
+    device = arguments.device
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("benchmark: --device: found no GPU that torch can use; accepted: cpu, or a machine with one")
+    table = Table(title=f"Median microseconds per sample, {torch.get_num_threads()} threads, float64, {device}")
+    limits, results, stages = Limits.of(device), dict[str, dict[str, float]](), dict[str, Stages]()
+    for case in CASES:
+        results[case.name], stages[case.name] = measure(case, arguments.samples, arguments.repeats, device, limits)
+    measured = measure_consistent(10_500, arguments.repeats, device)
     table.add_column("")
     for case in CASES:
         table.add_column(case.name, justify="right")
@@ -268,6 +289,7 @@ def main() -> None:
     consistent.add_row(*(f"{seconds:.2f}" for seconds in measured.values()))
     console = Console(width=100)
     console.print(table)
+    console.print(stage_table(stages, limits, device))
     console.print(consistent)
 
 

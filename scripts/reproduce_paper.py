@@ -5,18 +5,21 @@ and under every imperfection.
 
     python scripts/reproduce_paper.py             # eight minutes on two cores
     python scripts/reproduce_paper.py --quick     # one minute: fewer and shorter motions
+    torchrun --standalone --nproc-per-node 2 scripts/reproduce_paper.py      # draws shared, the same results
 """
 
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from paper.report import study_tables, write_study
 from paper.settings import Study
 from paper.study import Reproduction
 
-from torchid.boundary import run_guarded
+from torchid import ranks
+from torchid.boundary import run_guarded, run_in_ranks
 from torchid.commands.folder import STUDY, check_free, new_folder
 from torchid.config import load_simulation
 from torchid.errors import about_file
@@ -28,6 +31,11 @@ SENSOR_SETS = ("full", "contacts", "joints", "reduced")
 
 
 def main() -> int:
+    """Run the study in this process, or in all that torchrun has started; the first prints and writes."""
+    return run_in_ranks("reproduce_paper", run)
+
+
+def run() -> int:
     """Run the study, print its tables and write its folder."""
     parser = argparse.ArgumentParser(description="Reproduce section V of Mistry, Schaal, Yamane (2009).")
     parser.add_argument("--quick", action="store_true", help="fewer and shorter motions, fewer draws")
@@ -40,13 +48,17 @@ def main() -> int:
 
 def reproduce(options: argparse.Namespace) -> None:
     """Run the study with the options of the command line."""
-    check_free(options.output, options.overwrite, STUDY)
     experiments = {name: CONFIGS / f"biped_{name}.yaml" for name in SENSOR_SETS}
-    with about_file(SIMULATION):
+    with ranks.share_work(), about_file(SIMULATION):
+        ranks.from_first(partial(check_free, options.output, options.overwrite, STUDY), "output")
         study = Study(load_simulation(SIMULATION), experiments)
-        with new_folder(options.output, options.overwrite, STUDY) as folder:
-            results, series = Reproduction(study.quick() if options.quick else study).run(folder)
-            write_study(folder, results, series)
+        results, series = Reproduction(study.quick() if options.quick else study).run()
+
+        def write() -> None:
+            with new_folder(options.output, options.overwrite, STUDY) as folder:
+                write_study(folder, results, series)
+
+        ranks.from_first(write, "study folder")
     print_tables(*study_tables(results).values())
     print(f"written to {options.output}")
 

@@ -31,7 +31,12 @@ _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sen
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
-_SHARED = ("identify", "evaluate", "analyze")  # by the processes that torchrun has started; the first runs all others
+_SHARED = (
+    "identify",
+    "compress",
+    "evaluate",
+    "analyze",
+)  # by the processes that torchrun has started; the first runs all others
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -119,9 +119,9 @@ def max_unpacked_bytes(size: int) -> int:
     return max(MAX_SMALL, MAX_GROWTH * size, MAX_GROWTH_LARGE * (size - LARGE))
 
 
-def check_unpacked_size(path: Path, total: int) -> None:
-    """Raise LogError where a file declares arrays of `total` bytes, far more than its size allows."""
-    size = path.stat().st_size
+def check_unpacked_size(path: Path, total: int, copy: Path | None = None) -> None:
+    """Raise LogError where a file, or its copy, declares arrays of `total` bytes, far more than its size allows."""
+    size = (copy or path).stat().st_size
     if total > max_unpacked_bytes(size):
         found = f"arrays of {total} bytes in a file of {size}"
         accepted = f"at most {max_unpacked_bytes(size)} bytes in a file of this size"

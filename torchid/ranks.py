@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
-from itertools import accumulate
+from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from torchid.errors import InputError, TorchidError
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
 T = TypeVar("T")
+Result = TypeVar("Result")
 
 _LAUNCHED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # torchrun sets them
 #: For one exchange: processes wait for the slowest. Failures are told, and the death of a process ends its connections.
@@ -138,17 +139,11 @@ def from_first(compute: Callable[[], T], about: str) -> T:
     Raises:
         Exception: what `compute` raises.
     """
-    global _sharing
-    if _sharing is None:
-        return compute()
-    together, value = _sharing, None
-    if together.rank == 0:
-        _sharing = _ALONE
-        try:
+    value = None
+    if is_first():
+        with apart():
             value = compute()
-        finally:
-            _sharing = together
-    out: T = together.exchange(about, value)[0]
+    out: T = gather(value, about)[0]  # type: ignore[assignment]
     return out
 
 
@@ -183,6 +178,37 @@ def own_share(sizes: Sequence[int]) -> slice:
         for size, end in zip(sizes, ends, strict=True)
     ]
     return slice(owners.index(rank()), len(owners) - owners[::-1].index(rank())) if rank() in owners else slice(0)
+
+
+def share_out(items: Sequence[T], compute: Callable[[T], Result], about: str, sizes: Sequence[int]) -> list[Result]:
+    """What a function makes of each of some items, in their order, each item the work of one process alone.
+
+    Results are those of one process to the last bit, where sharing the samples of each would round otherwise.
+
+    Args:
+        items: the same number in all processes.
+        compute: whose passes over samples a process makes alone; what it returns pickles.
+        about: as for `gather`.
+        sizes: how much work each item is.
+
+    Raises:
+        Exception: what `compute` raises, in any process.
+    """
+    own = items[own_share(sizes)]
+    with apart():
+        results = [compute(item) for item in own]
+    return list(chain.from_iterable(gather(results, about)))
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Share nothing within the block, in which processes do different things."""
+    global _sharing
+    together, _sharing = _sharing, _ALONE
+    try:
+        yield
+    finally:
+        _sharing = together
 
 
 @contextmanager

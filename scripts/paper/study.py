@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from paper.fits import Series, compress_groups, predict_series
 from paper.results import NOMINAL, TRUE, Ranks, Record, Results
 from paper.settings import SHOWN, SQUATS, TRAINING, UNSEEN, Condition, Study, conditions
-from torchid import parameters
+from torchid import parameters, ranks
 from torchid.commands.simulate import nominal_parameters, simulate
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file
@@ -38,8 +38,17 @@ class _Draw:
     exact: Samples
 
 
+@dataclass(frozen=True)
+class _Outcome:
+    """What one draw gives: errors of every fit, ranks, and the forces over time, if they are those that are shown."""
+
+    records: list[Record]
+    ranks: list[Ranks]
+    shown: list[Series]
+
+
 class Reproduction:
-    """Runs a study."""
+    """Runs a study; processes that share the work each take some draws, with the results of one process."""
 
     def __init__(self, study: Study) -> None:
         """Read the experiment files.
@@ -57,12 +66,9 @@ class Reproduction:
                     raise ConfigError(study.experiments[name], key, f"{found}", f"{common}, as in the other files")
         self._robot, self._contacts, self._filter = first.robot, first.contacts, first.config.preprocessing
         self._evaluation = Evaluation(first.robot, first.contacts, first.config.device)
-        self._records: list[Record] = []
-        self._ranks: list[Ranks] = []
-        self._shown: list[Series] = []
 
-    def run(self, folder: Path) -> tuple[Results, Series]:
-        """Run the study; `folder` holds the simulated logs meanwhile.
+    def run(self) -> tuple[Results, Series]:
+        """Run the study.
 
         Returns:
             Errors of every fit, and forces over time of one of them.
@@ -71,19 +77,24 @@ class Reproduction:
             InputError: the robot falls.
         """
         cases = conditions(self.study.simulation)
-        names = [motion.name for motion in self.study.simulation.motions]
-        for friction in (False, True):
-            plant = [case for case in cases if case.friction == friction]
-            exact = self._simulated(friction, folder / "simulation", names)
-            with progress_bars() as bars:
-                steps = sum(map(self._draws, plant)) * (len(self._experiments) + 1)
-                bar = bars.add_task(f"fitting, {'with' if friction else 'no'} joint friction", total=steps)
-                done = partial(bars.advance, bar)
-                for case in plant:
-                    for number in range(self._draws(case)):
-                        self._examine(self._draw(case, number, exact), done)
-                        done()
-        return Results(self._records, self._ranks), self._shown[0]
+        exact = ranks.share_out((False, True), self._simulated, "simulation", sizes=(1, 1))
+        draws = [(case, number) for case in cases for number in range(self._draws(case))]
+        share = draws[ranks.own_share([1] * len(draws))]
+        with progress_bars() as bars:
+            bar = bars.add_task("fitting", total=len(share) * (len(self._experiments) + 1))
+            done = partial(bars.advance, bar)
+
+            def examine(draw: tuple[Condition, int]) -> _Outcome:
+                case, number = draw
+                outcome = self._examine(self._draw(case, number, exact[case.friction]), done)
+                done()
+                return outcome
+
+            outcomes = ranks.share_out(draws, examine, "draws", sizes=[1] * len(draws))
+        records, found, shown = (
+            [x for one in outcomes for x in getattr(one, part)] for part in ("records", "ranks", "shown")
+        )
+        return Results(records, found), shown[0]
 
     def _experiment(self, path: Path) -> Experiment:
         """An experiment file, for the study's robot and logs."""
@@ -94,14 +105,14 @@ class Reproduction:
     def _draws(self, condition: Condition) -> int:
         return self.study.noise_draws if condition.random else 1
 
-    def _simulated(self, friction: bool, folder: Path, names: Sequence[str]) -> dict[str, Log]:
+    def _simulated(self, friction: bool) -> dict[str, Log]:
         """Exact logs of the motions, with or without joint friction."""
         config = self.study.simulation
         plant = replace(config.friction, enabled=friction)
-        simulate(replace(config, output=folder, friction=plant))
-        logs = {name: read_log(folder / "exact" / f"{name}.npz") for name in names}
-        shutil.rmtree(folder)
-        return logs
+        with tempfile.TemporaryDirectory() as folder:
+            output = Path(folder) / "simulation"
+            simulate(replace(config, output=output, friction=plant))
+            return {motion.name: read_log(output / "exact" / f"{motion.name}.npz") for motion in config.motions}
 
     def _draw(self, condition: Condition, number: int, exact: Mapping[str, Log]) -> _Draw:
         """Corrupt, filter and bind all logs of a condition."""
@@ -119,31 +130,33 @@ class Reproduction:
         unseen = next(name for name in exact if name.startswith(UNSEEN))
         return _Draw(condition, number, groups, samples(unseen, condition), samples(unseen, clean))
 
-    def _examine(self, draw: _Draw, done: Callable[[], None]) -> None:
+    def _examine(self, draw: _Draw, done: Callable[[], None]) -> _Outcome:
         """Fit every sensor set on every training set from every nominal draw, and evaluate."""
         friction, nominals = draw.condition.friction, self._nominals()
+        out = _Outcome([], [], [])
         vectors: dict[str, dict[str, list[Array]]] = {training: {} for training in TRAINING}
         for sensors, experiment in self._experiments.items():
             logs = compress_groups(experiment, draw.groups)
             for training, groups in TRAINING.items():
                 vectors[training][sensors] = [fit.phi for fit in logs.fit(groups, nominals, friction)]
                 if draw.condition.name == SHOWN[0] and draw.number == 0:
-                    self._ranks.append(Ranks(training, sensors, logs.ranks(groups, friction)))
+                    out.ranks.append(Ranks(training, sensors, logs.ranks(groups, friction)))
             done()
         true = self._true(friction).flatten()
         for training, fitted in vectors.items():
             rows = {NOMINAL: [nominal.flatten() for nominal in nominals], **fitted, TRUE: [true]}
-            self._evaluate(draw, training, rows)
+            out.records.extend(self._evaluate(draw, training, rows))
             if (draw.condition.name, training) == SHOWN and draw.number == 0:
                 first = {name: phi[0] for name, phi in rows.items()}
-                self._shown.append(predict_series(self._evaluation, draw.exact, first))
+                out.shown.append(predict_series(self._evaluation, draw.exact, first))
+        return out
 
-    def _evaluate(self, draw: _Draw, training: str, rows: Mapping[str, Sequence[Array]]) -> None:
+    def _evaluate(self, draw: _Draw, training: str, rows: Mapping[str, Sequence[Array]]) -> Iterator[Record]:
         candidates = np.stack([phi for vectors in rows.values() for phi in vectors])
         measured, exact = (self._evaluation.metrics([log], candidates) for log in (draw.measured, draw.exact))
         labels = [(name, number) for name, vectors in rows.items() for number in range(len(vectors))]
         for (name, number), *metrics in zip(labels, measured, exact, strict=True):
-            self._records.append(Record(draw.condition.name, training, name, draw.number, number, *metrics))
+            yield Record(draw.condition.name, training, name, draw.number, number, *metrics)
 
     def _nominals(self) -> list[Array]:
         """Nominal parameters (L, 12), one per draw."""

@@ -118,7 +118,7 @@ def is_running(pid: int) -> bool:
 def finish(command: Sequence[str]) -> tuple[int, str, str]:
     """Exit status, standard output and standard error of a command."""
     with started(command) as process:
-        printed, complained = process.communicate(timeout=200)
+        printed, complained = process.communicate(timeout=400)
     return process.returncode, printed, complained
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from paper.results import NOMINAL, TRUE, Record, Results, examine_claims
+from repository import ROOT
 from script_calls import call
+from shared_work import TORCHRUN, finish
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchid.problem import Metrics
@@ -129,6 +132,31 @@ def test_figures_and_charts_are_written(study: tuple[Path, str]) -> None:
     joints.Reload()
     assert set(joints.Tags()["scalars"]) == {f"{training}/{group}" for training in TRAINING for group in ROW_GROUPS}
     assert len(joints.Scalars("all runs/base_force")) == len(CONDITIONS)
+
+
+@pytest.mark.slow
+def test_two_processes_write_the_study_of_one(tmp_path: Path) -> None:
+    script, outputs = str(ROOT / "scripts" / "reproduce_paper.py"), []
+    for name, before in (("one", (sys.executable,)), ("two", (*TORCHRUN, "2"))):
+        outputs.append(tmp_path / name)
+        status, printed, complained = finish((*before, script, "--quick", "--output", str(outputs[-1])))
+        assert status == 0, complained
+        assert printed.count("written to") == 1
+    for name in ("results.json", "tables.txt", "rms.png", "forces.png", "projected.png"):
+        assert (outputs[1] / name).read_bytes() == (outputs[0] / name).read_bytes(), name
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "two"]
+
+
+@pytest.mark.slow
+def test_a_folder_that_holds_something_else_ends_both_processes_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    script = str(ROOT / "scripts" / "reproduce_paper.py")
+    status, printed, complained = finish((*TORCHRUN, "2", script, "--quick", "--output", str(tmp_path)))
+    assert status != 0
+    assert not printed
+    (line,) = [line for line in complained.splitlines() if line.startswith("reproduce_paper: ")]
+    assert str(tmp_path) in line
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from synthetic import Array
 from torch import Tensor
 
-from torchid.sensing.projection import null_space
+from torchid.sensing.projection import complement, null_space
 
 
 def orthogonal(rng: np.random.Generator, size: int) -> Array:
@@ -116,3 +116,13 @@ def test_a_jacobian_of_rounding_errors_alone_has_rank_0(dtype: torch.dtype, with
         bases |= dict(zip(torch.arange(4)[index].tolist(), V, strict=True))
     assert [V.shape[1] for V in bases.values()] == [4, 5, 5, 5]
     assert (bases[0][1].abs() < 100.0 * eps).all()
+
+
+@pytest.mark.parametrize(("m", "k"), [(18, 12), (35, 12), (6, 6), (7, 1), (1, 1)])
+def test_what_a_gpu_makes_of_reflections_is_what_lapack_makes_of_them(m: int, k: int) -> None:
+    A = torch.randn(40, m, k, generator=torch.Generator().manual_seed(m), dtype=torch.float64)
+    A[0], A[1, 1:], A[2, :, -1] = 0.0, 0.0, A[2, :, 0]  # reflections that are none
+    reflectors, tau = torch.geqrf(A)
+    last = torch.eye(m, dtype=torch.float64)[:, k:].expand(40, m, m - k)
+    expected = torch.ormqr(reflectors, tau, last)
+    torch.testing.assert_close(complement(reflectors, tau), expected, rtol=0.0, atol=1e-14)

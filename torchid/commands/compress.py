@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from rich.progress import Progress
 
+from torchid import ranks
 from torchid.commands.folder import COMPRESSED, check_free, new_folder
 from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import LogReader
@@ -19,8 +24,10 @@ from torchid.fitting.fleet import row_model
 from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports, require_base, state_reports
 from torchid.logs.containers import FACTORS, list_bag_files
+from torchid.logs.remote import is_url
 from torchid.problem import Samples
 from torchid.problem.compressed_log import compress_log
+from torchid.problem.noise import LogElsewhere
 from torchid.report.tables import progress_bars
 
 
@@ -55,7 +62,8 @@ class Compression:
 def compress(config: ExperimentConfig, output: str | Path) -> Compression:
     """Compress the training logs of an experiment and write a folder with a file for each, whole or not at all.
 
-    Noise that the experiment does not state is estimated from these logs together.
+    Noise that the experiment does not state is estimated from these logs together. Processes that share the work each
+    read and compress some of the logs, and the first writes: the same files, bit for bit, as from one process.
 
     Args:
         config: the experiment; what it says of tests and of its own output does not matter.
@@ -65,22 +73,26 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
         InputError: whatever does not fit; nothing has been written then.
         BaseLostError: the sensors cannot see the base.
     """
+    if is_url(str(output)):
+        raise ConfigError(output, "output", "a URL", "a folder on this machine, to be copied from there")
     output = Path(output)
     config.logs.require_samples("compress")
-    check_free(output, config.overwrite, COMPRESSED, inputs_of(config))
+    ranks.from_first(partial(check_free, output, config.overwrite, COMPRESSED, inputs_of(config)), "output")
     names = _file_names(config.logs.train)
+    ranks.require_same(names, "logs.train")
+    share = ranks.own_share(ranks.as_first([_size(path) for path in config.logs.train], "sizes of the logs"))
+    paths = config.logs.train[share]
     with progress_bars() as bars:
         experiment = set_up(config)
-        logs, excluded = _read(experiment, output, bars)
         builder = experiment.builder(experiment.sensors)
-        states = [state_reports([log], builder) for log in logs]
-        together = merge_state_reports(states)
+        with _told_by_first(), ranks.apart():
+            logs, excluded = _read(experiment, paths, output, bars)
+            states = [state_reports([log], builder) for log in logs]
+        together = merge_state_reports(chain.from_iterable(ranks.gather(states, "contact states")))
         require_base(together, config.sensors.on_base_lost)
-        noise = experiment.estimate_noise(logs, experiment.sensors)
-        experiment = with_noise(experiment, noise)
-        factors = _compressed(experiment, logs, states, excluded, bars)
-        with during("writing", output), new_folder(output, config.overwrite, COMPRESSED) as folder:
-            files = [_write(folder / name, one) for name, one in zip(names, factors, strict=True)]
+        noise = experiment.estimate_noise(_with_those_elsewhere(logs), experiment.sensors)
+        factors = _compressed(with_noise(experiment, noise), paths, logs, states, excluded, bars)
+        files = _write_all(names, zip(names[share], factors, strict=True), output, config.overwrite)
     return Compression(files=files, states=together, noise=noise, output=output)
 
 
@@ -93,9 +105,36 @@ def _file_names(logs: Sequence[Path]) -> list[str]:
     return names
 
 
-def _read(experiment: Experiment, output: Path, bars: Progress) -> tuple[list[Samples], list[int]]:
-    """The logs, and how many samples of each were left out."""
-    files = experiment.config.logs.train
+def _size(path: Path) -> int:
+    """Bytes of a log's files; 1 if they are not here, which reading will say."""
+    with suppress(OSError):
+        return sum(file.stat().st_size for file in list_bag_files(path) or [path])
+    return 1
+
+
+@contextmanager
+def _told_by_first() -> Iterator[None]:
+    """Let the first process warn of what any of them warns of within the block."""
+    with nullcontext() if ranks.is_first() else warnings.catch_warnings(record=True) as caught:
+        yield
+    for of_process in ranks.gather([(str(one.message), one.category) for one in caught or ()], "warnings"):
+        for message, category in of_process if ranks.is_first() else ():
+            warnings.warn(message, category, stacklevel=2)
+
+
+def _with_those_elsewhere(logs: Sequence[Samples]) -> list[Samples | LogElsewhere]:
+    """All logs of the experiment in order; of those that other processes have, their size."""
+    of_processes: list[list[Samples | LogElsewhere]] = [
+        [*sizes] for sizes in ranks.gather([LogElsewhere(len(x), x.oversampling) for x in logs], "sizes of the samples")
+    ]
+    of_processes[ranks.rank()] = [*logs]
+    return list(chain.from_iterable(of_processes))
+
+
+def _read(
+    experiment: Experiment, files: Sequence[Path], output: Path, bars: Progress
+) -> tuple[list[Samples], list[int]]:
+    """Logs, and how many samples of each were left out."""
     reader = LogReader(replace(experiment, config=replace(experiment.config, output=output)))
     reading = bars.add_task("reading logs", total=len(files))
     logs = reader.read(files, experiment.sensors, lambda _: bars.advance(reading))
@@ -104,6 +143,7 @@ def _read(experiment: Experiment, output: Path, bars: Progress) -> tuple[list[Sa
 
 def _compressed(
     experiment: Experiment,
+    paths: Sequence[Path],
     logs: Sequence[Samples],
     states: Sequence[list[StateReport]],
     excluded: Sequence[int],
@@ -113,7 +153,7 @@ def _compressed(
     builder = experiment.builder(experiment.sensors)
     model = row_model(experiment, builder)
     streaming = bars.add_task("streaming samples", total=sum(map(len, logs)))
-    for path, log, own, left_out in zip(experiment.config.logs.train, logs, states, excluded, strict=True):
+    for path, log, own, left_out in zip(paths, logs, states, excluded, strict=True):
         yield FactorFile(
             compress_log(log, builder, lambda n: bars.advance(streaming, n)),
             model,
@@ -123,6 +163,26 @@ def _compressed(
             left_out,
             own,
         )
+
+
+def _write_all(
+    names: Sequence[str], factors: Iterable[tuple[str, FactorFile]], output: Path, overwrite: bool
+) -> list[CompressedFile]:
+    """Write the files of all processes, by name, in the first of them: a file of each at a time."""
+    rounds: Iterable[list[tuple[str, FactorFile] | None]] = ([one] for one in factors)
+    if ranks.world_size() > 1:
+        with ranks.apart():
+            own = list(factors)
+        most = max(ranks.gather(len(own), "numbers of files"))
+        rounds = (ranks.gather(own[k] if k < len(own) else None, "files") for k in range(most))
+    files = {}
+    writing = new_folder(output, overwrite, COMPRESSED) if ranks.is_first() else nullcontext()
+    with during("writing", output), writing as folder:
+        for of_processes in rounds:
+            for name, one in filter(None, of_processes):
+                if folder is not None:
+                    files[name] = _write(folder / name, one)
+    return ranks.as_first([files[name] for name in names if name in files], "files")
 
 
 def _write(path: Path, factors: FactorFile) -> CompressedFile:

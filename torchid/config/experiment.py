@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, validate_keys
@@ -27,6 +27,7 @@ from torchid.config.sensors import (
 from torchid.errors import ConfigError, about_file, warn_about_file
 from torchid.logs import Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
+from torchid.logs.remote import RemoteFile, as_path, list_matching
 from torchid.logs.ros_topics import check_topics
 from torchid.settings import NotNegative, Positive, Seed
 
@@ -110,10 +111,10 @@ class LogsConfig:
     """Logs to fit on, held-out logs for the early stopping of a descent, and logs for tests alone.
 
     A name with `*` or `?` is a pattern for all files that match. `topics` describes the topics of bags. The logs to fit
-    on may be factors of logs, from `torchid compress`.
+    on may be factors of logs, from `torchid compress`, which may lie elsewhere: `s3://...`.
     """
 
-    train: Annotated[list[Path], Field(min_length=1)]
+    train: Annotated[list[Annotated[Path, BeforeValidator(as_path)]], Field(min_length=1)]
     test: list[Path] = dataclasses.field(default_factory=list)
     validation: list[Path] = dataclasses.field(default_factory=list)
     topics: Topics | None = None
@@ -197,6 +198,7 @@ _EXPERIMENT = FileKind(
     keys="robot, logs, sensors, output",
     list_example="contacts=[{frame: l_sole, type: flat}]",
     paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*"),
+    urls=("logs.train.*",),
     outputs=("output",),
     prepare=_with_sensors_spelled_out,
     accepted={
@@ -359,11 +361,17 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
     """The paths, with every file that matches in place of a name with * or ? in it."""
     out: list[Path] = []
     for path in paths:
-        if path.exists() or not {"*", "?"} & set(path.name):
+        if isinstance(path, RemoteFile) and path.suffix != FACTORS:
+            raise ConfigError.at_field(field, f"{path}, by URL", f"{FACTORS} files by URL; logs on this machine")
+        if not {"*", "?"} & set(path.name) or path.exists():
             out.append(path)
             continue
-        matching = path.parent.glob(path.name.replace("[", "[[]"))
-        files = sorted(file for file in matching if file.is_file() or list_bag_files(file))
+        files: Sequence[Path]
+        if isinstance(path, RemoteFile):
+            files = list_matching(path)
+        else:
+            matching = path.parent.glob(path.name.replace("[", "[[]"))
+            files = sorted(file for file in matching if file.is_file() or list_bag_files(file))
         if not files:
             raise ConfigError.at_field(field, f"no file matches {path}", "a log, or a pattern of several")
         out += files

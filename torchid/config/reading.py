@@ -20,6 +20,7 @@ from pydantic import TypeAdapter, ValidationError
 from torchid.errors import ConfigError, UnknownNameError, about_file, during, excerpt, is_plain
 from torchid.guards import MAX_DEPTH, MAX_NODES, MAX_TEXT, MAX_YAML, read_bytes
 from torchid.logs.containers import READABLE
+from torchid.logs.remote import is_url
 from torchid.settings import accepted_values
 
 _LOADER: type = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -130,6 +131,7 @@ class FileKind(Generic[T]):
         keys: the chief keys, as in "a mapping with robot, logs, ...".
         list_example: an override that gives a list as a whole.
         paths: keys that hold a path, such as `robot.urdf`; `logs.train.*` is every item of the list `logs.train`.
+        urls: those of them that may hold a URL instead.
         outputs: keys that hold the path of a result.
         prepare: takes settings and those that will override them, and returns the settings to merge; it is called for
             the file and nothing, then, for each override, for all before and it, and for it and nothing.
@@ -142,6 +144,7 @@ class FileKind(Generic[T]):
     keys: str
     list_example: str
     paths: Sequence[str] = ()
+    urls: Sequence[str] = ()
     outputs: Sequence[str] = ()
     prepare: Callable[[Settings, Settings], Settings] = _as_is
     accepted: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -173,11 +176,11 @@ def load(kind: FileKind[T], path: Path, overrides: Sequence[str] = ()) -> T:
 
 
 def _load(kind: FileKind[T], path: Path, overrides: Sequence[str]) -> T:
-    in_file = _absolute(_read(kind, path), kind.paths, path.resolve().parent)
+    in_file = _absolute(_read(kind, path), kind.paths, path.resolve().parent, kind.urls)
     settings = kind.prepare(_absolute(in_file, kind.outputs, Path.cwd()), {})
     for text in overrides:
         with about_file("command line"):
-            given = _absolute(_parsed(text), (*kind.paths, *kind.outputs), Path.cwd())
+            given = _absolute(_parsed(text), (*kind.paths, *kind.outputs), Path.cwd(), kind.urls)
         try:
             layers = _cleared(kind.prepare(settings, given), given), kind.prepare(given, {})
             settings = _container(OmegaConf.merge(*layers))
@@ -252,29 +255,33 @@ def _container(config: Any) -> Any:
     return OmegaConf.to_container(config, resolve=True)
 
 
-def _absolute(settings: Settings, keys: Sequence[str], folder: Path) -> Settings:
+def _absolute(settings: Settings, keys: Sequence[str], folder: Path, urls: Sequence[str] = ()) -> Settings:
     for key in keys:
         try:
-            settings = _absolute_at(settings, key.split("."), folder)
+            settings = _absolute_at(settings, key.split("."), folder, key in urls)
         except (RuntimeError, ValueError) as error:
             raise ConfigError.at_field(key.removesuffix(".*"), str(error), "a path") from error
     return settings
 
 
-def _absolute_at(value: Any, key: Sequence[str], folder: Path) -> Any:
+def _absolute_at(value: Any, key: Sequence[str], folder: Path, may_be_url: bool) -> Any:
     """The value with the path at a key made absolute; values of another type are left to the validation."""
     if not key:
-        return _absolute_path(value, folder) if isinstance(value, str) else value
+        return _absolute_path(value, folder, may_be_url) if isinstance(value, str) else value
     name, *rest = key
     if name == "*":
-        return [_absolute_at(item, rest, folder) for item in value] if isinstance(value, list) else value
+        return [_absolute_at(item, rest, folder, may_be_url) for item in value] if isinstance(value, list) else value
     if isinstance(value, Mapping) and name in value:
-        return {**value, name: _absolute_at(value[name], rest, folder)}
+        return {**value, name: _absolute_at(value[name], rest, folder, may_be_url)}
     return value
 
 
-def _absolute_path(value: str, folder: Path) -> str:
+def _absolute_path(value: str, folder: Path, may_be_url: bool) -> str:
     """Raises ValueError or RuntimeError (the home folder of nobody) where the value names no file."""
+    if is_url(value):
+        if not may_be_url or not is_plain(value):
+            raise ValueError(f"'{excerpt(value)}', a URL")
+        return value
     path = os.path.normpath(folder / Path(value).expanduser())
     names = [len(os.fsencode(name)) for name in Path(path).parts]
     too_long = max(names) > _LONGEST_NAME or sum(names) + len(names) > _LONGEST_PATH

@@ -25,6 +25,7 @@ from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.extras import CHANNELS, measured_channels
+from torchid.problem.noise import LogElsewhere
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import (
@@ -133,10 +134,11 @@ class Scene:
         """Nominal and identified parameters of a fit, with the extra parameters that fit them best."""
         return calibrations(fit, self.robot, builder, self.loss)
 
-    def estimate_noise(self, logs: Sequence[Samples], sensors: SensorSet | None = None) -> NoiseSummary:
-        """The noise that bound logs show of some sensors, or of all that they have; what is stated is kept."""
+    def estimate_noise(self, logs: Sequence[Samples | LogElsewhere], sensors: SensorSet | None = None) -> NoiseSummary:
+        """The noise that bound logs show of some sensors, or of all that those here have; what is stated is kept."""
         if sensors is None:
-            sensors = recorded_sensors(self.robot, self.contacts, logs, self.noise)
+            here = [log for log in logs if isinstance(log, Samples)]
+            sensors = recorded_sensors(self.robot, self.contacts, here, self.noise)
         # without conditions: of the estimator, only the ridge and the rank tolerance matter
         fitter = self.fitter(self.builder(sensors), Conditions(names=self.robot.body_names))
         return estimate_noise(logs, fitter, stated_noise(self.config.sensors.noise).keys())

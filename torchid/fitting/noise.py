@@ -16,6 +16,7 @@ from torchid.problem import LinearProblem, Samples
 from torchid.problem.noise import (
     BASE_GROUPS,
     GroupVariances,
+    LogElsewhere,
     SampledRows,
     VarianceComponentEstimator,
     noise_of_groups,
@@ -60,7 +61,9 @@ class NoiseSummary:
     passes: int
 
 
-def estimate_noise(logs: Sequence[Samples], fitter: LogFitter, stated: Collection[str] = ()) -> NoiseSummary:
+def estimate_noise(
+    logs: Sequence[Samples | LogElsewhere], fitter: LogFitter, stated: Collection[str] = ()
+) -> NoiseSummary:
     """The noise of sensors, by fits of a sample of the logs that are weighed anew until the noise settles.
 
     Where some noise is stated and some not, the stated one counts as right but for a common factor: a filter leaves
@@ -72,7 +75,7 @@ def estimate_noise(logs: Sequence[Samples], fitter: LogFitter, stated: Collectio
     Source: variance components by iterated minimum norm estimation, see `torchid.problem.noise`.
 
     Args:
-        logs: bound training logs.
+        logs: bound training logs; of processes that share the work each may have some of them.
         fitter: of their rows; its sensors have the stated noise, and a guess where none is stated.
         stated: fields of `SensorNoise` that are stated.
     """

@@ -213,7 +213,7 @@ def _unloaded_information(builder: RowBuilder, samples: Samples, count: int) -> 
             columns, row = channel.row(builder)
             wide = row.new_zeros(count)
             wide[list(columns)] = row[0, :-1]
-            yield index[0], torch.outer(wide, wide)
+            yield index[0], torch.outer(wide, wide).to(builder.device)
 
 
 def _spread(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, ContactState, float]]:

@@ -18,6 +18,7 @@ from torchid import ranks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.problem.upload import upload
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -28,12 +29,14 @@ ProgressCallback = Callable[[int], None]
 CHUNK = 2048
 """Samples per chunk: fewer lose to dispatch, more to memory traffic (measured on CPU)."""
 
+_CHUNK_OF_GPU = 8 * CHUNK  # hides launches of some microseconds behind the work of each; not measured
+
 
 def map_chunks(
     logs: Sequence[Samples],
     builder: RowBuilder,
     reduce: Callable[[Iterator[tuple[Samples, ContactState]]], Result],
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[Result]:
@@ -42,15 +45,16 @@ def map_chunks(
     Processes that share their work (`torchid.ranks`) each take some successive chunks; all get the results of all.
 
     Args:
-        logs: each is moved to the builder's device chunk by chunk.
+        logs: each is moved to the builder's device chunk by chunk, see `upload`.
         builder: whose layouts and device are used.
         reduce: given an iterator over some of the chunks and their contact states; what it returns pickles.
-        chunk: samples per chunk.
+        chunk: samples per chunk; by default `chunk_size` of the builder's device.
         threads: workers, each with one intra-op thread (small arrays do not profit from more); by default one per
             intra-op thread torch would use, one if the builder is on a GPU.
         progress: called with the number of samples done since the last call.
     """
-    tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, chunk)]
+    size = chunk or chunk_size(builder.device)
+    tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, size)]
     for _, state, _ in tasks:
         builder.layout(state)
     sizes = [_size(samples, index) for samples, _, index in tasks]
@@ -61,8 +65,8 @@ def map_chunks(
     def pieces(
         part: Iterator[tuple[Samples, ContactState, slice | torch.Tensor]],
     ) -> Iterator[tuple[Samples, ContactState]]:
-        for samples, state, index in part:
-            piece = samples[index].to(builder.device)
+        chosen = ((samples[index], state) for samples, state, index in part)
+        for piece, state in upload(chosen, builder.device):
             yield piece, state
             if report is not None:
                 report(len(piece))
@@ -149,6 +153,11 @@ def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result
             return [work(0)]
         with ThreadPoolExecutor(workers) as pool, stopping():
             return list(pool.map(work, range(workers)))
+
+
+def chunk_size(device: torch.device) -> int:
+    """Default number of samples per chunk."""
+    return _CHUNK_OF_GPU if device.type == "cuda" else CHUNK
 
 
 def worker_count(device: torch.device) -> int:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchid import parameters, ranks
 from torchid.parameters import Array
-from torchid.problem.chunks import CHUNK, ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
+from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder, Workspace
@@ -59,7 +59,7 @@ class Part:
 def compress(
     logs: Sequence[Samples],
     builder: RowBuilder,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> TriangularFactor:
@@ -73,7 +73,7 @@ def compress(
 def compress_by_state(
     logs: Sequence[Samples],
     builder: RowBuilder,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> dict[ContactState, TriangularFactor]:
@@ -85,7 +85,7 @@ def compress_by_state(
 def compress_parts(
     logs: Sequence[Samples],
     builder: RowBuilder,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     threads: int | None = None,
     progress: ProgressCallback | None = None,
     weight_rows: RowWeighting | None = None,
@@ -325,14 +325,14 @@ class UnloadedOffsetEquation:
     def row(self, builder: RowBuilder) -> tuple[tuple[int, ...], Tensor]:
         """The whitened equation `o - (s - 1) mean = mean` as a block of one row: its columns, and (1, columns + 1).
 
-        The scale's column holds the mean: the noise of single readings would bias the scale towards 0.
+        The scale's column holds the mean: the noise of single readings would bias the scale towards 0. The row is on
+        the CPU, where readings in the air are, and so is the block of such rows in a factor.
         """
         first, row = builder.columns.count, [1.0, self.mean]
         columns: tuple[int, ...] = (first + self.offset,)
         if self.scale is not None:
             columns, row = (*columns, first + self.scale), [1.0, -self.mean, self.mean]
-        like = builder.tree.ancestors
-        return columns, torch.tensor([row], dtype=like.dtype, device=like.device) / self.deviation
+        return columns, torch.tensor([row], dtype=builder.tree.ancestors.dtype) / self.deviation
 
 
 def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator[UnloadedOffsetEquation]:

@@ -140,6 +140,7 @@ class ContactStateLayouts:
         self._measured = measured_components(self.contacts, sensors)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
         self._cache: dict[ContactState, ContactStateLayout] = {}
+        self._rotations: dict[int, Tensor] = {}
 
     def layout(self, state: ContactState) -> ContactStateLayout:
         """The layout of a contact state, cached."""
@@ -199,9 +200,16 @@ class ContactStateLayouts:
         joints = next(body.joints for body in bodies if body.body == node)
         return joints, bool(self.columns.tree.base_rows)
 
+    def frame_rotation(self, contact: int) -> Tensor:
+        """Axes of a contact frame in its node's joint frame, (3, 3), cached."""
+        if contact not in self._rotations:
+            self._rotations[contact] = self._tensor(self.frames[contact][1][:3, :3])
+        return self._rotations[contact]
+
     def clear(self) -> None:
         """Drop all layouts, when the robot's constants move to another device or precision."""
         self._cache.clear()
+        self._rotations.clear()
 
     def _contact_body(self, body: int, contacts: list[int], coupled: tuple[int, ...]) -> ContactBody:
         unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 import scipy.linalg
@@ -18,6 +19,7 @@ import torch
 from scipy.stats import chi2, norm
 from torch import Tensor
 
+from torchid import ranks
 from torchid.parameters import Array
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.compression import Part
@@ -86,6 +88,17 @@ class _Chunk:
     sources: Tensor
 
 
+@dataclass(frozen=True)
+class LogElsewhere:
+    """A log that another process has: its number of samples, and their oversampling."""
+
+    count: int
+    oversampling: float
+
+    def __len__(self) -> int:
+        return self.count
+
+
 class SampledRows:
     """Rows of about a thousand samples of the logs, in memory, to be whitened again with other noise.
 
@@ -97,8 +110,11 @@ class SampledRows:
 
     @one_thread()
     @torch.no_grad()
-    def __init__(self, logs: Sequence[Samples], builder: RowBuilder) -> None:
-        """Compute the rows of random samples, always the same ones."""
+    def __init__(self, logs: Sequence[Samples | LogElsewhere], builder: RowBuilder) -> None:
+        """Compute the rows of random samples, always the same ones.
+
+        Logs elsewhere are those of processes that share the work, each with successive ones; all get the rows of all.
+        """
         self.builder = builder
         names = _source_names(builder)
         self.groups = tuple(name for name in NOISE_GROUPS if name in names)
@@ -108,6 +124,9 @@ class SampledRows:
         n_rows = builder.tree.n_rows
         most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
         self.chunks = [self._chunk(part, state) for part, state in _random_chunks(logs, max(most, 1))]
+        elsewhere = any(isinstance(log, LogElsewhere) for log in logs)
+        if any(ranks.gather(elsewhere, "logs that others have")):
+            self.chunks = list(chain.from_iterable(ranks.gather(self.chunks, "samples for the noise")))
 
     @property
     def reference_std(self) -> Array:
@@ -196,7 +215,7 @@ def _source_names(builder: RowBuilder) -> list[str]:
     return [*BASE_GROUPS[: builder.tree.base_rows], *dofs, *contacts]
 
 
-def _random_chunks(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples, ContactState]]:
+def _random_chunks(logs: Sequence[Samples | LogElsewhere], most: int) -> Iterator[tuple[Samples, ContactState]]:
     """About `most` random samples (regular ones could be in phase with a gait), log by log and state by state.
 
     Of filtered logs at most four for every independent sample: more would add little.
@@ -205,6 +224,8 @@ def _random_chunks(logs: Sequence[Samples], most: int) -> Iterator[tuple[Samples
     for log in logs:
         count = min(len(log), max(round(min(share, 4.0 / log.oversampling) * len(log)), 1))
         index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
+        if isinstance(log, LogElsewhere):
+            continue
         chosen = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
         for state, where in chunks_by_state(chosen, _CHUNK):
             yield chosen[where], state

@@ -262,9 +262,8 @@ class RowBuilder(nn.Module):
 
     def _rotation(self, contact: int, kinematics: ChunkKinematics) -> Tensor:
         """Rotation contact frame to world, (B, 3, 3), or to a bolted base whose orientation is unknown."""
-        body, T_joint_frame = self.frames[contact]
-        in_body = kinematics.screw_axes.new_tensor(T_joint_frame[:3, :3])
-        rotation = kinematics.states.rotation[:, :, body].permute(2, 0, 1) @ in_body
+        body, _ = self.frames[contact]
+        rotation = kinematics.states.rotation[:, :, body].permute(2, 0, 1) @ self._layouts.frame_rotation(contact)
         return rotation if kinematics.rotation_world_base is None else kinematics.rotation_world_base @ rotation
 
     def recorded_torque(self, samples: Samples) -> Tensor:
@@ -305,12 +304,12 @@ class RowBuilder(nn.Module):
         if not (self.tree.base_rows or layout.coupled_joints):
             return
         unmeasured, measured = self._contact_rows(layout, dynamics)
-        torque = self.recorded_torque(samples)[:, list(layout.coupled_joints)]
+        torque = self.recorded_torque(samples)[:, self._index(layout.coupled_joints)]
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(layout.wrench_std):
             f = f + (measured.mT @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
         axes = self.noise_axes(dynamics.rotation_world_base) if self.sensors.noise.base_axes_differ else None
-        std, order = (layout.row_std, layout.wrench_std), layout.blocks.order
+        std, order = (layout.row_std, layout.wrench_std), self._index(layout.blocks.order)
         for index, basis in whitened_null_space(unmeasured, std[0], measured, std[1], axes, order):
             W = basis.permute(1, 2, 0).contiguous()
             if layout.blocks.are_turned:
@@ -403,7 +402,7 @@ class RowBuilder(nn.Module):
         return tuple(both.permute(2, 0, 1).split(sizes, dim=1))
 
     def _index(self, indices: Iterable[int]) -> Tensor:
-        return torch.tensor(list(indices), dtype=torch.int64, device=self.device)
+        return self.tree.index(indices)
 
     def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""

@@ -44,7 +44,7 @@ class Samples:
         share: (N, C), share of a constant contact reading that the filter leaves, as `Log.contact_share`; None if it is
             `active`.
         unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
-            `Log.contact_unloaded`; None without such readings.
+            `Log.contact_unloaded`, on the CPU; None without such readings.
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
     """
@@ -83,16 +83,32 @@ class Samples:
         """Some of the samples."""
         return self._each(lambda x: x[index])
 
-    def to(self, device: torch.device | str) -> Samples:
-        """The samples on another device."""
-        return self._each(lambda x: x.to(device))
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Samples:
+        """The samples on another device, all but readings in the air: these become a few means, on the CPU."""
+        return self._each_that_moves(lambda x: x.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> Samples:
+        """The samples with page-locked copies of what `to` moves, which a GPU can read while the host goes on."""
+        return self._each_that_moves(torch.Tensor.pin_memory)
+
+    def keep_for(self, stream: torch.Stream) -> None:
+        """Keep the memory of what `to` has moved until a stream of the device has done what it was given so far."""
+
+        def kept(x: Tensor) -> Tensor:
+            x.record_stream(stream)
+            return x
+
+        self._each_that_moves(kept)
+
+    def _each_that_moves(self, change: Callable[[Tensor], Tensor]) -> Samples:
+        return replace(replace(self, unloaded=None)._each(change), unloaded=self.unloaded)
 
     def motion(self) -> Motion:
         """The motion of these samples, for the regressor."""
         base, zero = self.base, self.time.new_zeros(len(self), 3)
         force = base.specific_force
         if force is None:  # of a bolted base
-            force = zero - zero.new_tensor(GRAVITY_WORLD)
+            force = torch.stack([zero[:, 0] - g for g in GRAVITY_WORLD], dim=1)
             if (rotation := base.rotation) is not None:
                 force = (rotation.mT @ force[..., None])[..., 0]
         omega = zero if base.angular_velocity is None else base.angular_velocity

@@ -174,8 +174,8 @@ def generalized_forces(
     Returns:
         (k, base rows + len(joints), B).
     """
-    path = tree.path(body)
-    screws = tree.joint_map[path][:, list(joints)].T @ screw_axes[:, path]
+    path = tree.index(tree.path(body))
+    screws = tree.joint_map[path][:, tree.index(joints)].T @ screw_axes[:, path]
     torque = (wrenches[:, :, None] * screws[:, None]).sum(0)
     return torch.cat([wrenches.transpose(0, 1), torque], dim=1) if tree.base_rows else torque
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,6 +104,7 @@ class KinematicTree(nn.Module):
     def __init__(self, robot: Robot, sign_width: float | None = None) -> None:
         super().__init__()
         self.sign_width = sign_width
+        self._indices: dict[tuple[int, ...], Tensor] = {}
         nodes = tree_nodes(robot)
         self.node_of = [index for index, node in enumerate(nodes) if node.body is not None]
         self.body_of = np.searchsorted(self.node_of, np.arange(len(nodes))).tolist()
@@ -151,6 +153,18 @@ class KinematicTree(nn.Module):
     def _register(self, name: str, value: np.ndarray) -> None:
         dtype = torch.int64 if value.dtype.kind == "i" else torch.float64
         self.register_buffer(name, torch.tensor(np.ascontiguousarray(value), dtype=dtype), persistent=False)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> KinematicTree:
+        self._indices.clear()
+        super()._apply(fn, recurse)
+        return self
+
+    def index(self, numbers: Iterable[int]) -> Tensor:
+        """Numbers as an index on the module's device, (len,) int64, made once: every other would be a copy to a GPU."""
+        key = tuple(numbers)
+        if key not in self._indices:
+            self._indices[key] = torch.tensor(key, dtype=torch.int64, device=self.ancestors.device)
+        return self._indices[key]
 
     def coulomb_sign(self, velocity: Tensor) -> Tensor:
         """Sign of velocities [rad/s or m/s] as Coulomb friction has it, smooth if a width is given."""

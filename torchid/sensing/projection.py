@@ -159,7 +159,7 @@ def base_rank(singular_values: Tensor) -> Tensor:
     return (singular_values > tolerance).sum(1)
 
 
-def null_space(A: Tensor, size: float = 1.0) -> Iterator[tuple[Tensor | slice, Tensor]]:
+def null_space(A: Tensor, size: float | Tensor = 1.0) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Orthonormal bases of the null spaces of a batch of matrices, grouped by rank.
 
     A QR factorization of the transpose serves samples of full row rank; only those that might have lost rank (straight
@@ -187,7 +187,7 @@ def whitened_null_space(
     J_m: Tensor,
     wrench_std: Tensor,
     axes: Tensor | None = None,
-    order: Sequence[int] | None = None,
+    order: Tensor | None = None,
 ) -> Iterator[tuple[Tensor | slice, Tensor]]:
     """Bases W of the null spaces of A under which the projected sensor noise is white, grouped by rank.
 
@@ -198,7 +198,7 @@ def whitened_null_space(
         wrench_std: (k_m,), noise of each measured wrench component [N, N m].
         axes: (B, 3, 3), columns are the unit vectors in the base frame that the base rows of `row_std` are along; None:
             the base's own axes.
-        order: of the m rows; where A is empty, column i of W is zero but in the first i + 1 of them.
+        order: (m,) int64, of the m rows; where A is empty, column i of W is zero but in the first i + 1 of them.
 
     Yields:
         (index of the samples, W): W is (B', m, m - rank) with `A @ W = 0` and `W^T S W = I`, where S, the covariance of
@@ -210,31 +210,38 @@ def whitened_null_space(
             yield index, _along(W.mT, axes[index].mT).mT
         return
     if not A.shape[1]:
-        yield slice(None), _triangular_root(row_std, J_m, wrench_std, order or range(A.shape[2]))
+        order = torch.arange(A.shape[2], device=A.device) if order is None else order
+        yield slice(None), _triangular_root(row_std, J_m, wrench_std, order)
         return
-    for index, V in null_space(A / row_std, float(torch.linalg.vector_norm(1.0 / row_std))):
+    for index, V in null_space(A / row_std, torch.linalg.vector_norm(1.0 / row_std).double()):
         W = V / row_std[:, None]  # white already, as far as the rows' own noise goes
         if len(wrench_std):
             through_contacts = (J_m[index] @ W) * wrench_std[:, None]
             identity = torch.eye(W.shape[2], dtype=W.dtype, device=W.device)
-            L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
+            L = _cholesky(identity + through_contacts.mT @ through_contacts)
             W = torch.linalg.solve_triangular(L, W.mT, upper=False).mT
         yield index, W
 
 
-def _triangular_root(row_std: Tensor, J_m: Tensor, wrench_std: Tensor, order: Sequence[int]) -> Tensor:
+def _triangular_root(row_std: Tensor, J_m: Tensor, wrench_std: Tensor, order: Tensor) -> Tensor:
     """W, (B, m, m), with `W^T S W = I` and S as in `whitened_null_space`; column i is zero but in `order[:i + 1]`."""
     samples, _, m = J_m.shape
-    ordered = list(order)
     identity = torch.eye(m, dtype=J_m.dtype, device=J_m.device)
-    W = (identity / row_std)[:, ordered].expand(samples, m, m)
     if not len(wrench_std):
-        return W
-    through_contacts = (J_m / row_std)[..., ordered] * wrench_std[:, None]
-    L = torch.linalg.cholesky(identity + through_contacts.mT @ through_contacts)
+        return (identity / row_std)[:, order].expand(samples, m, m)
+    through_contacts = (J_m / row_std)[..., order] * wrench_std[:, None]
+    L = _cholesky(identity + through_contacts.mT @ through_contacts)
     inverse = torch.linalg.solve_triangular(L, identity.expand_as(L), upper=False).mT
-    place = sorted(range(m), key=ordered.__getitem__)
-    return inverse[:, place] / row_std[:, None]
+    return inverse[:, order.argsort()] / row_std[:, None]
+
+
+def _cholesky(covariance: Tensor) -> Tensor:
+    """Lower triangles of matrices (B, r, r) not below the identity: only numbers that are not finite can make it fail.
+
+    That is an error on the CPU alone: to hear of it, the host would wait for a GPU. There the triangle is not finite.
+    """
+    L: Tensor = torch.linalg.cholesky_ex(covariance, check_errors=covariance.device.type == "cpu").L
+    return L
 
 
 def _along(X: Tensor, axes: Tensor) -> Tensor:
@@ -242,7 +249,7 @@ def _along(X: Tensor, axes: Tensor) -> Tensor:
     return torch.cat([X[..., :3] @ axes, X[..., 3:6] @ axes, X[..., 6:]], dim=-1)
 
 
-def _bases(A: Tensor, floor: float) -> Iterator[tuple[Tensor | slice, Tensor]]:
+def _bases(A: Tensor, floor: float | Tensor) -> Iterator[tuple[Tensor | slice, Tensor]]:
     samples, k, m = A.shape
     if samples == 0:
         return
@@ -259,8 +266,11 @@ def _bases(A: Tensor, floor: float) -> Iterator[tuple[Tensor | slice, Tensor]]:
         negligible = (tolerance * torch.linalg.matrix_norm(R)).clamp_min(floor)
         ratio = negligible * torch.linalg.matrix_norm(inverse)
         suspect = ~(ratio < 1.0 / _SUSPECT)  # so written, infinite and undefined ones are suspect too
-        V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
-        if not suspect.any():
+        if A.device.type == "cpu":
+            V = torch.ormqr(reflectors, tau, identity[:, k:].expand(samples, m, m - k))
+        else:
+            V = complement(reflectors, tau)
+        if not _exists(suspect):
             yield slice(None), V
             return
         regular = torch.nonzero(~suspect)[:, 0]
@@ -274,12 +284,36 @@ def _bases(A: Tensor, floor: float) -> Iterator[tuple[Tensor | slice, Tensor]]:
         yield remaining[same], Vh[same, r:].mT
 
 
-def _differentiable(A: Tensor, V: Tensor, floor: float) -> Tensor:
+def complement(reflectors: Tensor, tau: Tensor) -> Tensor:
+    """The last m - k columns of Q, (B, m, m - k), from what `torch.geqrf` returns of (B, m, k).
+
+    All samples at once, from the product of their reflections in closed form, `1 - Y T Y^T` (Schreiber, Van Loan 1989):
+    on a GPU, `torch.ormqr` takes one sample after the other. On a CPU that is the faster of the two.
+    """
+    m, k = reflectors.shape[1:]
+    Y = reflectors.tril(-1)
+    Y.diagonal(dim1=1, dim2=2).fill_(1.0)
+    D = tau[:, :, None]
+    last = Y[:, k:].mT  # Y^T of the last columns of the identity
+    T_last = torch.linalg.solve_triangular(D * (Y.mT @ Y).triu(1), D * last, upper=True, unitriangular=True)
+    return nn.functional.pad(torch.eye(m - k, dtype=Y.dtype, device=Y.device), (0, 0, k, 0)) - Y @ T_last
+
+
+def _exists(suspect: Tensor) -> bool:
+    """Whether any sample needs its singular values: the one number of a chunk that the host waits for.
+
+    The shapes of whatever comes after it depend on it. Only where there are such samples, the host waits for their
+    numbers and ranks too.
+    """
+    return bool(suspect.any())
+
+
+def _differentiable(A: Tensor, V: Tensor, floor: float | Tensor) -> Tensor:
     """Bases `V` as functions of A: projected onto the null space of A and made orthonormal again.
 
     Their value does not change but by rounding. To first order dV = -A^+ dA V (Golub, Pereyra 1973).
     """
-    inverse = torch.linalg.pinv(A, atol=floor, rtol=_tolerance(A))
+    inverse = torch.linalg.pinv(A, atol=float(floor), rtol=_tolerance(A))
     inside = V - inverse @ (A @ V)
     L = torch.linalg.cholesky(inside.mT @ inside)
     return torch.linalg.solve_triangular(L, inside.mT, upper=False).mT
