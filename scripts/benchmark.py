@@ -33,8 +33,8 @@ from torchid.estimators import Consistent, LeastSquares
 from torchid.parameters import FRICTION, Array, perturb_parameters
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
 from torchid.problem.base_motion import BaseMotion
+from torchid.problem.chunk_dynamics import ChunkDynamics
 from torchid.problem.chunks import chunk_size
-from torchid.problem.rows import ChunkDynamics
 from torchid.regressor import FrameJacobian, Regressor
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, SensorNoise, named_sensors

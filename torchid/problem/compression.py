@@ -13,10 +13,11 @@ from torch import Tensor
 
 from torchid import parameters, ranks
 from torchid.parameters import Array
+from torchid.problem.chunk_dynamics import Workspace
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, map_chunks, one_thread, worker_count
 from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
-from torchid.problem.rows import RowBuilder, Workspace
+from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
 

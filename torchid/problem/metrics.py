@@ -10,11 +10,12 @@ import torch
 
 from torchid.errors import join_names
 from torchid.parameters import Array
+from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ExtraTerms
 from torchid.problem.predict import measured_and_predicted_forces
-from torchid.problem.rows import ChunkKinematics, RowBuilder
+from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
 from torchid.sensing import Contact, named_sensors

@@ -14,10 +14,11 @@ from torch import Tensor
 
 from torchid.logs.spill import Spill
 from torchid.parameters import Array
+from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import chunks_by_state, one_thread
 from torchid.problem.contact_state import ContactState, contact_extra_column, dof_extra_column
 from torchid.problem.extras import ACTUATORS, Extra
-from torchid.problem.rows import ChunkKinematics, RowBuilder
+from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import body_wrenches
 from torchid.regressor.regressor import generalized_forces, wrench_transform, wrenches_at_base

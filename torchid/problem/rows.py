@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor, nn
 
 from torchid.parameters import Array
 from torchid.problem.base_motion import levelled_base_axes
+from torchid.problem.chunk_dynamics import ChunkDynamics, ChunkKinematics, Workspace
 from torchid.problem.contact_state import (
     Columns,
     ContactState,
@@ -24,7 +24,7 @@ from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.row_blocks import RowBlock
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import all_wrench_columns
-from torchid.regressor.kinematics import BodyStates, JointMotion, body_states, joint_motion, joint_screw_axes
+from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import (
     generalized_forces,
     wrench_transform,
@@ -36,64 +36,24 @@ from torchid.sensing import Contact, SensorSet
 from torchid.sensing.projection import null_space, whitened_null_space
 
 
-class Workspace:
-    """Named buffers of one worker, reused: fresh memory for large arrays takes as long as the arithmetic on them."""
-
-    def __init__(self) -> None:
-        """Start empty."""
-        self._buffers: dict[str, Tensor] = {}
-
-    def empty(self, name: str, like: Tensor, *shape: int) -> Tensor:
-        """A contiguous array with arbitrary values, valid until the next request with this name."""
-        buffer, size = self._buffers.get(name), math.prod(shape)
-        if buffer is None or buffer.numel() < size or (buffer.dtype, buffer.device) != (like.dtype, like.device):
-            buffer = self._buffers[name] = like.new_empty(size)
-        return buffer[:size].view(shape)
-
-
 @dataclass(frozen=True)
-class ChunkKinematics:
-    """Kinematics of B samples, from which predictions and contact Jacobians are computed.
+class BlockRows:
+    """Rows of a block at B samples.
 
-    Attributes:
-        joints: motion of all joints.
-        states: of the joint frames of all nodes.
-        screw_axes: (6, L, B), see `joint_screw_axes`.
-        rotation_world_base: (B, 3, 3), None where it was not recorded.
+    `stacked`: (columns + 1, columns + 1 + r B), the rows by column, the right-hand side last, after room for a factor;
+    `values`: (columns + 1, r, B), the rows in it.
     """
 
-    joints: JointMotion
-    states: BodyStates
-    screw_axes: Tensor
-    rotation_world_base: Tensor | None
+    block: RowBlock
+    stacked: Tensor
+    values: Tensor
 
-
-@dataclass(frozen=True)
-class ChunkDynamics(ChunkKinematics):
-    """Kinematics of B samples with the columns of the inertial parameters, from which rows are computed.
-
-    Attributes:
-        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter; the forces of
-            inertias, which are zero, need not have been written.
-    """
-
-    wrenches: Tensor
-
-    def select(self, index: Tensor | slice) -> ChunkDynamics:
-        """The dynamics of some samples."""
-        if isinstance(index, slice):  # all of them
-            return self
-
-        def pick(x: Tensor) -> Tensor:
-            return x[..., index]
-
-        return ChunkDynamics(
-            JointMotion(*map(pick, vars(self.joints).values())),
-            BodyStates(*map(pick, vars(self.states).values())),
-            pick(self.screw_axes),
-            None if self.rotation_world_base is None else self.rotation_world_base[index],
-            pick(self.wrenches),
-        )
+    @classmethod
+    def empty(cls, block: RowBlock, rows: int, like: Tensor, workspace: Workspace) -> BlockRows:
+        """Memory for so many rows at each of the samples of a tensor (..., B)."""
+        width, samples = len(block.support) + 1, like.shape[-1]
+        stacked = workspace.empty("rows", like, width, width + rows * samples)
+        return cls(block, stacked, stacked[:, width:].unflatten(1, (rows, samples)))
 
 
 @dataclass(frozen=True)
@@ -198,10 +158,10 @@ class RowBuilder(nn.Module):
         workspace = workspace or Workspace()
         layout, dynamics = self.layout(state), self.dynamics(samples, workspace)
         for _, _, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
-            for block, stacked, _ in blocks:
-                yield block.support, stacked.T
-        for block, _, stacked, _ in self._uncoupled_rows(samples, layout, dynamics, workspace):
-            yield block.support, stacked.T
+            for rows in blocks:
+                yield rows.block.support, rows.stacked.T
+        for _, rows in self._uncoupled_rows(samples, layout, dynamics, workspace):
+            yield rows.block.support, rows.stacked.T
 
     def rows_by_sample(self, samples: Samples, state: ContactState) -> tuple[Tensor, Tensor]:
         """The same rows sample by sample, for samples that share a contact state.
@@ -215,17 +175,17 @@ class RowBuilder(nn.Module):
         n_rows = self.tree.n_rows
         rows = samples.time.new_zeros(len(samples), n_rows, self.width + 1)
         W = samples.time.new_zeros(len(samples), n_rows, n_rows)
-        dofs = self._index([*range(base), *(base + joint for joint in layout.coupled_joints)])
+        dofs = self.tree.index([*range(base), *(base + joint for joint in layout.coupled_joints)])
         workspace, every = Workspace(), torch.arange(len(samples), device=self.device)
         for index, basis, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
             sample = every[index][:, None, None]
-            for block, _, values in blocks:
-                slots = torch.arange(block.rows.start, block.rows.stop, device=self.device)
-                rows[sample, slots[:, None], self._index([*block.support, self.width])] = values.permute(2, 1, 0)
+            for part in blocks:
+                slots = torch.arange(part.block.rows.start, part.block.rows.stop, device=self.device)
+                support = self.tree.index([*part.block.support, self.width])
+                rows[sample, slots[:, None], support] = part.values.permute(2, 1, 0)
             W[sample, dofs[:, None], torch.arange(basis.shape[1], device=self.device)] = basis.permute(2, 0, 1)
-        uncoupled = self._uncoupled_rows(samples, layout, dynamics, workspace)
-        for slot, (block, joint, _, values) in enumerate(uncoupled, start=coupled):
-            rows[:, slot, self._index([*block.support, self.width])] = values[:, 0].T
+        for slot, (joint, part) in enumerate(self._uncoupled_rows(samples, layout, dynamics, workspace), start=coupled):
+            rows[:, slot, self.tree.index([*part.block.support, self.width])] = part.values[:, 0].T
             W[:, base + joint, slot] = 1.0 / self._layouts.dof_std[joint]
         return rows, W
 
@@ -272,44 +232,35 @@ class RowBuilder(nn.Module):
             return samples.time.new_full((len(samples), self.tree.n_dofs), torch.nan)
         return samples.torque
 
-    @staticmethod
-    def _stack(name: str, like: Tensor, workspace: Workspace, *shape: int) -> tuple[Tensor, Tensor]:
-        """A buffer for rows, (columns, ..., B), below as many rows as columns: all as (columns, rows), and the rows."""
-        stacked = workspace.empty(name, like, shape[0], shape[0] + math.prod(shape[1:]))
-        return stacked, stacked[:, shape[0] :].unflatten(1, shape[1:])
-
     def _uncoupled_rows(
         self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
-    ) -> Iterator[tuple[RowBlock, int, Tensor, Tensor]]:
-        """Of each uncoupled joint the block, the joint, its rows with room above, the rows, (columns + 1, 1, B)."""
+    ) -> Iterator[tuple[int, BlockRows]]:
+        """Uncoupled joints, and the row of each."""
         torque = self.recorded_torque(samples)
         for joint, block in layout.uncoupled_joints.items():
             weight = 1.0 / self._layouts.dof_std[joint]
             W = torque.new_full((1, 1, len(samples)), weight)
-            stacked, X = self._stack("rows", W, workspace, len(block.support) + 1, 1, len(samples))
-            torch.mul(torque[:, joint], weight, out=X[-1, 0])
-            self._project(None, W, block, dynamics, X, workspace)
+            rows = BlockRows.empty(block, 1, W, workspace)
+            torch.mul(torque[:, joint], weight, out=rows.values[-1, 0])
+            self._project(None, W, dynamics, rows, workspace)
             for number, column in enumerate(block.extras, start=len(block.inertial) + len(block.friction)):
                 extra = self.extras[column - self.columns.count]
-                torch.mul(dof_extra_column(extra, samples, self.tree), weight, out=X[number, 0])
-            yield block, joint, stacked, X
+                torch.mul(dof_extra_column(extra, samples, self.tree), weight, out=rows.values[number, 0])
+            yield joint, rows
 
     def _coupled_rows(
         self, samples: Samples, layout: ContactStateLayout, dynamics: ChunkDynamics, workspace: Workspace
-    ) -> Iterator[tuple[Tensor | slice, Tensor, Iterator[tuple[RowBlock, Tensor, Tensor]]]]:
-        """Samples of one rank, their W, (base rows + coupled joints, r, B'), and the blocks of their rows.
-
-        Of each block the rows with room above, and the rows, (columns + 1, rows of the block, B').
-        """
+    ) -> Iterator[tuple[Tensor | slice, Tensor, Iterator[BlockRows]]]:
+        """Samples of one rank, their W, (base rows + coupled joints, r, B'), and their rows, block by block."""
         if not (self.tree.base_rows or layout.coupled_joints):
             return
         unmeasured, measured = self._contact_rows(layout, dynamics)
-        torque = self.recorded_torque(samples)[:, self._index(layout.coupled_joints)]
+        torque = self.recorded_torque(samples)[:, self.tree.index(layout.coupled_joints)]
         f = nn.functional.pad(torque, (self.tree.base_rows, 0))
         if len(layout.wrench_std):
             f = f + (measured.mT @ self._measured_wrench(samples, layout, dynamics)[..., None])[..., 0]
         axes = self.noise_axes(dynamics.rotation_world_base) if self.sensors.noise.base_axes_differ else None
-        std, order = (layout.row_std, layout.wrench_std), self._index(layout.blocks.order)
+        std, order = (layout.row_std, layout.wrench_std), self.tree.index(layout.blocks.order)
         for index, basis in whitened_null_space(unmeasured, std[0], measured, std[1], axes, order):
             W = basis.permute(1, 2, 0).contiguous()
             if layout.blocks.are_turned:
@@ -319,16 +270,16 @@ class RowBuilder(nn.Module):
 
     def _projected_blocks(
         self, W: Tensor, part: _Part, layout: ContactStateLayout, workspace: Workspace
-    ) -> Iterator[tuple[RowBlock, Tensor, Tensor]]:
+    ) -> Iterator[BlockRows]:
         base = self.tree.base_rows
         for block in layout.blocks.of_rank(W.shape[1]):
             own = W[:, block.rows]
-            stacked, X = self._stack("rows", W, workspace, len(block.support) + 1, *own.shape[1:])
-            torch.sum(own * part.f[:, None], dim=0, out=X[-1])
-            self._project(own[:base] if base else None, own[base:], block, part.dynamics, X, workspace)
+            rows = BlockRows.empty(block, own.shape[1], W, workspace)
+            torch.sum(own * part.f[:, None], dim=0, out=rows.values[-1])
+            self._project(own[:base] if base else None, own[base:], part.dynamics, rows, workspace)
             if block.extras:
-                X[-1 - len(block.extras) : -1] = self._extra_columns(part, layout, block, own)
-            yield block, stacked, X
+                rows.values[-1 - len(block.extras) : -1] = self._extra_columns(part, layout, block, own)
+            yield rows
 
     def _extra_columns(self, part: _Part, layout: ContactStateLayout, block: RowBlock, W: Tensor) -> Tensor:
         """Columns of a block's extra parameters, (extras, r, B)."""
@@ -343,18 +294,18 @@ class RowBuilder(nn.Module):
         self,
         W_base: Tensor | None,
         W_joints: Tensor,
-        block: RowBlock,
         dynamics: ChunkDynamics,
-        X: Tensor,
+        rows: BlockRows,
         workspace: Workspace,
     ) -> None:
-        """Write the columns W^T K of a block, the first of `X`, (columns + 1, r, B), but those of extra parameters.
+        """Write the columns W^T K of some rows, the first ones, but not those of extra parameters.
 
         `W_base`, (6, r, B), None for a fixed base, and `W_joints`, (joints, r, B): its part of the basis. A wrench on
         body i does work on the base and on the joints above it only. Body i's columns of W^T K are thus A_i^T times its
         wrench columns, with A_i the sum over its path of the rows of W times the joints' screw axes. No joint row is
         ever formed. Columns are contiguous, as the factorization needs them.
         """
+        block, X = rows.block, rows.values
         torques = [ratio * W_joints[joint] for _, joint, ratio, _ in block.moved]
         for number, (torque, (node, _, _, _)) in enumerate(zip(torques, block.moved, strict=True)):
             velocity, friction = dynamics.joints.velocity[node], X[len(block.inertial) + 2 * number :]
@@ -397,12 +348,9 @@ class RowBuilder(nn.Module):
                     at_base = wrenches_at_base(kinematics.states, contact.body, wrenches)
                     rows = generalized_forces(self.tree, kinematics.screw_axes, contact.body, at_base, joints)
                     target = both[starts[kind] : starts[kind] + len(wrenches)]
-                    target.index_copy_(1, self._index(columns), rows)
+                    target.index_copy_(1, self.tree.index(columns), rows)
                     starts[kind] += len(wrenches)
         return tuple(both.permute(2, 0, 1).split(sizes, dim=1))
-
-    def _index(self, indices: Iterable[int]) -> Tensor:
-        return self.tree.index(indices)
 
     def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor:
         """Measured wrench components along the frames' axes, (B, k_m)."""

@@ -1,0 +1,70 @@
+"""Kinematics and dynamics of a chunk of samples, and the memory that one chunk after the other is worked on in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torchid.regressor.kinematics import BodyStates, JointMotion
+
+
+class Workspace:
+    """Named buffers of one worker, reused: fresh memory for large arrays takes as long as the arithmetic on them."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._buffers: dict[str, Tensor] = {}
+
+    def empty(self, name: str, like: Tensor, *shape: int) -> Tensor:
+        """A contiguous array with arbitrary values, valid until the next request with this name."""
+        buffer, size = self._buffers.get(name), math.prod(shape)
+        if buffer is None or buffer.numel() < size or (buffer.dtype, buffer.device) != (like.dtype, like.device):
+            buffer = self._buffers[name] = like.new_empty(size)
+        return buffer[:size].view(shape)
+
+
+@dataclass(frozen=True)
+class ChunkKinematics:
+    """Kinematics of B samples, from which predictions and contact Jacobians are computed.
+
+    Attributes:
+        joints: motion of all joints.
+        states: of the joint frames of all nodes.
+        screw_axes: (6, L, B), see `joint_screw_axes`.
+        rotation_world_base: (B, 3, 3), None where it was not recorded.
+    """
+
+    joints: JointMotion
+    states: BodyStates
+    screw_axes: Tensor
+    rotation_world_base: Tensor | None
+
+
+@dataclass(frozen=True)
+class ChunkDynamics(ChunkKinematics):
+    """Kinematics of B samples with the columns of the inertial parameters, from which rows are computed.
+
+    Attributes:
+        wrenches: (6, columns, B), wrench at the base origin of a unit of each inertial parameter; the forces of
+            inertias, which are zero, need not have been written.
+    """
+
+    wrenches: Tensor
+
+    def select(self, index: Tensor | slice) -> ChunkDynamics:
+        """The dynamics of some samples."""
+        if isinstance(index, slice):  # all of them
+            return self
+
+        def pick(x: Tensor) -> Tensor:
+            return x[..., index]
+
+        return ChunkDynamics(
+            JointMotion(*map(pick, vars(self.joints).values())),
+            BodyStates(*map(pick, vars(self.states).values())),
+            pick(self.screw_axes),
+            None if self.rotation_world_base is None else self.rotation_world_base[index],
+            pick(self.wrenches),
+        )
