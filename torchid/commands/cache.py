@@ -39,7 +39,7 @@ _DESCRIPTION, _INDEX = "entry.json", "checksums.json"
 _NAME = re.compile(r"[0-9a-f]{64}")
 _LARGEST = 2**26  # bytes of a description: that of a log in 1000 contact states has 1e6
 _MOST_FILES = 10_000  # in the index of checksums
-_THERE = (errno.ENOTEMPTY, errno.EEXIST)  # another run has just stored the same
+_THERE = (errno.ENOTEMPTY, errno.EEXIST)  # of a rename
 _YOUNG = 2.0  # [s]: a file that is no older may change again within one tick of its time stamp
 
 
@@ -86,6 +86,8 @@ class Cache:
         """Nothing is read or written yet; `gigabytes` above 0."""
         self.folder, self.limit = folder.absolute(), GIGABYTE * gigabytes
         self._writable, self._used = True, set[str]()
+        self._noted: dict[str, Any] = {}  # for the index
+        self._read_index: dict[str, Any] | None = None
 
     def keep(self, keys: Collection[str]) -> None:
         """Let entries that this run will need, and others write for it, not go for those that this object writes."""
@@ -133,6 +135,7 @@ class Cache:
         size = sum(array.nbytes for array in arrays.values())
         if not self._writable or size > self.limit:
             return False
+        made = [folder for folder in (self.folder, *self.folder.parents) if not folder.exists()]
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if not self._make_room(size):
@@ -140,20 +143,24 @@ class Cache:
             with staging_folder(self.folder / key) as folder:
                 (folder / NEW).mkdir()
                 _write(folder / NEW, key, document, arrays)
-                (folder / NEW).rename(self.folder / key)
+                _rename(folder / NEW, self.folder / key)
             if not self._make_room(0):  # another run has stored something meanwhile
                 _remove(self.folder / key)
         except OSError as error:
-            if error.errno not in _THERE:
-                self._complain(error)
+            self._writable = False
+            found = f"cannot be written ({error.strerror or error}); this run goes on without it"
+            warn(f"{self.folder}: {found}, and with preprocessing.cache_gb: 0 without this line")
+            with suppress(OSError):
+                for folder in made:
+                    folder.rmdir()
         if self.has(key):
             self._used.add(key)
         return self.has(key)
 
-    def _complain(self, error: OSError) -> None:
-        self._writable = False
-        found = f"cannot be written ({error.strerror or error}); this run goes on without it"
-        warn(f"{self.folder}: {found}, and preprocessing.cache_gb: 0 does so without this line")
+    def tidy(self) -> None:
+        """Remove what killed runs left, and entries beyond the limit."""
+        with suppress(OSError):
+            self._make_room(0)
 
     def _make_room(self, size: int) -> bool:
         """Remove the entries that were not used for longest, and what killed runs left; whether `size` bytes fit in."""
@@ -186,27 +193,44 @@ class Cache:
         Raises:
             OSError: one cannot be read.
         """
-        states, known = file_states(files), self._index().get(_place(path))
-        if isinstance(known, dict) and known.get("files") == states and _NAME.fullmatch(str(known.get("sha256"))):
+        states, known = file_states(files), self._known(path)
+        if known.get("files") == states and _NAME.fullmatch(str(known.get("sha256"))):
             return str(known["sha256"])
         found = file_checksum(*files)
         youngest = max(max(state[1:3]) for state in states) / 1e9
         if states == file_states(files) and abs(time.time() - youngest) > _YOUNG:
-            self._note(path, {"files": states, "sha256": found})
+            self._noted[_place(path)] = {"files": states, "sha256": found}
         return found
 
     def array_bytes(self, path: Path, checksum: str, limit: float) -> int | None:
         """What `note_array_bytes` has noted, None if nothing."""
-        known = self._index().get(_place(path))
-        sizes = known.get("arrays") if isinstance(known, dict) and known.get("sha256") == checksum else None
+        known = self._known(path)
+        sizes = known.get("arrays") if known.get("sha256") == checksum else None
         found = sizes.get(repr(limit)) if isinstance(sizes, dict) else None
         return found if isinstance(found, int) else None
 
     def note_array_bytes(self, path: Path, checksum: str, limit: float, size: int) -> None:
         """Note what `log_bytes` said of a log, so that a later run need not open it."""
-        known = self._index().get(_place(path))
-        if isinstance(known, dict) and known.get("sha256") == checksum:
-            self._note(path, known | {"arrays": {repr(limit): size}})
+        known = self._known(path)
+        if known.get("sha256") == checksum:
+            self._noted[_place(path)] = {**known, "arrays": {repr(limit): size}}
+
+    def write_index(self) -> None:
+        """Write what was noted; what another run writes meanwhile may be lost, and is then worked out again."""
+        if not self._noted:
+            return
+        index = {place: x for place, x in self._index().items() if place not in self._noted} | self._noted
+        with suppress(OSError):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with atomic_file(self.folder / _INDEX, result=False) as new:
+                new.write_text(json.dumps(dict([*index.items()][-_MOST_FILES:]), indent=1) + "\n")
+
+    def _known(self, path: Path) -> dict[str, Any]:
+        place = _place(path)
+        if self._read_index is None:
+            self._read_index = self._index()
+        known = self._noted.get(place) or self._read_index.get(place)
+        return known if isinstance(known, dict) else {}
 
     def _index(self) -> dict[str, Any]:
         try:
@@ -214,16 +238,6 @@ class Cache:
         except (OSError, ValueError, RecursionError):
             return {}
         return document if isinstance(document, dict) else {}
-
-    def _note(self, path: Path, known: Mapping[str, Any]) -> None:
-        """Add to the index; what another run adds meanwhile may be lost, and is then worked out again."""
-        index = self._index()
-        index.pop(_place(path), None)
-        index = dict([*index.items(), (_place(path), known)][-_MOST_FILES:])
-        with suppress(OSError):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with atomic_file(self.folder / _INDEX, result=False) as new:
-                new.write_text(json.dumps(index, indent=1) + "\n")
 
 
 def _place(path: Path) -> str:
@@ -258,6 +272,15 @@ def _bytes_in(folder: Path) -> int:
         for path in folder.iterdir():
             total += path.lstat().st_size
     return total
+
+
+def _rename(folder: Path, entry: Path) -> None:
+    """Let an entry appear, unless another run has just stored the same."""
+    try:
+        folder.rename(entry)
+    except OSError as error:
+        if error.errno not in _THERE:
+            raise
 
 
 def _remove(folder: Path) -> None:

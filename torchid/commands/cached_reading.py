@@ -47,7 +47,11 @@ def open_cache(scene: Scene) -> Cache | None:
     if not size:
         return None
     cache = Cache(output.absolute().parent / FOLDER, size)
-    return cache if ranks.world_size() == 1 or _is_common(cache.folder) else None
+    if ranks.world_size() > 1 and not _is_common(cache.folder):
+        return None
+    if ranks.is_first():
+        cache.tidy()
+    return cache
 
 
 def _is_common(folder: Path) -> bool:
@@ -124,7 +128,10 @@ class CachedReader(LogReader):
         """As `LogReader.read`; of processes that share the work, each reads some of the logs for all."""
         if ranks.world_size() > 1:
             self._fill_together(paths, required)
-        return super().read(paths, required, on_read)
+        logs = super().read(paths, required, on_read)
+        if ranks.is_first():
+            self.cache.write_index()
+        return logs
 
     def _together(self, path: Path) -> float:
         room = self.scene.config.preprocessing.memory_gb - self._held
