@@ -35,10 +35,14 @@ from torchid.staging import NEW, atomic_file, is_leftover, remove_leftover, stag
 FOLDER = ".torchid_cache"
 """Name of the folder of entries, beside the output of runs."""
 
+TOKEN = "token-"
+"""First letters of files by which processes tell whether they have a folder in common."""
+
 _DESCRIPTION, _INDEX = "entry.json", "checksums.json"
 _NAME = re.compile(r"[0-9a-f]{64}")
 _LARGEST = 2**26  # bytes of a description: that of a log in 1000 contact states has 1e6
 _MOST_FILES = 10_000  # in the index of checksums
+_FORGOTTEN = 3600.0  # [s]: age of a token whose process was killed
 _THERE = (errno.ENOTEMPTY, errno.EEXIST)  # of a rename
 _YOUNG = 2.0  # [s]: a file that is no older may change again within one tick of its time stamp
 
@@ -63,9 +67,10 @@ def content_key(content: object) -> str:
 
 @cache
 def _code() -> str:
-    """Checksum of all that turns logs into numbers: torchid's modules, and the versions of the libraries below."""
+    """Checksum of all that turns logs into numbers: torchid's modules, libraries below, what the processor can do."""
     folder = Path(torchid.__file__).parent
-    digest = hashlib.sha256("\n".join(x.__version__ for x in (np, scipy, torch)).encode())
+    versions = [*(x.__version__ for x in (np, scipy, torch)), torch.backends.cpu.get_cpu_capability()]
+    digest = hashlib.sha256("\n".join(versions).encode())
     for path in sorted(folder.rglob("*.py")):
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
@@ -161,6 +166,9 @@ class Cache:
         """Remove what killed runs left, and entries beyond the limit."""
         with suppress(OSError):
             self._make_room(0)
+            for path in self.folder.glob(f"{TOKEN}*"):
+                if time.time() - path.stat().st_mtime > _FORGOTTEN:
+                    path.unlink()
 
     def _make_room(self, size: int) -> bool:
         """Remove the entries that were not used for longest, and what killed runs left; whether `size` bytes fit in."""

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import re
 import secrets
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
 
 from torchid import ranks
-from torchid.commands.cache import FOLDER, Cache, Entry, content_key, file_states, tensor_of
-from torchid.commands.manifest import file_checksum
+from torchid.commands.cache import FOLDER, TOKEN, Cache, content_key, file_states
+from torchid.commands.cached_samples import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
 from torchid.commands.reading import LogReader
 from torchid.errors import TorchidWarning, warn
 from torchid.fitting.experiment import Scene
@@ -25,17 +19,8 @@ from torchid.fitting.noise import recorded_sensors
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files
 from torchid.problem import Samples
-from torchid.problem.base_motion import BaseMotion
 from torchid.problem.extras import recorded_components
 from torchid.sensing import SensorSet
-
-NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
-"""Keys of preprocessing that do not change what the samples of a log are that is read whole."""
-
-_FORMAT = 1  # of entries
-_BASE = "base."  # before the names of tensors of the base's motion
-_PLAIN = ("wrench_in_world", "oversampling")  # of samples, beside tensors
-_Said = tuple[type[Warning], str]
 
 
 def open_cache(scene: Scene) -> Cache | None:
@@ -60,7 +45,7 @@ def _is_common(folder: Path) -> bool:
     if ranks.is_first():
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / (token := f"token-{secrets.token_hex(8)}")).touch()
+            (folder / (token := f"{TOKEN}{secrets.token_hex(8)}")).touch()
             name = token
     name = ranks.as_first(name, "a file for all processes")
     found = all(ranks.gather(bool(name) and (folder / name).is_file(), "a common folder"))
@@ -89,19 +74,6 @@ class _Planned:
     key: str
     together: float | None
     size: int
-
-
-@dataclass(frozen=True)
-class _Read:
-    """Samples of a log, the sensors whose every value is in them, how many were left out, and what reading said.
-
-    `excluded`: None where the settings leave nothing out.
-    """
-
-    samples: Samples
-    recorded: SensorSet
-    excluded: int | None
-    said: list[_Said]
 
 
 class CachedReader(LogReader):
@@ -135,12 +107,13 @@ class CachedReader(LogReader):
 
     def _together(self, path: Path) -> float:
         room = self.scene.config.preprocessing.memory_gb - self._held
+        bound = room if path.suffix.lower() == ".csv" else 0.0  # for others, `log_bytes` does not depend on it
         content = self._content(path)
-        size = None if content is None else self.cache.array_bytes(path, content.checksum, room)
+        size = None if content is None else self.cache.array_bytes(path, content.checksum, bound)
         if size is None:
             size = log_bytes(path, GIGABYTE * room)
             if content is not None:
-                self.cache.note_array_bytes(path, content.checksum, room, size)
+                self.cache.note_array_bytes(path, content.checksum, bound, size)
         return self._held + size / GIGABYTE
 
     def _samples(self, path: Path, required: SensorSet | None, together: float | None) -> Samples:
@@ -151,7 +124,7 @@ class CachedReader(LogReader):
             self._new.add(key)
         found = self._load(key, path, required, together)
         if found is None:
-            said: list[_Said] = []
+            said: list[Said] = []
             try:
                 found = self._read(path, required, together, said)
             finally:
@@ -167,12 +140,12 @@ class CachedReader(LogReader):
             self.excluded[str(path)] = found.excluded
         return found.samples
 
-    def _read(self, path: Path, required: SensorSet | None, together: float | None, said: list[_Said]) -> _Read:
+    def _read(self, path: Path, required: SensorSet | None, together: float | None, said: list[Said]) -> ReadLog:
         """A log as it is read without a cache; what is said on the way goes to a list."""
         with _listening(said):
             samples = super()._samples(path, required, together)
         recorded = recorded_sensors(self.scene.robot, self.scene.contacts, [samples])
-        return _Read(samples, recorded, self.excluded.get(str(path)), said)
+        return ReadLog(samples, recorded, self.excluded.get(str(path)), said)
 
     # ---------------------------------------------------------------------------------------------- keys and entries
 
@@ -203,26 +176,26 @@ class CachedReader(LogReader):
         blocks = None if together is None else settings.memory_gb
         return content_key([self._scene_content, content.checksum, path.suffix.lower(), blocks, masks])
 
-    def _store(self, key: str, path: Path, read: _Read) -> bool:
+    def _store(self, key: str, path: Path, read: ReadLog) -> bool:
         """Whether an entry is there now; none is written of a log that has changed since its key was made."""
         content = self._content(path)
         if content is None or file_states(content.files) != content.states:
             return False
-        return self.cache.save(key, *_packed(read))
+        return self.cache.save(key, *samples_entry(read))
 
-    def _load(self, key: str, path: Path, required: SensorSet | None, together: float | None) -> _Read | None:
+    def _load(self, key: str, path: Path, required: SensorSet | None, together: float | None) -> ReadLog | None:
         """Samples from the cache; None if they are not there, or lack what is required, which reading then says."""
         entry = self.cache.load(key)
         if entry is None:
             return None
         try:
-            found = _unpacked(entry, str(path), None if together is None else self.folder)
+            found = samples_of_entry(entry, str(path), None if together is None else self.folder)
         except Exception as error:  # noqa: B902 - whatever another program has put there
             self.cache.drop(key, str(error))
             return None
         return found if required is None or self._has(found, required) else None
 
-    def _has(self, found: _Read, required: SensorSet) -> bool:
+    def _has(self, found: ReadLog, required: SensorSet) -> bool:
         """Whether every value of the required sensors was recorded."""
         needed = recorded_components(self.scene.contacts, required, found.samples.wrench_in_world)
         return not (required.torque & ~found.recorded.torque).any() and not (needed & ~found.recorded.wrench).any()
@@ -279,87 +252,8 @@ def _shares(sizes: Mapping[int, int]) -> list[list[int]]:
     return [sorted(share) for share in shares]
 
 
-# ----------------------------------------------------------------------------------------- what samples depend on
-
-
-def content_of_scene(scene: Scene) -> dict[str, Any]:
-    """All that the samples of a log depend on beside the log, as a document; the sensors that are fitted do not."""
-    config, robot = scene.config, scene.robot
-    settings = {name: x for name, x in vars(config.preprocessing).items() if name not in NOT_IN_SAMPLES}
-    topics = None if config.logs is None or config.logs.topics is None else asdict(config.logs.topics)
-    return {
-        "format": _FORMAT,
-        "urdf": [config.robot.urdf.name, file_checksum(config.robot.urdf)],
-        "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names)],
-        "contacts": [asdict(contact) for contact in scene.contacts],
-        "preprocessing": settings,
-        "topics": topics,
-    }
-
-
-# -------------------------------------------------------------------------------------------- entries of the cache
-
-
-def _packed(read: _Read) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """The document and the arrays of an entry; axes are in the order of the strides, which come back with them."""
-    samples, arrays, axes = read.samples, dict[str, NDArray[Any]](), dict[str, list[int]]()
-    own = {name: x for name, x in vars(samples).items() if isinstance(x, Tensor)}
-    base = {_BASE + name: x for name, x in vars(samples.base).items() if isinstance(x, Tensor)}
-    for name, x in (own | base).items():
-        axes[name] = sorted(range(x.ndim), key=lambda axis, x=x: -x.stride(axis))  # type: ignore[misc]
-        arrays[name] = x.numpy().transpose(axes[name])
-    document = {
-        "source": samples.source,
-        "samples": {name: getattr(samples, name) for name in _PLAIN},
-        "axes": axes,
-        "recorded": [read.recorded.torque.tolist(), read.recorded.wrench.tolist()],
-        "excluded": read.excluded,
-        "said": [[category.__name__, message] for category, message in read.said if category in _said_again()],
-    }
-    return document, arrays
-
-
-def _unpacked(entry: Entry, source: str, folder: Path | None) -> _Read:
-    """What was stored, of a log of this name; any exception where that is something else.
-
-    Args:
-        entry: of the cache.
-        source: name of the log.
-        folder: as `Samples` has it.
-    """
-    document, base = entry.document, dict[str, Tensor]()
-    own: dict[str, Any] = {"torque": None, "wrench": None}
-    for name, axes in document["axes"].items():
-        tensor = tensor_of(entry.arrays[name].transpose(np.argsort(axes)))
-        if name.startswith(_BASE):
-            base[name.removeprefix(_BASE)] = tensor
-        else:
-            own[name] = tensor
-    own |= {name: document["samples"][name] for name in _PLAIN}
-    samples = Samples(source, base=BaseMotion(**base), folder=folder, **own)
-    torque, wrench = (np.array(mask, dtype=bool) for mask in document["recorded"])
-    recorded = SensorSet(torque, wrench.reshape(-1, 6))
-    categories = {category.__name__: category for category in _said_again()}
-    said = [(categories[name], _about(source, document["source"], text)) for name, text in document["said"]]
-    return _Read(samples, recorded, document["excluded"], said)
-
-
-def _about(source: str, before: str, text: str) -> str:
-    """What was said of a log, said of one with the same content."""
-    names = {before: source, Path(before).name: Path(source).name}
-    return re.sub("|".join(map(re.escape, names)), lambda found: names[found[0]], text)
-
-
-def _said_again() -> list[type[Warning]]:
-    """Warnings that are for users: torchid's, and those of libraries about numbers."""
-    out: list[type[Warning]] = [TorchidWarning, RuntimeWarning]
-    for category in out:
-        out += category.__subclasses__() if category is not RuntimeWarning else []
-    return out
-
-
 @contextmanager
-def _listening(said: list[_Said]) -> Iterator[None]:
+def _listening(said: list[Said]) -> Iterator[None]:
     """Gather all warnings instead of giving them."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")  # which of them are shown is decided where they are given
@@ -369,7 +263,7 @@ def _listening(said: list[_Said]) -> Iterator[None]:
             said += [(one.category, str(one.message)) for one in caught]
 
 
-def _say(said: Iterable[_Said]) -> None:
+def _say(said: Iterable[Said]) -> None:
     for category, message in said:
         if issubclass(category, TorchidWarning):
             warn(message, category)
