@@ -313,7 +313,7 @@ def test_a_training_does_not_begin_where_somebody_keeps_notes(place: Path, tmp_p
     (tmp_path / "run.training").unlink()
     shutil.rmtree(tmp_path / "elsewhere")
     assert server.run([*line, "--resume"]).status == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert names_in(tmp_path) == ["run"]
 
 
 def test_files_are_replaced_only_on_request_and_links_and_inputs_never(

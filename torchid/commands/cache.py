@@ -140,7 +140,7 @@ class Cache:
         size = sum(array.nbytes for array in arrays.values())
         if not self._writable or size > self.limit:
             return False
-        made = [folder for folder in (self.folder, *self.folder.parents) if not folder.exists()]
+        missing = missing_folders(self.folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if not self._make_room(size):
@@ -155,9 +155,7 @@ class Cache:
             self._writable = False
             found = f"cannot be written ({error.strerror or error}); this run goes on without it"
             warn(f"{self.folder}: {found}, and with preprocessing.cache_gb: 0 without this line")
-            with suppress(OSError):
-                for folder in made:
-                    folder.rmdir()
+            remove_empty(missing)
         if self.has(key):
             self._used.add(key)
         return self.has(key)
@@ -246,6 +244,18 @@ class Cache:
         except (OSError, ValueError, RecursionError):
             return {}
         return document if isinstance(document, dict) else {}
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """A folder and those above it that are not there, the innermost first."""
+    return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
+def remove_empty(folders: Sequence[Path]) -> None:
+    """Remove folders, the innermost first, up to one in which something is."""
+    with suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def _place(path: Path) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchid import ranks
-from torchid.commands.cache import FOLDER, TOKEN, Cache, content_key, file_states
+from torchid.commands.cache import FOLDER, TOKEN, Cache, content_key, file_states, missing_folders, remove_empty
 from torchid.commands.cached_samples import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
 from torchid.commands.reading import LogReader
 from torchid.errors import TorchidWarning, warn
@@ -41,7 +41,7 @@ def open_cache(scene: Scene) -> Cache | None:
 
 def _is_common(folder: Path) -> bool:
     """Whether all processes find in a folder what the first one has just put there."""
-    name = ""
+    name, missing = "", missing_folders(folder)
     if ranks.is_first():
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
@@ -52,8 +52,7 @@ def _is_common(folder: Path) -> bool:
     if name and ranks.is_first():
         with suppress(OSError):
             (folder / name).unlink()
-        with suppress(OSError):
-            folder.rmdir()  # unless there are entries already
+        remove_empty(missing)
     return found
 
 
