@@ -81,6 +81,16 @@ def test_a_damaged_entry_is_dropped_with_one_line(tmp_path: Path, name: str) -> 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_entry_without_a_description_is_none_and_is_replaced(tmp_path: Path) -> None:
+    assert Cache(tmp_path, 1.0).save(key_of(0), {"a": 1}, arrays_of(0.1))
+    (tmp_path / key_of(0) / "entry.json").unlink()
+    assert Cache(tmp_path, 1.0).load(key_of(0)) is None
+    assert Cache(tmp_path, 1.0).save(key_of(0), {"a": 2}, arrays_of(0.1))
+    entry = Cache(tmp_path, 1.0).load(key_of(0))
+    assert entry is not None
+    assert entry.document == {"a": 2}
+
+
 def test_an_entry_of_another_name_is_not_taken(tmp_path: Path) -> None:
     assert Cache(tmp_path, 1.0).save(key_of(0), {"a": 1}, arrays_of(0.1))
     (tmp_path / key_of(0)).rename(tmp_path / key_of(1))

@@ -148,6 +148,8 @@ class Cache:
             with staging_folder(self.folder / key) as folder:
                 (folder / NEW).mkdir()
                 _write(folder / NEW, key, document, arrays)
+                if not self.has(key):
+                    _remove(self.folder / key)  # without a description it is nobody's
                 _rename(folder / NEW, self.folder / key)
             if not self._make_room(0):  # another run has stored something meanwhile
                 _remove(self.folder / key)
@@ -223,7 +225,7 @@ class Cache:
 
     def write_index(self) -> None:
         """Write what was noted; what another run writes meanwhile may be lost, and is then worked out again."""
-        if not self._noted:
+        if not (self._noted and self._writable):
             return
         index = {place: x for place, x in self._index().items() if place not in self._noted} | self._noted
         with suppress(OSError):
