@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -145,7 +144,8 @@ def needs(builder: RowBuilder, chunks: Sequence[Chunk]) -> tuple[Need, Need, Nee
     """What the four stages need for some chunks, in their order."""
     tree, layout = builder.tree, builder.columns.layout
     kinematics, null_space, projection, factorization = (Need() for _ in STAGES)
-    kept = Counter(column < parameters.INERTIA.start for body in layout.kept for column in body)
+    # a wrench times a screw axis; inertias have no force
+    operations = [12 if column < parameters.INERTIA.start else 6 for body in layout.kept for column in body]
     for chunk, state in chunks:
         plan, count = builder.layout(state), len(chunk)
         m = tree.base_rows + len(plan.coupled_joints)
@@ -157,11 +157,11 @@ def needs(builder: RowBuilder, chunks: Sequence[Chunk]) -> tuple[Need, Need, Nee
         )
         factorize, apply = 2 * m * k**2 - 2 * k**3 / 3, 4 * m * r * k - 2 * r * k**2
         null_space.add(count * (12 * k * m + factorize + apply), count * (k * m + m * r))
-        of_columns = 12 * kept[True] + 6 * kept[False]  # a wrench times a screw axis; inertias have no force
-        projection.add(count * r * (of_columns + 12 * tree.n_nodes), count * (6 * layout.count + m * r))
+        projection.add(count * r * 12 * tree.n_nodes, count * (6 * layout.count + m * r))
         for support, rows in builder.rows(chunk, state):
             width = len(support) + 1
-            projection.add(0.0, rows.shape[0] * width)
+            projected = sum(operations[column] for column in support if column < layout.count)
+            projection.add(rows.shape[0] * projected, rows.shape[0] * width)
             factorization.add(2.0 * rows.shape[0] * width**2, rows.shape[0] * width)
     return kinematics, null_space, projection, factorization
 

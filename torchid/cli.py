@@ -162,6 +162,8 @@ def _identify(options: argparse.Namespace) -> None:
     _print_fit(run)
     timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
     print(fill(f"time          {run.samples} samples: {timed}", 100, subsequent_indent=" " * 14))
+    if run.reused:
+        print(f"from cache    {', '.join(run.reused)}")
     print(f"written to    {run.experiment.config.output}")
 
 

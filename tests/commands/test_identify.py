@@ -14,6 +14,7 @@ import pytest
 import torch
 import yaml
 from repository import CONFIGS, DEMO, SHARED
+from run_folders import names_in
 from synthetic import Oracle, random_states
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -50,7 +51,7 @@ def test_a_run_folder_holds_what_it_promises(run: Path) -> None:
         "identifiability",
         "contributions",
     }
-    assert not [path for path in run.parent.iterdir() if path != run], "temporary folders left behind"
+    assert names_in(run.parent) == [run.name], "temporary folders left behind"
 
 
 def test_resolved_config_reads_back_as_itself(run: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -148,7 +149,7 @@ def test_an_evaluation_keeps_large_logs_beside_the_run_wherever_that_was_moved_t
     made_in.clear()
     run.parent.mkdir()
     (tmp_path / "here" / "run").rename(run)
-    (tmp_path / "here").rmdir()
+    shutil.rmtree(tmp_path / "here")
     assert main(["evaluate", str(run), "--log", str(tmp_path / "setup" / "log.npz")]) == 0
     assert set(made_in) == {str(run)}
 

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from hostile_commands import Commands
 from refusals import refusal
-from run_folders import Add, a_run, everything, write
+from run_folders import Add, a_run, everything, names_in, write
 
 from torchid.cli import main
 from torchid.commands.folder import (
@@ -226,7 +226,7 @@ def test_a_run_lists_every_file_of_its_own(copy: Path, place: Path, server: Comm
         server.run(["identify", str(place / "demo" / "quadruped.yaml"), f"output={copy}", "overwrite=true"]).status == 0
     )
     assert not (copy / "evaluation").exists()
-    assert {path.name for path in copy.parent.iterdir()} == {"run"}
+    assert names_in(copy.parent) == ["run"]
 
 
 def test_experiments_never_remove_what_they_read(copy: Path, place: Path, tmp_path: Path, server: Commands) -> None:
@@ -313,7 +313,7 @@ def test_a_training_does_not_begin_where_somebody_keeps_notes(place: Path, tmp_p
     (tmp_path / "run.training").unlink()
     shutil.rmtree(tmp_path / "elsewhere")
     assert server.run([*line, "--resume"]).status == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert names_in(tmp_path) == ["run"]
 
 
 def test_files_are_replaced_only_on_request_and_links_and_inputs_never(

@@ -17,6 +17,7 @@ import yaml
 from demo import shortened_demo
 from fleets import walks
 from repository import DEMO
+from run_folders import names_in
 from shared_work import (
     TORCHRUN,
     children,
@@ -394,7 +395,7 @@ def test_a_killed_process_ends_all_and_leaves_nothing_or_all(
     status, _, complained = finish([*command, f"output={output}", "overwrite=true"])
     assert status == 0, complained
     assert (output / "parameters.json").read_bytes() == parameters
-    assert [path.name for path in output.parent.iterdir()] == ["run"]
+    assert names_in(output.parent) == ["run"]
 
 
 @pytest.mark.slow
@@ -413,4 +414,4 @@ def test_torchrun_starts_again_where_a_training_was(runs: dict[int, Path], exper
     assert process.returncode == 0, complained
     expected = json.loads((runs[2] / "quadruped, descent" / "parameters.json").read_text())
     assert json.loads((folder / "run/parameters.json").read_text()) == expected
-    assert [path.name for path in folder.iterdir()] == ["run"]
+    assert names_in(folder) == ["run"]

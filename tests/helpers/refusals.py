@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 
 from torchid.cli import main
+from torchid.commands.cache import FOLDER
 from torchid.errors import ConfigError, InputError, UnknownNameError
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
-    """All files with what is in them, and all folders."""
-    paths = sorted(folder.rglob("*"))
+    """All files with what is in them, and all folders, without what runs keep for later ones."""
+    paths = [path for path in sorted(folder.rglob("*")) if FOLDER not in path.relative_to(folder).parts]
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in paths}
 
 

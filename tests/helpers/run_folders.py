@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from torchid.commands.cache import FOLDER
 from torchid.commands.folder import (
     EVALUATION,
     new_folder,
@@ -38,3 +39,8 @@ def everything(folder: Path) -> dict[str, tuple[bytes, str]]:
         )
         for path in folder.rglob("*")
     }
+
+
+def names_in(folder: Path) -> list[str]:
+    """What is in a folder, but for what runs keep there for later ones."""
+    return sorted(path.name for path in folder.iterdir() if path.name != FOLDER)

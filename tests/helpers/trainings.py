@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from run_folders import names_in
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchid.estimators import Trainer
@@ -66,7 +67,7 @@ def assert_as_uninterrupted(output: Path, run: Path) -> None:
         assert (output / name).read_bytes() == (run / name).read_bytes()
     found, expected = (json.loads((folder / "metrics.json").read_text()) for folder in (output, run))
     assert found | {"seconds": None} == expected | {"seconds": None}
-    assert [path.name for path in output.parent.iterdir()] == [output.name]
+    assert names_in(output.parent) == [output.name]
     curves, whole = events_in(output), events_in(run)
     assert curves.Tags()["scalars"] == whole.Tags()["scalars"]
     for tag in whole.Tags()["scalars"]:

@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 from hostile_commands import Commands
 from refusals import files_in
+from run_folders import names_in
+
+from torchid.commands.cache import FOLDER
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP)
 COMMANDS = ("identify", "train", "evaluate", "analyze", "convert", "compress")
@@ -53,9 +56,8 @@ def content(made: Path) -> set[str]:
 
 def hidden(out: Path) -> list[str]:
     """Temporary files and folders, wherever they are."""
-    found = (
-        path for path in out.rglob(".*") if path.name != ".checkpoint.pt" and out / "run.training" not in path.parents
-    )
+    kept = (".checkpoint.pt", FOLDER)
+    found = (path for path in out.rglob(".*") if path.name not in kept and out / "run.training" not in path.parents)
     return sorted(str(path.relative_to(out)) for path in found)
 
 
@@ -112,4 +114,4 @@ def test_a_run_that_is_replaced_is_there_at_any_moment(
     for _ in range(2):
         server.stopped(line, number, draw.uniform(0.7, 1.0) * seconds)
         assert content(out) == content(run)
-        assert [path.name for path in tmp_path.iterdir()] == ["run"]
+        assert names_in(tmp_path) == ["run"]

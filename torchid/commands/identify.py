@@ -12,13 +12,15 @@ from functools import partial
 from rich.progress import Progress
 
 from torchid import ranks
+from torchid.commands.cached_factors import cached_parts, factors_key
+from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
-from torchid.errors import NumericalWarning, warn_about_file
+from torchid.errors import NumericalWarning, format_count, warn_about_file
 from torchid.estimators import Conditions, Estimate, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
@@ -81,6 +83,7 @@ class _Data:
     """Training logs in folds, or factors of them, with the noise that they are weighed with, and compressed; test logs.
 
     `experiment`: with that noise. `factors`: files that the training logs come from, none if they come from logs.
+    `reused`: what an earlier run has left in the cache, in words.
     """
 
     experiment: Experiment
@@ -92,6 +95,7 @@ class _Data:
     builder: RowBuilder
     blocks: Sequence[Block]
     parts: list[Part]
+    reused: list[str]
 
 
 @dataclass
@@ -119,7 +123,7 @@ def _prepare(config: ExperimentConfig, clock: _Clock, bars: Progress) -> _Prepar
 def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
     """The logs of an experiment, read and compressed."""
     with clock("read"):
-        reader = LogReader(experiment)
+        reader = _reader(experiment)
         logs = _read(reader, experiment, bars)
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
@@ -129,8 +133,9 @@ def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Dat
     with clock("compress"):
         builder = experiment.builder(experiment.sensors)
         blocks = split_into_folds(logs["train"], builder)
-        parts = _compressed(builder, blocks, bars)
-    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts)
+        parts, there = _compressed(experiment, reader, builder, blocks, bars)
+    reused = [*_reused(reader), *(["factors"] if there else [])]
+    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused)
 
 
 def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
@@ -139,14 +144,15 @@ def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
         fleet = read_fleet(experiment, lambda _: bars.advance(reading))
         require_base(fleet.states, experiment.config.sensors.on_base_lost)
-        reader = LogReader(experiment)
+        reader = _reader(experiment)
         logs = _read(reader, experiment, bars)
     with clock("compress"):
         builder = fleet.experiment.builder(fleet.experiment.sensors)
         blocks = fold_compressed([one.log for one in fleet.files], builder)
         parts = merge_blocks(blocks, builder)
     excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
-    return _Data(fleet.experiment, logs, fleet.files, excluded, fleet.states, fleet.noise, builder, blocks, parts)
+    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader))
+    return _Data(fleet.experiment, logs, fleet.files, excluded, *same)
 
 
 def _identify(config: ExperimentConfig, resume: bool) -> Identification:
@@ -199,6 +205,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             mass=mass,
             validation=validation,
             ridge=ready.ridge,
+            reused=ready.reused,
         )
         require_not_worse(run.worse, experiment)
         bars.add_task("writing", total=None)
@@ -243,9 +250,35 @@ def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str
     }
 
 
-def _compressed(builder: RowBuilder, train: Sequence[Samples], bars: Progress) -> list[Part]:
+def _reader(experiment: Experiment) -> LogReader:
+    """Reads logs, through the cache beside the output if there is to be one."""
+    cache = open_cache(experiment)
+    return LogReader(experiment) if cache is None else CachedReader(experiment, cache)
+
+
+def _reused(reader: LogReader) -> list[str]:
+    """What a reader has found in its cache, in words."""
+    count = len(reader.reused) if isinstance(reader, CachedReader) else 0
+    return [f"samples of {format_count(count, 'log')}"] if count else []
+
+
+def _compressed(
+    experiment: Experiment, reader: LogReader, builder: RowBuilder, train: Sequence[Samples], bars: Progress
+) -> tuple[list[Part], bool]:
+    """The compressed training logs, and whether they were in the cache."""
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
-    return compress_parts(train, builder, progress=lambda n: bars.advance(streaming, n))
+
+    def compute() -> list[Part]:
+        return compress_parts(train, builder, progress=lambda n: bars.advance(streaming, n))
+
+    keys = reader.keys if isinstance(reader, CachedReader) else {}
+    paths = [str(path) for path in experiment.config.logs.train]
+    if not isinstance(reader, CachedReader) or not all(ranks.gather(keys.keys() >= {*paths}, "logs in the cache")):
+        return compute(), False
+    key = factors_key(experiment, builder, [keys[path] for path in paths], train)
+    parts, there = cached_parts(reader.cache, key, builder, train, compute)
+    bars.update(streaming, completed=sum(map(len, train)))
+    return parts, there
 
 
 def _robust(

@@ -79,19 +79,24 @@ class LogReader:
         """
         limit, logs = self.scene.config.preprocessing.memory_gb, []
         for path in paths:
-            together = memory_needed(path, limit, self._held)
-            if existing_log_kind(path) is LogKind.BAG:
-                logs.append(self._small(path, required))
-                self._held += logs[-1].nbytes / GIGABYTE
-            elif together <= limit:
-                logs.append(self._small(path, required))
-                self._held = together
-            else:
-                logs.append(self._large(path, required, together))
+            together = self._together(path)
+            bag = existing_log_kind(path) is LogKind.BAG
+            large = together > limit and not bag
+            logs.append(self._samples(path, required, together if large else None))
+            if not large:
+                self._held = together + (logs[-1].nbytes / GIGABYTE if bag else 0.0)
             if on_read is not None:
                 on_read(path)
         names = ranks.as_first([log.source for log in logs], "names of the logs")  # they may lie elsewhere there
         return [log if log.source == name else replace(log, source=name) for log, name in zip(logs, names, strict=True)]
+
+    def _together(self, path: Path) -> float:
+        """What a log takes in memory with those before it [GB]."""
+        return memory_needed(path, self.scene.config.preprocessing.memory_gb, self._held)
+
+    def _samples(self, path: Path, required: SensorSet | None, together: float | None) -> Samples:
+        """The samples of a log; `together`: what it takes with those before it [GB], if that is too much."""
+        return self._small(path, required) if together is None else self._large(path, required, together)
 
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""

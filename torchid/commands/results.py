@@ -72,6 +72,7 @@ class Identification:
         mass: the total mass and how well it is known.
         validation: errors on held-out blocks, None where the samples are too few to leave some out.
         ridge: how it was chosen, if it was.
+        reused: what an earlier run has left in the cache, in words.
     """
 
     experiment: Experiment
@@ -91,6 +92,7 @@ class Identification:
     mass: TotalMass
     validation: CrossValidation | None
     ridge: RidgeChoice | None
+    reused: Sequence[str] = ()
 
     def violations_by_name(self) -> list[dict[str, object]]:
         """Conditions that the identified parameters break, the body by its name."""

@@ -142,6 +142,7 @@ class PreprocessingConfig:
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
     `exclude_condemned`: leave out the samples that `torchid check` condemns.
     `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
+    `cache_gb`: room [GB] for samples and factors that later runs of `identify` find beside the output; 0 for none.
     """
 
     cutoff_hz: Positive | None = None
@@ -149,6 +150,7 @@ class PreprocessingConfig:
     contact_margin_s: NotNegative | None = None
     exclude_condemned: bool = False
     memory_gb: Positive = 2.0
+    cache_gb: NotNegative = 2.0
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)

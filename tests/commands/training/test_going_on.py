@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from repository import DEMO
+from run_folders import names_in
 from tensorboard.plugins.custom_scalar import layout_pb2
 from trainings import (
     BY_EPOCH,
@@ -47,7 +48,7 @@ def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Pa
     figures = {"forces.png", "errors.png", "parameters.png", "identifiability.png", "contributions.png"}
     results = {"config.yaml", "parameters.json", "metrics.json", "identified.urdf", "manifest.json"}
     assert names == {"events", "hparams", *results, *figures}
-    assert list(run.parent.iterdir()) == [run]
+    assert names_in(run.parent) == [run.name]
     assert load_config(run / "config.yaml").estimator.training.epochs == EPOCHS
 
 
@@ -254,7 +255,7 @@ def test_an_interrupt_before_the_first_checkpoint_leaves_nothing_in_the_way(
     monkeypatch.setattr(Trainer, "finished", True)  # what matters is that it starts
     assert main(command(experiment, output, "--resume")) == 0
     assert "no checkpoint to go on from; training starts at the beginning" in capsys.readouterr().err
-    assert [path.name for path in output.parent.iterdir()] == ["run"]
+    assert names_in(output.parent) == ["run"]
 
 
 def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
@@ -266,7 +267,7 @@ def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr("torchid.commands.results.write_json", stopped)
         assert main(command(experiment, output, "--resume")) == 1
-    assert [path.name for path in output.parent.iterdir()] == ["run.training"]
+    assert names_in(output.parent) == ["run.training"]
     assert load_checkpoint(training_of(output))["trainer"]["epoch"] == EPOCHS
     assert main(command(experiment, output, "--resume")) == 0
     assert_as_uninterrupted(output, run)

@@ -15,6 +15,7 @@ import pytest
 import torch
 from refusals import files_in, refusal
 from repository import DEMO
+from run_folders import names_in
 from trainings import (
     EPOCHS,
     assert_as_uninterrupted,
@@ -183,7 +184,7 @@ def test_a_run_stays_as_it_is_until_the_one_that_replaces_it_is_complete(
         assert main(command(experiment, output, "overwrite=true", "--resume")) == 1
     assert "No space left" in capsys.readouterr().err
     assert files_in(output) == before
-    assert sorted(path.name for path in output.parent.iterdir()) == ["run", "run.training"]
+    assert names_in(output.parent) == ["run", "run.training"]
     refusal(command(experiment, output, "--resume"), output.parent, capsys)
     assert main(command(experiment, output, "overwrite=true", "--resume")) == 0
     assert_as_uninterrupted(output, run)
@@ -207,7 +208,7 @@ def test_an_unfinished_training_is_begun_anew_if_asked_for(
     more = ("overwrite=true", "estimator.training.epochs=1", "estimator.training.seed=3")
     assert main(command(experiment, output, *more)) == 0
     assert steps(events_in(output), "loss/data") == [1], "nothing of the old curves"
-    assert [path.name for path in output.parent.iterdir()] == ["run"]
+    assert names_in(output.parent) == ["run"]
 
 
 @pytest.mark.parametrize("more", [(), ("overwrite=true",), ("--resume",)], ids=["plain", "overwrite", "resume"])
@@ -234,10 +235,10 @@ def test_a_descent_that_diverges_ends_in_one_line_and_is_not_in_the_way_of_the_n
     assert line.startswith("torchid: estimator: training: a loss of ")
     assert line.endswith("; accepted: a smaller lr")
     assert printed.out == ""
-    assert [path.name for path in output.parent.iterdir()] == ["run.training"]
+    assert names_in(output.parent) == ["run.training"]
     assert {path.name.split(".")[0] for path in training_of(output).iterdir()} == {"config", "events", "manifest"}
     assert main(command(experiment, output, "estimator.training.epochs=1")) == 0
-    assert [path.name for path in output.parent.iterdir()] == ["run"]
+    assert names_in(output.parent) == ["run"]
 
 
 def test_nothing_to_learn_is_noticed_before_anything_is_written(

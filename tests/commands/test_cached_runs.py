@@ -1,0 +1,384 @@
+"""The cache of samples and factors: results are those without it, and change with whatever they come from."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from demo import DEMO, shortened_demo
+from large import experiment, overrides, recorded
+from matplotlib.figure import Figure
+from trainings import FIGURES
+
+from torchid.cli import main
+from torchid.commands.cache import FOLDER, content_key
+from torchid.commands.cached_factors import factors_key
+from torchid.commands.cached_reading import CachedReader, open_cache
+from torchid.commands.cached_samples import NOT_IN_SAMPLES, content_of_scene
+from torchid.commands.reading import LogReader
+from torchid.config import load_config
+from torchid.config.experiment import ActuatorsConfig, ContactConfig, PreprocessingConfig, RobotConfig
+from torchid.config.sensors import NoiseConfig
+from torchid.errors import TorchidWarning
+from torchid.fitting.experiment import set_up, with_noise
+from torchid.fitting.noise import NoiseSummary
+from torchid.problem.compression import split_into_folds
+
+NONE = "preprocessing.cache_gb=0"
+SGD = "estimator={name: sgd, ridge: 0.1, training: {epochs: 2, batch_size: 64}}"
+ESTIMATORS = {
+    "least squares": ("estimator.ridge=0.01", "preprocessing.cutoff_hz=8"),
+    "auto": ("estimator.ridge=auto", "preprocessing.cutoff_hz=20"),
+    "consistent": ("estimator.name=consistent",),
+    "offsets": ("sensors={set: full, offsets: {contact_force: log}}", "preprocessing.contact_margin_s=0.01"),
+    "robust": ("estimator.robust=huber", "actuators.armature=true"),
+    "descent": (SGD,),
+    "block by block": ("preprocessing.memory_gb=0.0001",),
+}
+
+
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Checksums of files that have just been written count; no figures, which take most of the time; one thread.
+
+    Threads add what they know of residuals in the order in which they get there.
+    """
+    monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
+    for figure in FIGURES:
+        monkeypatch.setattr(f"torchid.commands.results.{figure}", lambda *_: Figure(figsize=(1.0, 1.0)))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Experiment file of the demo, shortened."""
+    return shortened_demo(tmp_path_factory.mktemp("cache") / "demo", 300) / "quadruped.yaml"
+
+
+def results(run: Path) -> dict[str, Any]:
+    """All that a run folder says, but for how long it took and the size of the cache."""
+    out: dict[str, Any] = {name: (run / name).read_bytes() for name in ("parameters.json", "identified.urdf")}
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    del config["preprocessing"]["cache_gb"], config["output"], config["overwrite"]
+    return out | {"config": config, "metrics": json.loads((run / "metrics.json").read_text()) | {"seconds": None}}
+
+
+def keys_in(folder: Path) -> set[str]:
+    return {path.name for path in (folder / FOLDER).iterdir() if path.is_dir()}
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_run_from_the_cache_has_the_results_of_one_without_to_the_last_bit(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    line = ["identify", str(demo), *ESTIMATORS[name]]
+    assert main([*line, f"output={tmp_path / 'without'}", NONE]) == 0
+    assert not (tmp_path / FOLDER).exists()
+    expected = results(tmp_path / "without")
+    assert main([*line, f"output={tmp_path / 'first'}"]) == 0
+    assert results(tmp_path / "first") == expected
+    assert "from cache" not in capsys.readouterr().out
+    for opened in ("reading.read_log", "reading.open_log_blocks", "cached_reading.log_bytes", "cache.file_checksum"):
+        monkeypatch.setattr(f"torchid.commands.{opened}", None)
+    monkeypatch.setattr(sys.modules["torchid.commands.identify"], "compress_parts", None)
+    assert main([*line, f"output={tmp_path / 'second'}"]) == 0
+    assert results(tmp_path / "second") == expected
+    assert "from cache    samples of 2 logs, factors" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_another_ridge_estimator_and_prior_read_and_compress_nothing(
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["identify", str(demo), f"output={tmp_path / 'first'}", "estimator.ridge=1.0"]) == 0
+    others = (("estimator.ridge=0.01",), ("estimator.name=consistent", "estimator.prior=entropic"))
+    for number, more in enumerate(others):
+        assert main(["identify", str(demo), *more, f"output={tmp_path / f'without{number}'}", NONE]) == 0
+    monkeypatch.setattr("torchid.commands.reading.read_log", None)
+    monkeypatch.setattr(sys.modules["torchid.commands.identify"], "compress_parts", None)
+    for number, more in enumerate(others):
+        assert main(["identify", str(demo), *more, f"output={tmp_path / f'with{number}'}"]) == 0
+        assert results(tmp_path / f"with{number}") == results(tmp_path / f"without{number}")
+
+
+# ------------------------------------------------------------------------------------------- what an entry depends on
+
+#: A value of every key of preprocessing that is neither its default nor that of the demo.
+CHANGED = {
+    "cutoff_hz": 7.0,
+    "sample_rate_hz": 111.0,
+    "contact_margin_s": 0.02,
+    "exclude_condemned": True,
+    "memory_gb": 3.0,
+    "cache_gb": 5.0,
+}
+
+
+def content(file: Path, *more: str) -> str:
+    return content_key(content_of_scene(set_up(load_config(file, more))))
+
+
+@pytest.mark.parametrize("name", [one.name for one in fields(PreprocessingConfig)])
+def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo: Path, name: str) -> None:
+    """A new key is of those that do, and has a value here, unless it is named in two places."""
+    other = f"preprocessing.{name}={json.dumps(CHANGED[name])}"
+    assert NOT_IN_SAMPLES == ("memory_gb", "cache_gb")
+    assert (content(demo) != content(demo, other)) == (name not in NOT_IN_SAMPLES)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        "robot.fixed_base=true",
+        "robot.base_link=front_left_hip_link",
+        "contacts.0.type=flat",
+        "contacts.0={type: line, line_axis: x}",
+        "logs.topics.joint_states=/joints",
+    ],
+)
+def test_robot_contacts_and_topics_change_the_name_of_samples(demo: Path, tmp_path: Path, other: str) -> None:
+    assert {x.name for x in fields(RobotConfig)} == {"urdf", "base_link", "fixed_base"}
+    assert {x.name for x in fields(ContactConfig)} == {"frame", "type", "line_axis"}
+    document = yaml.safe_load(demo.read_text())
+    key, _, value = other.partition("=")
+    if key.startswith("contacts"):
+        new = yaml.safe_load(value)
+        document["contacts"][0] |= new if isinstance(new, dict) else {"type": new}
+        key = ""
+    elif key == "robot.base_link":
+        document["contacts"] = document["contacts"][:1]
+    shutil.copytree(demo.parent, tmp_path / "demo")
+    file = tmp_path / "demo" / "other.yaml"
+    file.write_text(yaml.safe_dump(document))
+    base = content(demo)
+    assert content(file, *([other] if key else [])) != base
+
+
+def test_the_urdf_and_the_code_change_the_name_of_samples(
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = content(demo)
+    shutil.copytree(demo.parent, tmp_path / "demo")
+    assert content(tmp_path / "demo" / demo.name) == before, "a copy is the same"
+    urdf = tmp_path / "demo" / "quadruped.urdf"
+    urdf.write_text(urdf.read_text().replace("</robot>", "<!-- heavier --></robot>"))
+    assert content(tmp_path / "demo" / demo.name) != before
+    monkeypatch.setattr("torchid.commands.cache._code", lambda: "another")
+    assert content(demo) != before
+
+
+def test_sensors_estimators_and_extra_parameters_leave_the_name_of_samples(demo: Path) -> None:
+    more = ("sensors=full", "estimator.ridge=3.0", "actuators.armature=true", "device=cpu", "output=elsewhere")
+    assert content(demo) == content(demo, *more)
+
+
+def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, tmp_path: Path) -> None:
+    def key(*more: str) -> str:
+        scene = set_up(load_config(demo, (f"output={tmp_path / 'run'}", *more)))
+        noise = NoiseSummary(scene.noise, [], {}, 0)
+        logs = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+        scene = with_noise(scene, noise)
+        builder = scene.builder(scene.sensors)
+        return factors_key(scene, builder, ["samples"], split_into_folds(logs, builder))
+
+    same = key()
+    assert key("estimator.ridge=3.0", "estimator.friction=false", "preprocessing.memory_gb=3") == same
+    values = {x.name: 0.77 for x in fields(NoiseConfig) if not x.name.startswith(("base", "ft"))}
+    values |= {"base_force": [1.0, 2.0, 3.0], "base_moment": [1.0, 2.0, 3.0], "ft_force": 0.3, "ft_moment": 0.3}
+    assert values.keys() == {x.name for x in fields(NoiseConfig)}
+    terms = {"armature": True, "torque_offset": True, "asymmetric_coulomb": True, "sign_width": 0.01}
+    assert terms.keys() == {x.name for x in fields(ActuatorsConfig)}
+    others = [f"sensors.noise.{name}={json.dumps(x)}" for name, x in values.items()]
+    others += [f"actuators.{name}={json.dumps(x)}" for name, x in terms.items()]
+    others += ["sensors.set=full", "sensors.offsets={joint_torque: log}", "sensors.scales={joint_torque: all}"]
+    found = {key(other) for other in others}
+    assert same not in found
+    assert len(found) == len(others)
+
+
+def test_a_log_with_other_content_is_read_whatever_its_size_and_time_say(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(demo.parent, tmp_path / "demo")
+    log, file = tmp_path / "demo" / "sway_train.npz", tmp_path / "demo" / demo.name
+    assert main(["identify", str(file), f"output={tmp_path / 'before'}"]) == 0
+    state = log.stat()
+    with np.load(log) as archive:
+        arrays = dict(archive)
+    arrays["joint_torque"] = arrays["joint_torque"] + 1.0
+    np.savez(log, **arrays)
+    os.utime(log, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert (log.stat().st_size, log.stat().st_mtime_ns) == (state.st_size, state.st_mtime_ns)
+    capsys.readouterr()
+    for name, more in (("after", ()), ("without", (NONE,))):
+        assert main(["identify", str(file), f"output={tmp_path / name}", *more]) == 0
+    assert "from cache    samples of 1 log\n" in capsys.readouterr().out
+    assert results(tmp_path / "after") == results(tmp_path / "without") != results(tmp_path / "before")
+
+
+# ------------------------------------------------------------------------------------------------ what reading said
+
+
+def read_twice(file: Path, *more: str) -> list[tuple[list[str], dict[str, int], int]]:
+    """What is said, what is excluded and how many samples there are, when logs are read without a cache, then twice."""
+    out = []
+    for cached in (False, True, True):
+        scene = set_up(load_config(file, more))
+        cache = open_cache(scene)
+        assert cache is not None
+        reader = CachedReader(scene, cache) if cached else LogReader(scene)
+        with pytest.warns(TorchidWarning) as said:
+            logs = reader.read(scene.config.logs.train, scene.sensors)
+        out.append(([str(x.message) for x in said], dict(reader.excluded), sum(map(len, logs))))
+    return out
+
+
+def test_warnings_are_repeated_word_for_word_and_excluded_samples_counted(tmp_path: Path) -> None:
+    fields = recorded(2_000)
+    fields["contact_wrench_local"][500:700, 1, 2] = np.nan
+    fields["contact_active"][:, 1] = True
+    file = experiment(tmp_path / "a", fields)
+    shutil.copytree(tmp_path / "a", tmp_path / "other place")
+    shutil.move(tmp_path / "other place" / "log.npz", tmp_path / "other place" / "walk.npz")
+    (tmp_path / "other place" / "run.yaml").write_text(file.read_text().replace("log.npz", "walk.npz"))
+    settings = (*overrides({"cutoff_hz": 20.0}), f"output={tmp_path / 'run'}")
+    without, first, second = read_twice(file, *settings)
+    assert first == second == without
+    assert "NaN in part of" in without[0][0]
+    *_, moved = read_twice(tmp_path / "other place" / "run.yaml", *settings)
+    assert moved[0] == [x.replace("a/log.npz", "other place/walk.npz") for x in without[0]]
+    assert len(keys_in(tmp_path)) == 1
+
+
+def test_excluded_samples_are_said_and_counted_again(demo: Path, tmp_path: Path) -> None:
+    shutil.copytree(demo.parent, tmp_path / "demo")
+    log = tmp_path / "demo" / "sway_train.npz"
+    with np.load(log) as archive:
+        arrays = dict(archive)
+    arrays["joint_torque"][100:103, 2] += 1e4
+    np.savez(log, **arrays)
+    more = (f"output={tmp_path / 'run'}", "preprocessing.exclude_condemned=true")
+    without, first, second = read_twice(tmp_path / "demo" / demo.name, *more)
+    assert first == second == without
+    assert without[1][str(log)] > 0
+
+
+def test_a_sensor_that_was_not_recorded_is_missed_as_without_a_cache(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fields = recorded(1_000)
+    del fields["contact_wrench_local"]
+    file = experiment(tmp_path, fields)
+    scene = set_up(load_config(file, (*overrides({}), f"output={tmp_path / 'run'}")))
+    cache = open_cache(scene)
+    assert cache is not None
+    CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
+    assert keys_in(tmp_path)
+    complaints = []
+    for more in ((), (NONE,)):
+        assert main(["identify", str(file), *overrides({}, "full"), f"output={tmp_path / 'run'}", *more]) == 2
+        complaints.append(capsys.readouterr().err)
+    assert "contact_wrench: missing" in complaints[0]
+    assert complaints[0] == complaints[1]
+
+
+# ------------------------------------------------------------------------------------------- damage, bounds, company
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
+def test_a_run_with_damaged_entries_says_so_and_has_the_same_results(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["identify", str(demo), f"output={tmp_path / 'first'}"]) == 0
+    for path in (tmp_path / FOLDER).rglob("*.npy"):
+        os.truncate(path, path.stat().st_size - 8)
+    (tmp_path / FOLDER / "checksums.json").write_text("{")
+    capsys.readouterr()
+    assert main(["identify", str(demo), f"output={tmp_path / 'second'}"]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "a damaged entry of the cache" in line]
+    assert len(lines) == 3, "two logs and the factors"
+    assert results(tmp_path / "second") == results(tmp_path / "first")
+    assert main(["identify", str(demo), f"output={tmp_path / 'third'}"]) == 0
+    assert "from cache    samples of 2 logs, factors" in capsys.readouterr().out
+
+
+def test_entries_with_something_else_in_them_are_dropped(demo: Path, tmp_path: Path) -> None:
+    """As another program could write them, with all checksums."""
+    scene = set_up(load_config(demo, (f"output={tmp_path / 'run'}",)))
+    cache = open_cache(scene)
+    assert cache is not None
+    CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
+    (key,) = keys_in(tmp_path)
+    for document, arrays in (({}, {}), ({"axes": {"time": [0]}}, {"time": np.zeros((2, 2))}), ({"axes": 3}, {})):
+        shutil.rmtree(cache.folder / key)
+        assert cache.save(key, document, arrays)
+        with pytest.warns(TorchidWarning, match="a damaged entry"):
+            (log,) = CachedReader(scene, cache).read(scene.config.logs.train, scene.sensors)
+        assert len(log) == 250
+
+
+@pytest.mark.slow
+def test_two_runs_at_once_have_the_results_of_one(demo: Path, tmp_path: Path) -> None:
+    line = [sys.executable, "-m", "torchid", "identify", str(demo)]
+    running = [
+        subprocess.Popen(
+            [*line, f"output={tmp_path / name}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for name in ("a", "b")
+    ]
+    assert main([*line[3:], f"output={tmp_path / 'c'}", NONE]) == 0
+    for process in running:
+        _, complained = process.communicate(timeout=100)
+        assert process.returncode == 0, complained
+        assert "cache" not in complained
+    assert results(tmp_path / "a")["parameters.json"] == results(tmp_path / "b")["parameters.json"]
+    assert len(keys_in(tmp_path)) == 3
+    assert not [path for path in (tmp_path / FOLDER).iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
+@pytest.mark.parametrize("reason", ["a file in its place", "a full disk", "a folder that may not be written"])
+def test_where_nothing_can_be_written_a_run_goes_on_without_and_says_so_once(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, reason: str
+) -> None:
+    assert main(["identify", str(demo), f"output={tmp_path / 'without'}", NONE]) == 0
+    capsys.readouterr()
+
+    def refused(*_: object, **__: object) -> Any:
+        raise OSError(
+            13 if "may not" in reason else 28, "Permission denied" if "may not" in reason else "No space left"
+        )
+
+    if reason == "a file in its place":
+        (tmp_path / FOLDER).write_text("mine")
+    elif reason == "a full disk":
+        monkeypatch.setattr("numpy.lib.format.write_array_header_1_0", refused)
+    else:
+        monkeypatch.setattr("torchid.commands.cache.staging_folder", refused)
+    assert main(["identify", str(demo), f"output={tmp_path / 'run'}"]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if FOLDER in line]
+    assert len(lines) == 1
+    assert f"{tmp_path / FOLDER}: cannot be written (" in lines[0]
+    assert results(tmp_path / "run") == results(tmp_path / "without")
+    if reason != "a file in its place":
+        assert not [path for path in (tmp_path / FOLDER).glob("*") if path.is_dir()]
+
+
+def test_cache_gb_is_checked_like_any_key(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["identify", str(DEMO / "quadruped.yaml"), "preprocessing.cache_gb=-1"]) == 2
+    assert "preprocessing.cache_gb: found -1; accepted: greater than or equal to 0" in capsys.readouterr().err

@@ -1,0 +1,270 @@
+"""Reading logs through a cache of samples, whose missing entries processes of one run write together."""
+
+from __future__ import annotations
+
+import secrets
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchid import ranks
+from torchid.commands.cache import FOLDER, TOKEN, Cache, content_key, file_states, missing_folders, remove_empty
+from torchid.commands.cached_samples import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
+from torchid.commands.reading import LogReader
+from torchid.errors import TorchidWarning, warn
+from torchid.fitting.experiment import Scene
+from torchid.fitting.noise import recorded_sensors
+from torchid.logs.blocks import GIGABYTE, log_bytes
+from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files
+from torchid.problem import Samples
+from torchid.problem.extras import recorded_components
+from torchid.sensing import SensorSet
+
+
+def open_cache(scene: Scene) -> Cache | None:
+    """The cache beside the output of an experiment; None without one, or where processes have no common folder.
+
+    All processes that share the work call this together.
+    """
+    size, output = scene.config.preprocessing.cache_gb, scene.config.output
+    if not size:
+        return None
+    cache = Cache(output.absolute().parent / FOLDER, size)
+    if ranks.world_size() > 1 and not _is_common(cache.folder):
+        return None
+    if ranks.is_first():
+        cache.tidy()
+    return cache
+
+
+def _is_common(folder: Path) -> bool:
+    """Whether all processes find in a folder what the first one has just put there."""
+    name, missing = "", missing_folders(folder)
+    if ranks.is_first():
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / (token := f"{TOKEN}{secrets.token_hex(8)}")).touch()
+            name = token
+    name = ranks.as_first(name, "a file for all processes")
+    found = all(ranks.gather(bool(name) and (folder / name).is_file(), "a common folder"))
+    if name and ranks.is_first():
+        with suppress(OSError):
+            (folder / name).unlink()
+        remove_empty(missing)
+    return found
+
+
+@dataclass(frozen=True)
+class _Content:
+    """Checksum of a log, and its files with their states when it was worked out."""
+
+    checksum: str
+    files: list[Path]
+    states: list[list[int]]
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """A log that will be read, the name of its samples, what it takes with others if that is too much, its bytes."""
+
+    path: Path
+    key: str
+    together: float | None
+    size: int
+
+
+class CachedReader(LogReader):
+    """Takes the samples of logs from a cache, and reads and stores those that are not there.
+
+    Samples of the cache are mapped to its files: all processes of a machine have them in memory once.
+
+    Attributes:
+        keys: names of the samples of each log by its path, which stand for all that these depend on.
+        reused: logs that an earlier run has read.
+    """
+
+    def __init__(self, scene: Scene, cache: Cache) -> None:
+        """Nothing is read yet."""
+        super().__init__(scene)
+        self.cache, self.keys, self.reused = cache, dict[str, str](), set[str]()
+        self._new = set[str]()  # keys that were not there when this run began
+        self._contents: dict[Path, _Content] = {}
+        self._scene_content = content_of_scene(scene)
+
+    def read(
+        self, paths: Sequence[Path], required: SensorSet | None, on_read: Callable[[Path], None] | None = None
+    ) -> list[Samples]:
+        """As `LogReader.read`; of processes that share the work, each reads some of the logs for all."""
+        if ranks.world_size() > 1:
+            self._fill_together(paths, required)
+        logs = super().read(paths, required, on_read)
+        if ranks.is_first():
+            self.cache.write_index()
+        return logs
+
+    def _together(self, path: Path) -> float:
+        room = self.scene.config.preprocessing.memory_gb - self._held
+        bound = room if path.suffix.lower() == ".csv" else 0.0  # for others, `log_bytes` does not depend on it
+        content = self._content(path)
+        size = None if content is None else self.cache.array_bytes(path, content.checksum, bound)
+        if size is None:
+            size = log_bytes(path, GIGABYTE * room)
+            if content is not None:
+                self.cache.note_array_bytes(path, content.checksum, bound, size)
+        return self._held + size / GIGABYTE
+
+    def _samples(self, path: Path, required: SensorSet | None, together: float | None) -> Samples:
+        key = self._key(path, required, together)
+        if key is None:
+            return super()._samples(path, required, together)
+        if not self.cache.has(key):
+            self._new.add(key)
+        found = self._load(key, path, required, together)
+        if found is None:
+            said: list[Said] = []
+            try:
+                found = self._read(path, required, together, said)
+            finally:
+                _say(said)
+            if ranks.world_size() == 1 and self._store(key, path, found):
+                found = self._load(key, path, required, together) or found
+        else:
+            _say(found.said)
+            if key not in self._new:
+                self.reused.add(str(path))
+        self.keys[str(path)] = key
+        if found.excluded is not None:
+            self.excluded[str(path)] = found.excluded
+        return found.samples
+
+    def _read(self, path: Path, required: SensorSet | None, together: float | None, said: list[Said]) -> ReadLog:
+        """A log as it is read without a cache; what is said on the way goes to a list."""
+        with _listening(said):
+            samples = super()._samples(path, required, together)
+        recorded = recorded_sensors(self.scene.robot, self.scene.contacts, [samples])
+        return ReadLog(samples, recorded, self.excluded.get(str(path)), said)
+
+    # ---------------------------------------------------------------------------------------------- keys and entries
+
+    def _content(self, path: Path) -> _Content | None:
+        """What is in a log; None where it cannot be read, which reading then says."""
+        if path not in self._contents:
+            existing_log_kind(path)
+            files = list_bag_files(path) or [path]
+            try:
+                states = file_states(files)
+                self._contents[path] = _Content(self.cache.checksum(path, files), files, states)
+            except OSError:
+                return None
+        return self._contents[path]
+
+    def _key(self, path: Path, required: SensorSet | None, together: float | None) -> str | None:
+        """The name of the samples of a log, None if it cannot be read.
+
+        Reading block by block rounds otherwise than reading a log as a whole, and with the size of the blocks. Where
+        samples are dropped, what was required of them before cannot be told from what is left.
+        """
+        content = self._content(path)
+        if content is None:
+            return None
+        settings = self.scene.config.preprocessing
+        drops = settings.exclude_condemned or settings.contact_margin_s is not None
+        masks = None if required is None or not drops else [required.torque.tolist(), required.wrench.tolist()]
+        blocks = None if together is None else settings.memory_gb
+        return content_key([self._scene_content, content.checksum, path.suffix.lower(), blocks, masks])
+
+    def _store(self, key: str, path: Path, read: ReadLog) -> bool:
+        """Whether an entry is there now; none is written of a log that has changed since its key was made."""
+        content = self._content(path)
+        if content is None or file_states(content.files) != content.states:
+            return False
+        return self.cache.save(key, *samples_entry(read))
+
+    def _load(self, key: str, path: Path, required: SensorSet | None, together: float | None) -> ReadLog | None:
+        """Samples from the cache; None if they are not there, or lack what is required, which reading then says."""
+        entry = self.cache.load(key)
+        if entry is None:
+            return None
+        try:
+            found = samples_of_entry(entry, str(path), None if together is None else self.folder)
+        except Exception as error:  # noqa: B902 - whatever another program has put there
+            self.cache.drop(key, str(error))
+            return None
+        return found if required is None or self._has(found, required) else None
+
+    def _has(self, found: ReadLog, required: SensorSet) -> bool:
+        """Whether every value of the required sensors was recorded."""
+        needed = recorded_components(self.scene.contacts, required, found.samples.wrench_in_world)
+        return not (required.torque & ~found.recorded.torque).any() and not (needed & ~found.recorded.wrench).any()
+
+    # ------------------------------------------------------------------------------------------ several processes
+
+    def _fill_together(self, paths: Sequence[Path], required: SensorSet | None) -> None:
+        """Store the samples of logs that the cache lacks, each by one of the processes; a log that fails is left.
+
+        All processes then find the same entries, and read what is not there themselves: what cannot be read fails in
+        all of them, as without a cache.
+        """
+        plan = self._plan(paths, required)
+        self.cache.keep([one.key for one in plan])
+        missing = {one.key: number for number, one in enumerate(plan) if not self.cache.has(one.key)}
+        self._new.update(missing)
+        shares = ranks.as_first(_shares({number: plan[number].size for number in missing.values()}), "logs to read")
+        for number in shares[ranks.rank()]:
+            try:
+                one = plan[number]
+                self._store(one.key, one.path, self._read(one.path, required, one.together, []))
+            except Exception:  # noqa: B902 - all processes meet it, and say it, when they read the log
+                break
+        ranks.gather(None, "logs read")
+
+    def _plan(self, paths: Sequence[Path], required: SensorSet | None) -> list[_Planned]:
+        """What will be read, up to the first log that cannot be; bags that are not in the cache count as nothing."""
+        plan, held, limit = [], self._held, self.scene.config.preprocessing.memory_gb
+        try:
+            for path in paths:
+                together = self._together(path)
+                large = together > limit and existing_log_kind(path) is not LogKind.BAG
+                key = self._key(path, required, together if large else None)
+                if key is None:
+                    break
+                size = sum(state[0] for state in self._contents[path].states)
+                plan.append(_Planned(path, key, together if large else None, size))
+                self._held = self._held if large else together
+        except Exception:  # noqa: B902 - said when the log is read
+            return plan
+        finally:
+            self._held = held
+        return plan
+
+
+def _shares(sizes: Mapping[int, int]) -> list[list[int]]:
+    """Numbers of logs for each process, from their sizes: the largest first, each to whoever has least so far."""
+    shares: list[list[int]] = [[] for _ in range(ranks.world_size())]
+    taken = [0] * len(shares)
+    for number in sorted(sizes, key=lambda number: (-sizes[number], number)):
+        least = taken.index(min(taken))
+        shares[least].append(number)
+        taken[least] += sizes[number]
+    return [sorted(share) for share in shares]
+
+
+@contextmanager
+def _listening(said: list[Said]) -> Iterator[None]:
+    """Gather all warnings instead of giving them."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")  # which of them are shown is decided where they are given
+        try:
+            yield
+        finally:
+            said += [(one.category, str(one.message)) for one in caught]
+
+
+def _say(said: Iterable[Said]) -> None:
+    for category, message in said:
+        if issubclass(category, TorchidWarning):
+            warn(message, category)
+        else:
+            warnings.warn(message, category, stacklevel=2)

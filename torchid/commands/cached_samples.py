@@ -1,0 +1,114 @@
+"""Samples of one log as entries of a cache: what they depend on, how they are stored, and what reading had said."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchid.commands.cache import Entry, tensor_of
+from torchid.commands.manifest import file_checksum
+from torchid.errors import TorchidWarning
+from torchid.fitting.experiment import Scene
+from torchid.problem import Samples
+from torchid.problem.base_motion import BaseMotion
+from torchid.sensing import SensorSet
+
+NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
+"""Keys of preprocessing that do not change what the samples of a log are that is read whole."""
+
+Said = tuple[type[Warning], str]
+"""Class and text of a warning."""
+
+_FORMAT = 1  # of entries
+_BASE = "base."  # before the names of tensors of the base's motion
+
+
+@dataclass(frozen=True)
+class ReadLog:
+    """Samples of a log, the sensors whose every value is in them, how many were left out, and what reading said.
+
+    `excluded`: None where the settings leave nothing out.
+    """
+
+    samples: Samples
+    recorded: SensorSet
+    excluded: int | None
+    said: list[Said]
+
+
+def content_of_scene(scene: Scene) -> dict[str, Any]:
+    """All that the samples of a log depend on beside the log, as a document; the sensors that are fitted do not."""
+    config, robot = scene.config, scene.robot
+    settings = {name: x for name, x in vars(config.preprocessing).items() if name not in NOT_IN_SAMPLES}
+    topics = None if config.logs is None or config.logs.topics is None else asdict(config.logs.topics)
+    return {
+        "format": _FORMAT,
+        "urdf": [config.robot.urdf.name, file_checksum(config.robot.urdf)],
+        "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names)],
+        "contacts": [asdict(contact) for contact in scene.contacts],
+        "preprocessing": settings,
+        "topics": topics,
+    }
+
+
+def samples_entry(read: ReadLog) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """The document and the arrays of an entry; axes are in the order of the strides, which come back with them."""
+    samples, arrays, axes = read.samples, dict[str, NDArray[Any]](), dict[str, list[int]]()
+    own = {name: x for name, x in vars(samples).items() if isinstance(x, Tensor)}
+    base = {_BASE + name: x for name, x in vars(samples.base).items() if isinstance(x, Tensor)}
+    for name, x in (own | base).items():
+        axes[name] = sorted(range(x.ndim), key=lambda axis, x=x: -x.stride(axis))  # type: ignore[misc]
+        arrays[name] = x.numpy().transpose(axes[name])
+    document = {
+        "source": samples.source,
+        "samples": {name: x for name, x in vars(samples).items() if isinstance(x, (bool, int, float))},
+        "axes": axes,
+        "recorded": [read.recorded.torque.tolist(), read.recorded.wrench.tolist()],
+        "excluded": read.excluded,
+        "said": [[category.__name__, message] for category, message in read.said if category in _said_again()],
+    }
+    return document, arrays
+
+
+def samples_of_entry(entry: Entry, source: str, folder: Path | None) -> ReadLog:
+    """What was stored, of a log of this name; any exception where that is something else.
+
+    Args:
+        entry: of the cache.
+        source: name of the log.
+        folder: as `Samples` has it.
+    """
+    document, base = entry.document, dict[str, Tensor]()
+    own: dict[str, Any] = {"torque": None, "wrench": None}
+    for name, axes in document["axes"].items():
+        tensor = tensor_of(entry.arrays[name].transpose(np.argsort(axes)))
+        if name.startswith(_BASE):
+            base[name.removeprefix(_BASE)] = tensor
+        else:
+            own[name] = tensor
+    samples = Samples(source, base=BaseMotion(**base), folder=folder, **own, **document["samples"])
+    torque, wrench = (np.array(mask, dtype=bool) for mask in document["recorded"])
+    recorded = SensorSet(torque, wrench.reshape(-1, 6))
+    categories = {category.__name__: category for category in _said_again()}
+    said = [(categories[name], _about(source, document["source"], text)) for name, text in document["said"]]
+    return ReadLog(samples, recorded, document["excluded"], said)
+
+
+def _about(source: str, before: str, text: str) -> str:
+    """What was said of a log, said of one with the same content."""
+    names = {before: source, Path(before).name: Path(source).name}
+    return re.sub("|".join(map(re.escape, names)), lambda found: names[found[0]], text)
+
+
+def _said_again() -> list[type[Warning]]:
+    """Warnings that are for users: torchid's, and those of libraries about numbers."""
+    out: list[type[Warning]] = [TorchidWarning, RuntimeWarning]
+    for category in out:
+        out += category.__subclasses__() if category is not RuntimeWarning else []
+    return out
