@@ -281,7 +281,10 @@ def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Covera
         clean = values[columns]
         if flags is not None:
             clean[~flags[:, columns[1]]] = 0.0
-        out[columns] = timeline.evaluate(timeline.smooth(clean), (0,))[0]
+        if clean.any():
+            out[columns] = timeline.evaluate(timeline.smooth(clean), (0,))[0]
+        else:  # such as moments of points
+            out[columns] = 0.0
     return out
 
 
