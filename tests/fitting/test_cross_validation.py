@@ -277,6 +277,15 @@ def test_what_no_robot_can_be_ends_the_run_in_one_line_that_says_what_it_points_
     assert not (tmp_path / "run").exists()
 
 
+def test_the_middle_of_a_long_log_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchid.commands.check.MOST_CHECKED", 1000)
+    assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, in_degrees), "sensors.set=joints"]) == 2
+    told = "torchid check finds in train.npz (samples 150 to 1149 of 1300, counted from there): joint_position: "
+    assert told in capsys.readouterr().err
+
+
 def scalars_of_the_feet(log: dict[str, Any]) -> None:
     """Sizes of the feet's forces, entered as if they were all along the frames' z axes."""
     wrench = np.zeros_like(log["contact_wrench_local"])

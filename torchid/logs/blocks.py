@@ -85,8 +85,8 @@ class LogBlocks:
         """Bytes of a sample."""
         return 8 + sum(int(np.prod(x.shape[1:])) * x.dtype.itemsize for x in self.fields.values())
 
-    def read(self, samples: slice, only: tuple[str, ...] | None = None) -> Log:
-        """Some samples as a log, or only the fields `only` of them with positions of 0.
+    def read(self, samples: slice, only: tuple[str, ...] | None = None, allow_gaps: bool = False) -> Log:
+        """Some samples as a log, or only the fields `only` of them with positions of 0; `allow_gaps` as of `read_log`.
 
         Signs of quaternions continue those of the samples before, if these were read last.
 
@@ -96,7 +96,7 @@ class LogBlocks:
         with about_file(self.source):
             raw = self._raw(samples, only)
             try:
-                log = build_log(raw)
+                log = build_log(raw, allow_gaps)
             except LogError as error:
                 raise count_samples_from(samples.start, error) from error
         if log.base_quat_xyzw is not None:
