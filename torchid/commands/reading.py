@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -40,7 +42,7 @@ from torchid.logs.spill import Filled, Spill
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
-from torchid.problem.chunks import in_threads
+from torchid.problem.chunks import one_thread
 from torchid.problem.samples import oversampling, require_forces
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
@@ -207,20 +209,15 @@ class LargeLog:
             kept = None if contacts is None else self._away_from_changes(contacts, time)
             in_the_air = None if contacts is None or not with_unloaded else _in_the_air(contacts)
             stored = _Stored(blocks.source, self.folder, len(time) if kept is None else int(kept.sum()))
+            threads = 0 if self.folder is not None else torch.get_num_threads()  # on a disk because memory is short
             read = (_read_block(blocks, piece, timeline, in_the_air) for piece in self._pieces(blocks, len(time)))
-            with closing(self._each(partial(self._bound, coverage), read)) as bound:
+            with closing(_in_threads(partial(self._bound, coverage), read, threads)) as bound:
                 for piece, samples in bound:
                     if in_the_air is None:
                         samples = replace(samples, unloaded=None)
                     stored.add(samples, None if kept is None else np.flatnonzero(kept[piece]))
             bandwidth = None if timeline is None else timeline.bandwidth_hz
             return stored.samples(samples, oversampling(time, bandwidth))
-
-    def _each(
-        self, bind: Callable[[_Block], tuple[slice, Samples]], blocks: Iterator[_Block]
-    ) -> Generator[tuple[slice, Samples], None, None]:
-        """What becomes of each block; where memory is short, of one at a time."""
-        yield from map(bind, blocks) if self.folder is not None else in_threads(bind, blocks)
 
     def _pieces(self, blocks: LogBlocks, count: int) -> Iterator[slice]:
         """The samples of a log, or of what becomes of them, in parts that fit into memory."""
@@ -292,6 +289,33 @@ def _read_block(blocks: LogBlocks, piece: slice, timeline: Timeline | None, in_t
     if in_the_air is not None:
         log = replace(log, contact_unloaded=unloaded_readings(log, in_the_air[samples]))
     return _Block(piece, log, part)
+
+
+def _in_threads(
+    bind: Callable[[_Block], tuple[slice, Samples]], blocks: Iterator[_Block], threads: int
+) -> Generator[tuple[slice, Samples], None, None]:
+    """What becomes of each block, in their order; they are read here, a few ahead of those that are worked on.
+
+    Args:
+        bind: called with each block, in the context of the caller.
+        blocks: of a log.
+        threads: that `bind` runs in, 0 for this one alone.
+    """
+    if not threads:
+        yield from map(bind, blocks)
+        return
+    with one_thread(), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        ahead: deque[Future[tuple[slice, Samples]]] = deque()
+        try:
+            for block in blocks:
+                ahead.append(pool.submit(copy_context().run, bind, block))
+                if len(ahead) > threads:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            for future in ahead:
+                future.cancel()
 
 
 class _Stored:

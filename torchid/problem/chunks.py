@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import copy_context
 from functools import cache
 from itertools import chain
 from typing import TypeVar
@@ -151,26 +149,6 @@ def run_in_workers(tasks: Sequence[Task], run: Callable[[Iterator[Task]], Result
             return [work(0)]
         with ThreadPoolExecutor(workers) as pool, stopping():
             return list(pool.map(work, range(workers)))
-
-
-def in_threads(work: Callable[[Task], Result], tasks: Iterable[Task]) -> Generator[Result, None, None]:
-    """Results of `work` in the order of the tasks, which are drawn one by one, a few ahead of those that are worked on.
-
-    As many threads work as torch would use, each with one of its own, and with the context of the caller.
-    """
-    workers = torch.get_num_threads()
-    with one_thread(), ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        ahead: deque[Future[Result]] = deque()
-        try:
-            for task in tasks:
-                ahead.append(pool.submit(copy_context().run, work, task))
-                if len(ahead) > workers:
-                    yield ahead.popleft().result()
-            while ahead:
-                yield ahead.popleft().result()
-        finally:
-            for future in ahead:
-                future.cancel()
 
 
 def worker_count(device: torch.device) -> int:
