@@ -147,6 +147,8 @@ def _identify(options: argparse.Namespace) -> None:
     if run.worse:
         _print_headline(run.worse)
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
+    if 0 < run.evaluated["train"] < run.samples:
+        print(f"train         errors of forces of {run.evaluated['train']} of {run.samples} samples, evenly spaced")
     print_tables(
         contribution_table(run.contributions),
         verdict_table(robot.body_names, estimate.verdict),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from large import (
     SAMPLES,
     SMALL,
@@ -46,6 +47,56 @@ def test_blocks_give_the_samples_of_the_whole_log(
     assert is_on_disk(large)
     assert not is_on_disk(whole)
     assert_same(large, whole, tolerance)
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Logs in memory are read in blocks however short they are."""
+    monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
+    monkeypatch.setattr("torchid.commands.reading._BLOCK_GB", 1e-4)
+
+
+@pytest.mark.parametrize(("settings", "tolerance"), SETTINGS.values(), ids=SETTINGS.keys())
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_long_log_in_memory_is_worked_on_in_blocks_by_threads(
+    tmp_path: Path, settings: dict[str, float], tolerance: float, threads: int, request: pytest.FixtureRequest
+) -> None:
+    file = experiment(tmp_path, recorded(jitter=0.3))
+    whole, before = samples_of(file, *overrides(settings)), torch.get_num_threads()
+    request.getfixturevalue("small_blocks")
+    torch.set_num_threads(threads)
+    try:
+        blocks = samples_of(file, *overrides(settings))
+    finally:
+        torch.set_num_threads(before)
+    assert not is_on_disk(blocks)
+    assert_same(blocks, whole, tolerance)
+    assert sorted(os.listdir(tmp_path)) == ["log.npz", "run.yaml"]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
+@pytest.mark.parametrize("terms", ["{}", "{contact_force: log}"])
+def test_readings_in_the_air_are_kept_where_offsets_are_fitted(
+    tmp_path: Path, suffix: str, terms: str, request: pytest.FixtureRequest
+) -> None:
+    file = experiment(tmp_path, recorded(9_000), suffix)
+    settings = (*overrides({"cutoff_hz": 20}), "sensors.set=full", f"sensors.offsets={terms}")
+    whole = samples_of(file, *settings, required=False)
+    request.getfixturevalue("small_blocks")
+    for more in ((), (SMALL,)):
+        blocks = samples_of(file, *settings, *more, required=False)
+        assert is_on_disk(blocks) == bool(more)
+        assert_same(blocks, whole, 1e-10)
+        assert (blocks.unloaded is None) == (terms == "{}")
+
+
+def test_a_damaged_byte_of_a_long_log_is_found(tmp_path: Path, small_blocks: None) -> None:
+    file = experiment(tmp_path, recorded())
+    data = bytearray((tmp_path / "log.npz").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "log.npz").write_bytes(data)
+    with pytest.raises(LogError, match="Bad CRC-32"):
+        samples_of(file, *overrides({}))
 
 
 def test_the_neighbourhood_of_a_block_is_as_long_as_the_filter_remembers() -> None:
@@ -153,7 +204,7 @@ BAD = {
 
 @pytest.mark.parametrize("change", BAD.values(), ids=BAD.keys())
 def test_a_bad_large_log_is_refused_in_the_words_for_a_small_one(
-    tmp_path: Path, change: Callable[[Fields], None]
+    tmp_path: Path, change: Callable[[Fields], None], request: pytest.FixtureRequest
 ) -> None:
     file, fields = experiment(tmp_path, recorded(100)), recorded()
     change(fields)
@@ -165,6 +216,10 @@ def test_a_bad_large_log_is_refused_in_the_words_for_a_small_one(
         said.append(str(caught.value))
         assert sorted(os.listdir(tmp_path)) == ["log.npz", "run.yaml"]
     assert said[1].replace("near it", "in all") == said[0]
+    request.getfixturevalue("small_blocks")
+    with pytest.raises(InputError) as caught:
+        samples_of(file, *overrides({}))
+    assert str(caught.value).replace("near it", "in all") == said[0]
 
 
 def test_the_size_of_a_log_is_known_before_it_is_read(tmp_path: Path) -> None:

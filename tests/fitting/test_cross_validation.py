@@ -22,7 +22,7 @@ from torchid.commands.plausibility import force_gain, implausibility, is_implaus
 from torchid.config import load_config
 from torchid.errors import BaseLostError
 from torchid.estimators import LeastSquares
-from torchid.fitting.cross_validation import with_all_readings
+from torchid.fitting.cross_validation import Scorer, TrainingScore, with_all_readings
 from torchid.fitting.experiment import set_up
 from torchid.identifiability.base_parameters import StateReport, _base_statistics, require_base
 from torchid.identifiability.confounding import TotalMass
@@ -125,6 +125,65 @@ def test_cross_validation_is_what_refitting_by_hand_gives(run: Path, demo: tuple
     assert (metrics["verdict"], metrics["worse_than_nominal"]) == (None, [])
 
 
+def test_of_long_training_logs_every_kth_sample_is_scored(run: Path, demo: tuple[RowBuilder, Samples]) -> None:
+    _, log = demo
+    experiment = set_up(load_config(run / "config.yaml"))
+    builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
+    fitter, blocks = experiment.fitter(builder, experiment.conditions()), split_into_folds([log], builder)
+    fit = fitter.fit(compress_parts(blocks, builder))
+    compared, *without = (experiment.calibrations(one, builder) for one in (fit, *fitter.fit_without_folds(fit.parts)))
+    parts = merge_states(fit.parts, builder)
+
+    def score(most: int) -> TrainingScore:
+        done: list[int] = []
+        scorer = Scorer(evaluation, builder, most)
+        found = scorer.score_training(blocks, parts, compared, without, done.append)
+        assert sum(done) == found.samples == scorer.scored(blocks)[1] <= most
+        return found
+
+    whole, thinned = score(len(log)), score(len(log) // 3)
+    assert (whole.samples, thinned.samples) == (len(log), sum(len(block[::4]) for block in blocks))
+    assert Scorer(evaluation, builder).scored(blocks) == (1, len(log)), "short logs are scored whole"
+    assert whole.metrics.identified.as_dict() == json.loads((run / "metrics.json").read_text())["train"]
+    assert whole.cross_validation is not None
+    assert thinned.cross_validation is not None
+    for pair in (
+        *zip(whole.metrics, thinned.metrics, strict=True),
+        (whole.cross_validation.identified, thinned.cross_validation.identified),
+        (whole.cross_validation.nominal, thinned.cross_validation.nominal),
+    ):
+        every, some = (metrics.rms for metrics in pair)
+        assert some[WHITENED] == every[WHITENED], "of all samples"
+        for group in ROW_GROUPS:
+            assert some[group] != every[group]
+            assert some[group] == pytest.approx(every[group], rel=0.02), group
+
+
+@pytest.mark.parametrize(
+    ("lengths", "most", "step"), [((10, 10), 20, 1), ((10, 10), 19, 2), ((7, 7), 7, 3), ((5, 1, 1), 2, 5), ((), 3, 1)]
+)
+def test_the_step_between_scored_samples_is_the_least_that_keeps_to_the_limit(
+    run: Path, demo: tuple[RowBuilder, Samples], lengths: tuple[int, ...], most: int, step: int
+) -> None:
+    builder, log = demo
+    scorer = Scorer(set_up(load_config(run / "config.yaml")).evaluation(), builder, most)
+    logs = [log[:length] for length in lengths]
+    assert scorer.scored(logs) == (step, sum(len(one[::step]) for one in logs))
+
+
+def test_the_number_of_scored_samples_is_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Scorer.__init__, "__defaults__", (500,))
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={tmp_path / 'run'}"]) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    evaluated = metrics["evaluated_samples"]
+    assert 400 < evaluated["train"] <= 500 < metrics["samples"]
+    assert evaluated["test"] > 500, "unseen logs are evaluated whole"
+    stated = f"errors of forces of {evaluated['train']} of {metrics['samples']} samples"
+    assert stated in capsys.readouterr().out
+
+
 def test_the_chosen_ridge_is_the_largest_within_a_standard_error_of_the_best(run: Path) -> None:
     found = json.loads((run / "metrics.json").read_text())["ridge_selection"]
     best = min(found["mean_square"])
@@ -216,6 +275,15 @@ def test_what_no_robot_can_be_ends_the_run_in_one_line_that_says_what_it_points_
     for text in told:
         assert text in printed.err
     assert not (tmp_path / "run").exists()
+
+
+def test_the_middle_of_a_long_log_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchid.commands.check.MOST_CHECKED", 1000)
+    assert main(["identify", str(DEMO / "quadruped.yaml"), *changed(tmp_path, in_degrees), "sensors.set=joints"]) == 2
+    told = "torchid check finds in train.npz (samples 150 to 1149 of 1300, counted from there): joint_position: "
+    assert told in capsys.readouterr().err
 
 
 def scalars_of_the_feet(log: dict[str, Any]) -> None:

@@ -236,6 +236,29 @@ def test_gross_outliers_in_a_twentieth_of_the_torques_leave_the_parameters_where
 
 
 @pytest.mark.parametrize("kind", LOSSES)
+def test_passes_over_some_samples_save_passes_over_all_and_change_nothing(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = industrial_arm(4000)
+    log = bench.noisy(np.random.default_rng(2), 0.1)
+    _, expected, slow = bench.fits(kind, log[:2000], replace(log[2000:], source="other"))
+    monkeypatch.setattr("torchid.fitting.robust._ROUGH_SAMPLES", 1000)
+    _, fit, fast = bench.fits(kind, log[:2000], replace(log[2000:], source="other"))
+    assert fast.passes < slow.passes
+    assert fast.converged
+    known = expected.estimate.verdict == "identified"
+    moved = (fit.estimate.phi - expected.estimate.phi)[known] / expected.estimate.standard_error[known]
+    assert 0.0 < np.abs(moved).max() < 0.1
+    assert fast.scale == pytest.approx(slow.scale, rel=0.02)
+
+    assert fit.estimate.rows == expected.estimate.rows, "the last passes see all samples"
+    uneven = log[:3300], replace(log[3300:], source="other")
+    _, kept, _ = bench.fits(kind, *uneven)
+    monkeypatch.undo()
+    np.testing.assert_array_equal(kept.estimate.phi, bench.fits(kind, *uneven)[1].estimate.phi, "each log keeps 200")
+
+
+@pytest.mark.parametrize("kind", LOSSES)
 def test_rows_that_mix_joints_are_robust_as_long_as_few_samples_are_hit(kind: str) -> None:
     bench, rng = quadruped(), np.random.default_rng(3)
     log = bench.clean

@@ -17,7 +17,8 @@ from torchid.fitting.experiment import set_up_scene
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
 from torchid.logs import Log, Topics, read_log, write_log
-from torchid.logs.containers import atomic_output, new_log_kind
+from torchid.logs.blocks import open_log_blocks
+from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, new_log_kind
 from torchid.report.figures import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
@@ -27,6 +28,8 @@ from torchid.sensing import Contact
 EXPERIMENTS = (".yaml", ".yml")
 FIGURES = (".png", ".pdf", ".svg")
 _WRENCH = (slice(0, 3), slice(3, 6))
+MOST_CHECKED = 100_000
+"""Samples of a log that are checked for the reason of a bad fit: what spoils all of a log shows in its middle."""
 
 
 def check_files(
@@ -112,11 +115,43 @@ def read_log_to_check(path: Path, topics: Topics | None, settings: Preprocessing
     Raises:
         LogError: it cannot be read, or is larger than what may be in memory at once.
     """
+    _require_memory(path, settings)
+    return read_log(path, topics, allow_gaps=True)
+
+
+def read_middle_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> tuple[Log, str]:
+    """The log, or the middle `MOST_CHECKED` samples of a longer one, and its name, with their numbers if they are some.
+
+    Raises:
+        LogError: as `read_log_to_check`.
+    """
+    _require_memory(path, settings)
+    if existing_log_kind(path) is LogKind.BAG:
+        log = read_log(path, topics, allow_gaps=True)
+        middle = _middle(len(log))
+        return log.select(middle), _stretch_name(path, middle, len(log))
+    with open_log_blocks(path, None) as blocks:
+        middle = _middle(len(blocks))
+        return blocks.read(middle, allow_gaps=True), _stretch_name(path, middle, len(blocks))
+
+
+def _middle(samples: int) -> slice:
+    first = max(0, (samples - MOST_CHECKED) // 2)
+    return slice(first, min(first + MOST_CHECKED, samples))
+
+
+def _stretch_name(path: Path, stretch: slice, samples: int) -> str:
+    if stretch.stop - stretch.start == samples:
+        return path.name
+    return f"{path.name} (samples {stretch.start} to {stretch.stop - 1} of {samples}, counted from there)"
+
+
+def _require_memory(path: Path, settings: PreprocessingConfig) -> None:
+    """Refuse a log that is larger than what may be in memory at once."""
     size = memory_needed(path, settings.memory_gb)
     if size > settings.memory_gb:
         accepted = f"parts of the log, or an experiment file with a preprocessing.memory_gb above {size:.2g}"
         raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
-    return read_log(path, topics, allow_gaps=True)
 
 
 def _contact(log: Log, index: int) -> Contact:

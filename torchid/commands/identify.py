@@ -185,7 +185,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             fits = (fit, *fitter.fit_without_folds(fit.parts))
             compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
             scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
-            metrics, validation = _metrics(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
+            scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
         broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
         run = Identification(
             experiment=experiment,
@@ -196,14 +196,15 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             states=ready.states,
             by_state=alone,
             contributions=added,
-            metrics=metrics,
+            metrics=scores.metrics,
+            evaluated=scores.samples,
             violations=broken,
             seconds=clock.seconds,
             samples=sum(map(len, blocks)),
             factors=ready.factors,
             excluded=ready.excluded,
             mass=mass,
-            validation=validation,
+            validation=scores.validation,
             ridge=ready.ridge,
             reused=ready.reused,
         )
@@ -336,7 +337,16 @@ def _contributions(
     return out
 
 
-def _metrics(
+@dataclass
+class _Scores:
+    """Metrics and number of evaluated samples by set of logs, and of fits without a fold each on that fold."""
+
+    metrics: dict[str, Comparison[Metrics]]
+    samples: dict[str, int]
+    validation: CrossValidation | None
+
+
+def _scores(
     scorer: Scorer,
     test: Sequence[Samples],
     blocks: Sequence[Block],
@@ -344,18 +354,20 @@ def _metrics(
     compared: Comparison[Calibration],
     without_folds: Sequence[Comparison[Calibration]],
     bars: Progress,
-) -> tuple[dict[str, Comparison[Metrics]], CrossValidation | None]:
-    """Metrics by set of logs, and of fits without a fold each on that fold; `parts`: of the training logs' blocks."""
-    bar = bars.add_task("evaluating", total=sum(map(len, [*blocks, *test])))
+) -> _Scores:
+    """Metrics of the training logs, whose blocks the `parts` are of, and of the test logs."""
+    unseen = sum(map(len, test))
+    bar = bars.add_task("evaluating", total=scorer.scored(blocks)[1] + unseen)
 
     def done(samples: int) -> None:
         bars.advance(bar, samples)
 
     train = scorer.score_training(blocks, parts, compared, without_folds, done)
-    metrics = {"train": train.metrics}
+    scores = _Scores({"train": train.metrics}, {"train": train.samples}, train.cross_validation)
     if test:
-        metrics["test"] = scorer.score_logs(test, compared, done)
-    return metrics, train.cross_validation
+        scores.metrics["test"] = scorer.score_logs(test, compared, done)
+        scores.samples["test"] = unseen
+    return scores
 
 
 def _identified_metrics(

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from torchid import parameters
-from torchid.commands.check import read_log_to_check
+from torchid.commands.check import read_middle_to_check
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn_about_file
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
@@ -183,19 +183,19 @@ def _unexplained(fit: Fit) -> str | None:
 
 
 def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
-    """Findings on a large part of a training log, the most severe first; none without its samples."""
+    """Findings on a large part of a training log, or of its middle, the most severe first; none without its samples."""
     files = scene.config.logs
     if files is None or files.compressed:
         return
     findings = []
     for path in files.train:
         try:
-            log = read_log_to_check(path, files.topics, scene.config.preprocessing)
+            log, name = read_middle_to_check(path, files.topics, scene.config.preprocessing)
             checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
         except InputError:  # larger than memory: it is not checked
             continue
         severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
-        findings += [(path.name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
+        findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
     yield from sorted(findings, key=lambda pair: _order(pair[1]))
 
 

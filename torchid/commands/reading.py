@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -35,15 +38,18 @@ from torchid.logs.preprocess import (
     unloaded_readings,
     warn_of_gaps,
 )
-from torchid.logs.spill import Spill
+from torchid.logs.spill import Filled, Spill
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
+from torchid.problem.chunks import one_thread
 from torchid.problem.samples import oversampling, require_forces
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
 _COPIES = 16  # a block takes so many times the memory of its recorded arrays: derivatives, splines, bound tensors
+_BLOCK_GB = 0.02  # recorded arrays of a block; smaller ones spend more on the neighbourhood that a filter needs
+_WHOLE_GB = 2.0 * _BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
 
 
 class LogReader:
@@ -101,12 +107,16 @@ class LogReader:
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""
         settings, files = self.scene.config.preprocessing, self.scene.config.logs
+        if not settings.exclude_condemned and log_bytes(path, GIGABYTE * _WHOLE_GB) > GIGABYTE * _WHOLE_GB:
+            return self._in_blocks(path, required, None)
         topics = None if files is None else files.topics
         recorded = read_log(path, topics, allow_gaps=settings.exclude_condemned)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
         samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
+        if not self._with_unloaded:
+            samples = replace(samples, unloaded=None)
         if checked is not None:
             count = len(samples)
             samples = drop_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
@@ -123,7 +133,18 @@ class LogReader:
             found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
             accepted = f"a preprocessing.memory_gb above {together:.2g}, or parts of the logs that torchid check passes"
             raise LogError(path, "preprocessing.exclude_condemned", found, accepted)
-        return LargeLog(path, settings, self.scene.robot, self.scene.contacts, required, self.folder).samples()
+        return self._in_blocks(path, required, self.folder)
+
+    def _in_blocks(self, path: Path, required: SensorSet | None, folder: Path | None) -> Samples:
+        """A log that is read block by block."""
+        scene = self.scene
+        log = LargeLog(path, scene.config.preprocessing, scene.robot, scene.contacts, required, folder)
+        return log.samples(self._with_unloaded)
+
+    @property
+    def _with_unloaded(self) -> bool:
+        """Whether offsets of contact sensors are fitted, the only use of their readings in the air."""
+        return any(channel.startswith("contact") for channel in self.scene.terms.offsets)
 
     def _checked(self, log: Log) -> Checked | None:
         """What the checks of a log say, if condemned samples are to be left out."""
@@ -151,7 +172,9 @@ def _folder_beside(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class LargeLog:
-    """A log whose samples go to a disk on their way to a robot.
+    """A log that is read, preprocessed and bound block by block, so that no more than its samples is in memory.
+
+    Blocks are read one after the other; if the samples are held in memory, threads work on them.
 
     Attributes:
         path: its file.
@@ -159,7 +182,7 @@ class LargeLog:
         robot: whose log it is.
         contacts: in use.
         required: sensors whose every value must be there, None if gaps are allowed.
-        folder: where there is room.
+        folder: where there is room for the samples; None: in memory.
     """
 
     path: Path
@@ -167,10 +190,13 @@ class LargeLog:
     robot: Robot
     contacts: Sequence[Contact]
     required: SensorSet | None
-    folder: Path
+    folder: Path | None
 
-    def samples(self) -> Samples:
-        """What reading, preprocessing and binding the log as a whole would give, on the disk.
+    def samples(self, with_unloaded: bool = True) -> Samples:
+        """What reading, preprocessing and binding the log as a whole would give.
+
+        Args:
+            with_unloaded: with the readings of contact sensors in the air, which only say what their offsets are.
 
         Raises:
             InputError: as `read_log`, `preprocess` and `bind_log` would, or the disk is full.
@@ -186,22 +212,24 @@ class LargeLog:
             time = blocks.time if timeline is None else blocks.time[0] + timeline.output_stamps
             contacts = self._contacts(blocks, first)
             kept = None if contacts is None else self._away_from_changes(contacts, time)
-            in_the_air = None if contacts is None else _in_the_air(contacts)
-            stored = _Stored(blocks.source, self.folder)
-            for piece in self._pieces(blocks, len(time)):
-                samples = self._bound(_preprocessed(blocks, piece, timeline, coverage, in_the_air), piece)
-                if in_the_air is None:
-                    samples = replace(samples, unloaded=None)
-                stored.add(samples, None if kept is None else np.flatnonzero(kept[piece]))
+            in_the_air = None if contacts is None or not with_unloaded else _in_the_air(contacts)
+            stored = _Stored(blocks.source, self.folder, len(time) if kept is None else int(kept.sum()))
+            threads = 0 if self.folder is not None else torch.get_num_threads()  # on a disk because memory is short
+            read = (_read_block(blocks, piece, timeline, in_the_air) for piece in self._pieces(blocks, len(time)))
+            with closing(_in_threads(partial(self._bound, coverage), read, threads)) as bound:
+                for piece, samples in bound:
+                    if in_the_air is None:
+                        samples = replace(samples, unloaded=None)
+                    stored.add(samples, None if kept is None else np.flatnonzero(kept[piece]))
             bandwidth = None if timeline is None else timeline.bandwidth_hz
             return stored.samples(samples, oversampling(time, bandwidth))
 
     def _pieces(self, blocks: LogBlocks, count: int) -> Iterator[slice]:
         """The samples of a log, or of what becomes of them, in parts that fit into memory."""
-        rows = self.settings.memory_gb * GIGABYTE / (_COPIES * blocks.row_bytes) * count / len(blocks)
+        most = _BLOCK_GB if self.folder is None else self.settings.memory_gb / _COPIES
+        rows = most * GIGABYTE / blocks.row_bytes * count / len(blocks)
         step = max(SPLINE_BLOCK, int(rows))
-        for start in range(0, count, step):
-            yield slice(start, min(start + step, count))
+        return (slice(start, min(start + step, count)) for start in range(0, count, step))
 
     def _coverage(self, blocks: LogBlocks, first: Log, timeline: Timeline) -> dict[str, Coverage]:
         """Which channels were measured throughout, which takes a pass over the log."""
@@ -230,15 +258,16 @@ class LargeLog:
         margin = self.settings.contact_margin_s
         return None if margin is None else away_from_changes(contacts, time, margin)
 
-    def _bound(self, log: Log, piece: slice) -> Samples:
-        """The samples of a part; errors count from the beginning."""
+    def _bound(self, coverage: Mapping[str, Coverage], block: _Block) -> tuple[slice, Samples]:
+        """The numbers of a block's samples, and these; errors count from the beginning."""
+        log = block.log if block.timeline is None else move_to_timeline(block.log, block.timeline, coverage)
         samples = bind_log(log, self.robot, self.contacts)
         if self.required is not None:
             try:
                 require_forces(samples, self.robot, self.contacts, self.required)
             except LogError as error:
-                raise count_samples_from(piece.start, error) from error
-        return samples
+                raise count_samples_from(block.piece.start, error) from error
+        return block.piece, samples
 
 
 def _in_the_air(contacts: Log) -> BoolArray | None:
@@ -249,27 +278,60 @@ def _in_the_air(contacts: Log) -> BoolArray | None:
     return unloaded if unloaded.any() else None
 
 
-def _preprocessed(
-    blocks: LogBlocks,
-    piece: slice,
-    timeline: Timeline | None,
-    coverage: Mapping[str, Coverage],
-    in_the_air: BoolArray | None,
-) -> Log:
-    """A part of the preprocessed log."""
+@dataclass(frozen=True)
+class _Block:
+    """A part of the samples of a preprocessed log: their numbers, and what they are made of, as it was recorded."""
+
+    piece: slice
+    log: Log
+    timeline: Timeline | None
+
+
+def _read_block(blocks: LogBlocks, piece: slice, timeline: Timeline | None, in_the_air: BoolArray | None) -> _Block:
+    """What a part of the preprocessed log depends on."""
     samples, part = (piece, None) if timeline is None else timeline.part(piece.start, piece.stop)
     log = blocks.read(samples)
     if in_the_air is not None:
         log = replace(log, contact_unloaded=unloaded_readings(log, in_the_air[samples]))
-    return log if part is None else move_to_timeline(log, part, coverage)
+    return _Block(piece, log, part)
+
+
+def _in_threads(
+    bind: Callable[[_Block], tuple[slice, Samples]], blocks: Iterator[_Block], threads: int
+) -> Generator[tuple[slice, Samples], None, None]:
+    """What becomes of each block, in their order; they are read here, a few ahead of those that are worked on.
+
+    Args:
+        bind: called with each block, in the context of the caller.
+        blocks: of a log.
+        threads: that `bind` runs in, 0 for this one alone.
+    """
+    if not threads:
+        yield from map(bind, blocks)
+        return
+    with one_thread(), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        ahead: deque[Future[tuple[slice, Samples]]] = deque()
+        try:
+            for block in blocks:
+                ahead.append(pool.submit(copy_context().run, bind, block))
+                if len(ahead) > threads:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            for future in ahead:
+                future.cancel()
 
 
 class _Stored:
     """Tensors of the samples of one log, by name and whether they are the base's, that grow part by part."""
 
-    def __init__(self, source: str, folder: Path) -> None:
+    def __init__(self, source: str, folder: Path | None, samples: int) -> None:
         self._folder = folder
-        self._spills: defaultdict[tuple[str, bool], Spill] = defaultdict(partial(Spill, source, folder))
+        grow: Callable[[], Spill | Filled] = (
+            partial(Filled, samples) if folder is None else partial(Spill, source, folder)
+        )
+        self._spills: defaultdict[tuple[str, bool], Spill | Filled] = defaultdict(grow)
 
     def add(self, samples: Samples, kept: np.ndarray | None) -> None:
         """Add samples, or those of some numbers."""

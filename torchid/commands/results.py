@@ -64,6 +64,7 @@ class Identification:
         by_state: what each of them determines on its own.
         contributions: what each training log, contact state and sensor adds.
         metrics: errors by set of logs, "train" and "test".
+        evaluated: number of samples whose forces were predicted, by set of logs.
         violations: conditions that the identified parameters break.
         seconds: by step of the run.
         samples: number of training samples.
@@ -84,6 +85,7 @@ class Identification:
     by_state: dict[str, Estimate]
     contributions: Contributions
     metrics: dict[str, Comparison[Metrics]]
+    evaluated: Mapping[str, int]
     violations: list[Violation]
     seconds: dict[str, float]
     samples: int
@@ -190,6 +192,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "parameters": int(estimate.phi.size),
         "condition_number": estimate.condition_number if estimate.rank else None,
         "samples": run.samples,
+        "evaluated_samples": dict(run.evaluated),
         "excluded_samples": run.excluded,
         **({"factors": [_factor_entry(one) for one in run.factors]} if run.factors else {}),
         "rows": estimate.rows,

@@ -68,16 +68,20 @@ class Calibration:
         """Whether readings have offsets or scales."""
         return any(extra.what in ("offset", "scale") for extra in self.builder.extras)
 
-    def calibrate(self, logs: Sequence[Samples]) -> list[Samples]:
-        """The logs with calibrated readings; extra parameters of a new log are fitted to it first.
+    def calibrate(self, logs: Sequence[Samples], step: int = 1) -> list[Samples]:
+        """The logs with calibrated readings; extra parameters of a new log are fitted to it first, to all its samples.
+
+        Args:
+            logs: as recorded.
+            step: every `step`-th sample of each comes back.
 
         Warns:
             TorchidWarning: a new log lacks sensors, so that its readings are taken as they are.
         """
         if not self.changes_readings:
-            return list(logs)
+            return [log.every(step) for log in logs]
         extras, tree = self.builder.extras, self._on_cpu.tree
-        return [calibrate_readings(log, extras, self._values_for(log), tree) for log in logs]
+        return [calibrate_readings(log.every(step), extras, self._values_for(log), tree) for log in logs]
 
     def parameters(self, evaluation: Evaluation) -> Array:
         """Parameters as `Evaluation.metrics` takes them, (12 L + E,)."""

@@ -29,7 +29,7 @@ from torchid.logs.log import (
 )
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
-from torchid.logs.tables import table_blocks, table_size
+from torchid.logs.tables import read_table, table_blocks, table_size
 
 GIGABYTE = 1e9
 _ACCEPTED = "a plain array of numbers, truth values or text"
@@ -85,8 +85,8 @@ class LogBlocks:
         """Bytes of a sample."""
         return 8 + sum(int(np.prod(x.shape[1:])) * x.dtype.itemsize for x in self.fields.values())
 
-    def read(self, samples: slice, only: tuple[str, ...] | None = None) -> Log:
-        """Some samples as a log, or only the fields `only` of them with positions of 0.
+    def read(self, samples: slice, only: tuple[str, ...] | None = None, allow_gaps: bool = False) -> Log:
+        """Some samples as a log, or only the fields `only` of them with positions of 0; `allow_gaps` as of `read_log`.
 
         Signs of quaternions continue those of the samples before, if these were read last.
 
@@ -96,7 +96,7 @@ class LogBlocks:
         with about_file(self.source):
             raw = self._raw(samples, only)
             try:
-                log = build_log(raw)
+                log = build_log(raw, allow_gaps)
             except LogError as error:
                 raise count_samples_from(samples.start, error) from error
         if log.base_quat_xyzw is not None:
@@ -124,10 +124,11 @@ class LogBlocks:
 
 
 @contextmanager
-def open_log_blocks(path: Path, folder: Path) -> Iterator[LogBlocks]:
+def open_log_blocks(path: Path, folder: Path | None) -> Iterator[LogBlocks]:
     """Open a log (.h5, .npz, .csv or .parquet).
 
-    An .h5 file is read in place; others are unpacked to temporary files in `folder`.
+    Arrays of .h5 and .npz files are read in place unless these are compressed; others are unpacked to temporary files
+    in `folder`, or to memory without one.
 
     Raises:
         LogError: the file is invalid.
@@ -143,7 +144,7 @@ def open_log_blocks(path: Path, folder: Path) -> Iterator[LogBlocks]:
         yield blocks
 
 
-def _open_arrays(container: Container, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
+def _open_arrays(container: Container, folder: Path | None) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a container."""
     given = list(container.declared_bytes())
     check_fields_given(given)
@@ -158,9 +159,13 @@ def _open_arrays(container: Container, folder: Path) -> tuple[dict[str, NDArray[
     return names, fields
 
 
-def _open_table(path: Path, folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
+def _open_table(path: Path, folder: Path | None) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a table, which is read once."""
     names: dict[str, NDArray[Any]] = {}
+    if folder is None:
+        raw = read_table(path)
+        check_fields_given(raw)
+        return {n: x for n, x in raw.items() if _is_text(n)}, {n: x for n, x in raw.items() if not _is_text(n)}
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
     for number, block in enumerate(table_blocks(path)):
         if not number:

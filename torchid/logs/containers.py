@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import struct
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -97,8 +98,11 @@ class Container(Protocol):
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`; text is an array of str or of UTF-8 bytes."""
 
-    def lazy(self, name: str, folder: Path) -> LazyArray:
-        """The array `name`, read where it is sliced; compressed arrays are unpacked to a file in `folder`."""
+    def lazy(self, name: str, folder: Path | None) -> LazyArray:
+        """The array `name`, read where it is sliced, while the file is open.
+
+        Compressed arrays are unpacked to a file in `folder`, or to memory without one.
+        """
 
 
 @contextlib.contextmanager
@@ -181,6 +185,8 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 _PIECE_BYTES, _DIRECTORY_BYTES = 2**22, 2**20
 #: First bytes of a directory entry.
 _ENTRY = b"PK\x01\x02"
+#: Of an entry, before its name; its last two numbers are the lengths of the name and of the extra fields.
+_LOCAL_HEADER = struct.Struct("<26xHH")
 
 
 def _open_archive(path: Path) -> zipfile.ZipFile:
@@ -220,17 +226,31 @@ class _Npz:
             array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
         return array
 
-    def lazy(self, name: str, folder: Path) -> LazyArray:
-        """The array `name`, unpacked to a file in `folder`."""
+    def lazy(self, name: str, folder: Path | None) -> LazyArray:
+        """The array `name`, where it lies in the archive if it is not compressed, else unpacked."""
         entry = self._entry(name)
         with self._archive.open(entry) as stream:
             shape, fortran_order, dtype = _read_header(stream)
             if dtype.hasobject or not shape:
                 return self.load(name)
+            if entry.compress_type == zipfile.ZIP_STORED and not fortran_order:
+                header = stream.tell()
+                while stream.read(_PIECE_BYTES):  # compares the checksum at its end
+                    pass
+                return _StoredArray(self._archive.fp, self._start(entry) + header, shape, dtype)
+            if folder is None:
+                return self.load(name)
             unpacked = Spill(self._archive.filename, folder)
             while data := stream.read(_PIECE_BYTES):
                 unpacked.write(data)
         return unpacked.mapped(shape, dtype, fortran_order)
+
+    def _start(self, entry: zipfile.ZipInfo) -> int:
+        """Where in the archive the bytes of an entry begin: after a header with its name and extra fields."""
+        file: Any = self._archive.fp
+        file.seek(entry.header_offset)
+        *_, name, extra = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
+        return int(entry.header_offset) + _LOCAL_HEADER.size + int(name) + int(extra)
 
     def _entry(self, name: str) -> zipfile.ZipInfo:
         """The entry of the array `name`; ValueError if it does not match its header."""
@@ -240,6 +260,23 @@ class _Npz:
         with self._archive.open(entry) as stream:
             _check_header(stream, entry.file_size)
         return entry
+
+
+class _StoredArray:
+    """An array whose elements lie in an open file one after the other; one thread at a time may read it."""
+
+    def __init__(self, file: Any, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        self._file, self._start, self.shape, self.dtype = file, start, shape, dtype
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        """Some successive rows; EOFError if the file ends before."""
+        start, stop, _ = rows.indices(self.shape[0])
+        out: NDArray[Any] = np.empty((max(stop - start, 0), *self.shape[1:]), self.dtype)
+        if out.size:
+            self._file.seek(self._start + start * out[:1].nbytes)
+            if self._file.readinto(out.reshape(-1).view(np.uint8).data) != out.nbytes:
+                raise EOFError("the file has become shorter")
+        return out
 
 
 @contextlib.contextmanager

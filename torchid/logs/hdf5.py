@@ -50,9 +50,11 @@ class Hdf5:
             return np.broadcast_to(np.array(None, dtype=object), item.shape)
         return np.asarray(item[()])
 
-    def lazy(self, name: str, folder: Path) -> LazyArray:
-        """The array `name`, read where it is sliced."""
+    def lazy(self, name: str, folder: Path | None) -> LazyArray:
+        """The array `name`, read where it is sliced; without a folder, arrays in chunks are read whole."""
         item = self._stored_dataset(name)
+        if folder is None and item.chunks:
+            return np.asarray(self.load(name))
         chunk = _chunk_bytes(item, self._file_size)
         if chunk > MAX_SMALL:
             raise ValueError(f"chunks of {chunk} bytes, more than the {MAX_SMALL} that are read at a time")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -114,10 +115,7 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
     fields: dict[str, Any] = {
         "time": log.time[timeline.kept] if timeline.keeps_stamps else timeline.origin + timeline.output_stamps,
     }
-    for chain in DERIVATIVE_CHAINS:
-        fields |= _chain(log, chain, timeline)
-    if log.base_quat_xyzw is not None:
-        fields |= _orientation(log, make_sign_continuous(log.base_quat_xyzw), timeline)
+    fields |= _motion(log, timeline)
     for name in NAN_ALLOWED:
         if getattr(log, name) is not None:
             fields[name] = _resample_measured(log, name, timeline, coverage.get(name))
@@ -144,31 +142,38 @@ def lacks_derivatives(log: Log) -> bool:
     return False
 
 
-def _chain(log: Log, chain: tuple[str, ...], timeline: Timeline) -> dict[str, FloatArray]:
-    """The quantities of a chain at the output's stamps: the recorded ones, and derivatives for missing ones."""
+def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
+    """Quantities of motion at the output's stamps: the recorded ones, and derivatives for missing ones."""
+
+    def underived(names: tuple[str, ...]) -> tuple[str, ...]:
+        """A quantity with those of its derivatives that nothing else gives."""
+        return names[:1] + tuple(takewhile(lambda name: getattr(log, name) is None, names[1:]))
+
+    given = [chain[i:] for chain in DERIVATIVE_CHAINS for i in range(len(chain)) if getattr(log, chain[i]) is not None]
+    if log.base_quat_xyzw is not None:
+        given.append(("base_quat_xyzw", *_ANGULAR))
+    for name, *_ in given:
+        check_finite(name, getattr(log, name), labels=column_labels(name, log.names))
+    wanted = [underived(names) for names in given]
     out: dict[str, FloatArray] = {}
-    for i, name in enumerate(chain):
-        values = getattr(log, name)
-        if values is None:
-            continue
-        check_finite(name, values, labels=column_labels(name, log.names))
-        missing = [name]
-        while i + len(missing) < len(chain) and getattr(log, chain[i + len(missing)]) is None:
-            missing.append(chain[i + len(missing)])
-        derivatives = timeline.evaluate(timeline.smooth(values), range(len(missing)))
-        out |= dict(zip(missing, derivatives, strict=True))
+    for count in dict.fromkeys(map(len, wanted)):
+        same = [names for names in wanted if len(names) == count]
+        smoothed = [timeline.smooth(_continuous(log, name)) for name, *_ in same]
+        for names, derivatives in zip(same, timeline.evaluate_jointly(smoothed, range(count)), strict=True):
+            is_turned = names[0] == "base_quat_xyzw"
+            out |= _orientation(log, derivatives, timeline) if is_turned else dict(zip(names, derivatives, strict=True))
     return out
 
 
-def _orientation(log: Log, quat: FloatArray, timeline: Timeline) -> dict[str, FloatArray]:
-    """The orientation at the output's stamps, and angular rates that were not recorded."""
-    check_finite("base_quat_xyzw", quat)
-    smoothed = timeline.smooth(quat)
-    if log.base_angular_velocity_base is not None:
-        orders = [0]
-    else:
-        orders = [0, 1, 2] if log.base_angular_acceleration_base is None else [0, 1]
-    q, *rates = timeline.evaluate(smoothed, orders)
+def _continuous(log: Log, name: str) -> FloatArray:
+    """The field `name` without jumps that are no motion."""
+    values: FloatArray = getattr(log, name)
+    return make_sign_continuous(values) if name == "base_quat_xyzw" else values
+
+
+def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) -> dict[str, FloatArray]:
+    """The orientation at the output's stamps, from the quaternion, and angular rates from its derivatives."""
+    q, *rates = derivatives
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     if timeline.low_pass is not None and np.min(norm) < _MIN_QUATERNION_NORM:
         found = f"a cutoff that removes the base's rotation (norm of the filtered quaternion {np.min(norm):.2g})"
@@ -281,7 +286,10 @@ def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Covera
         clean = values[columns]
         if flags is not None:
             clean[~flags[:, columns[1]]] = 0.0
-        out[columns] = timeline.evaluate(timeline.smooth(clean), (0,))[0]
+        if clean.any():
+            out[columns] = timeline.evaluate(timeline.smooth(clean), (0,))[0]
+        else:  # such as moments of points
+            out[columns] = 0.0
     return out
 
 

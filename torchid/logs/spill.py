@@ -32,6 +32,25 @@ class SpillError(InputError):
     """The disk has no room for arrays that exceed the memory."""
 
 
+class Filled:
+    """An array in memory that is filled row by row, without a second copy at the end."""
+
+    def __init__(self, rows: int) -> None:
+        """Start empty, with room for so many rows as soon as there is a first."""
+        self._length, self._filled, self._array = rows, 0, np.zeros(0)
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Add rows, all of one shape and type."""
+        if not self._filled:
+            self._array = np.empty((self._length, *rows.shape[1:]), rows.dtype)
+        self._array[self._filled : self._filled + len(rows)] = rows
+        self._filled += len(rows)
+
+    def array(self) -> NDArray[Any]:
+        """All rows, (N, ...)."""
+        return self._array
+
+
 class Spill:
     """An array that grows by rows on a disk.
 

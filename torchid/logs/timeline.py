@@ -41,19 +41,33 @@ def spline_derivatives(
         orders: order of each derivative wanted, 0 being the value itself.
         block: samples per spline.
     """
-    flat = values.reshape(len(time), -1)
-    out = [np.zeros((len(at), flat.shape[1])) for _ in orders]
+    return joint_spline_derivatives(time, [values], at, orders, block)[0]
+
+
+def joint_spline_derivatives(
+    time: FloatArray, fields: Sequence[FloatArray], at: FloatArray, orders: Sequence[int], block: int = SPLINE_BLOCK
+) -> list[list[FloatArray]]:
+    """As `spline_derivatives` of each of some fields: one matrix is factorized for all."""
+    flat = [values.reshape(len(time), -1) for values in fields]
+    out = [[np.zeros((len(at), values.shape[1])) for _ in orders] for values in flat]
+    ends = np.cumsum([values.shape[1] for values in flat])
     degree = _spline_degree(len(time))
-    for start in range(0, len(time) if flat.size else 0, block):
+    for start in range(0, len(time) if any(values.size for values in flat) else 0, block):
         stop = start + block
         first = int(np.searchsorted(at, time[start])) if start else 0
         last = int(np.searchsorted(at, time[stop])) if stop < len(time) else len(at)
         if first < last:
             near = slice(max(0, start - SPLINE_OVERLAP), stop + SPLINE_OVERLAP)
-            spline = make_interp_spline(time[near], flat[near], k=degree)
-            for derivative, order in zip(out, orders, strict=True):
-                derivative[first:last] = spline(at[first:last], order)
-    return [derivative.reshape(len(at), *values.shape[1:]) for derivative in out]
+            together = flat[0][near] if len(flat) == 1 else np.concatenate([values[near] for values in flat], axis=1)
+            spline = make_interp_spline(time[near], together, k=degree)
+            for number, order in enumerate(orders):
+                found = np.split(spline(at[first:last], order), ends[:-1], axis=1)
+                for derivatives, part in zip(out, found, strict=True):
+                    derivatives[number][first:last] = part
+    return [
+        [derivative.reshape(len(at), *values.shape[1:]) for derivative in derivatives]
+        for derivatives, values in zip(out, fields, strict=True)
+    ]
 
 
 # ------------------------------------------------------------------------- stamps of a log, and the filter between them
@@ -156,10 +170,17 @@ class Timeline:
 
     def evaluate(self, smoothed: FloatArray, orders: Sequence[int]) -> list[FloatArray]:
         """Derivatives (K, ...) of the given orders of channels on the grid (M, ...), at the output's stamps."""
+        return self.evaluate_jointly([smoothed], orders)[0]
+
+    def evaluate_jointly(self, smoothed: Sequence[FloatArray], orders: Sequence[int]) -> list[list[FloatArray]]:
+        """As `evaluate` of each of some fields."""
         if self.output is None and orders[0] == 0:
-            rest = spline_derivatives(self.grid, smoothed, self.output_stamps, orders[1:]) if len(orders) > 1 else []
-            return [smoothed[self.kept], *rest]
-        return spline_derivatives(self.grid, smoothed, self.output_stamps, orders)
+            kept = [values[self.kept] for values in smoothed]
+            if len(orders) == 1:
+                return [[values] for values in kept]
+            rest = joint_spline_derivatives(self.grid, smoothed, self.output_stamps, orders[1:])
+            return [[values, *derivatives] for values, derivatives in zip(kept, rest, strict=True)]
+        return joint_spline_derivatives(self.grid, smoothed, self.output_stamps, orders)
 
     def hold(self, values: FloatArray) -> FloatArray:
         """Values (N, ...) as recorded, at the output's stamps (K, ...): each holds until the next sample."""

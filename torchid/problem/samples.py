@@ -83,6 +83,10 @@ class Samples:
         """Some of the samples."""
         return self._each(lambda x: x[index])
 
+    def every(self, step: int) -> Samples:
+        """Every `step`-th sample from the first on; all of them, without a copy, for a step of 1."""
+        return self if step == 1 else self[::step]
+
     def to(self, device: torch.device | str, non_blocking: bool = False) -> Samples:
         """The samples on another device, all but readings in the air: these become a few means, on the CPU."""
         return self._each_that_moves(lambda x: x.to(device, non_blocking=non_blocking))
