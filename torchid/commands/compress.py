@@ -27,7 +27,7 @@ from torchid.logs.containers import FACTORS, list_bag_files
 from torchid.logs.remote import is_url
 from torchid.problem import Samples
 from torchid.problem.compressed_log import compress_log
-from torchid.problem.noise import LogElsewhere
+from torchid.problem.sampled_rows import LogElsewhere
 from torchid.report.tables import progress_bars
 
 

@@ -25,7 +25,7 @@ from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.extras import CHANNELS, measured_channels
-from torchid.problem.noise import LogElsewhere
+from torchid.problem.sampled_rows import LogElsewhere
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import (

@@ -13,7 +13,7 @@ from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.fitting.row_model import RowModel, require_same_noise, require_same_rows
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports
 from torchid.problem import RowBuilder
-from torchid.problem.noise import noise_of_groups, std_by_group
+from torchid.problem.sampled_rows import noise_of_groups, std_by_group
 
 _THE_EXPERIMENT = "the experiment file"
 _APART = ("exclude_condemned", "memory_gb", "cache_gb")  # keys of preprocessing that do not change what a row is

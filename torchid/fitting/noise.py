@@ -13,15 +13,8 @@ from torchid.estimators import LeastSquares
 from torchid.fitting.fit import LogFitter
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, Samples
-from torchid.problem.noise import (
-    BASE_GROUPS,
-    GroupVariances,
-    LogElsewhere,
-    SampledRows,
-    VarianceComponentEstimator,
-    noise_of_groups,
-    std_by_group,
-)
+from torchid.problem.noise import GroupVariances, VarianceComponentEstimator
+from torchid.problem.sampled_rows import BASE_GROUPS, LogElsewhere, SampledRows, noise_of_groups, std_by_group
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 

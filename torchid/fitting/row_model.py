@@ -11,7 +11,7 @@ from torchid.errors import LogError, join_names
 from torchid.parameters import WRENCH_COMPONENTS, Array
 from torchid.problem import RowBuilder
 from torchid.problem.extras import measured_components
-from torchid.problem.noise import noise_of_sensors
+from torchid.problem.sampled_rows import noise_of_sensors
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
 from torchid.rounding import KINEMATIC_TOLERANCE

@@ -1,0 +1,211 @@
+"""Rows of some samples by source of noise, and the groups of sources that have one standard deviation each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+import torch
+from scipy.stats import chi2, norm
+from torch import Tensor
+
+from torchid import ranks
+from torchid.parameters import Array
+from torchid.problem.chunks import chunks_by_state, one_thread
+from torchid.problem.compression import Part
+from torchid.problem.contact_state import ContactState
+from torchid.problem.extras import measured_components
+from torchid.problem.linear import TriangularFactor
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples
+from torchid.sensing import SensorNoise
+
+BASE_GROUPS = tuple(f"base_{kind}.{axis}" for kind in ("force", "moment") for axis in "xyz")
+NOISE_GROUPS = ("joint_torque", "contact_force", "contact_moment", *BASE_GROUPS, "ft_force", "ft_moment")
+"""Groups of one standard deviation each; base rows along the axes of the levelled base."""
+
+_SAMPLES, _BYTES, _CHUNK = 1000, 2**27, 256  # rows in memory: 1000 samples give a standard deviation to 2 to 3 %
+CLIP = 3.0
+"""Robust standard deviations at which residuals, of impacts for instance, are clipped."""
+
+
+def std_by_group(noise: SensorNoise) -> dict[str, float]:
+    """Standard deviation of every group, by name [N, N m]."""
+    limb = noise.limb_std
+    sensors = (noise.joint_torque, noise.contact_force, noise.contact_moment)
+    return dict(zip(NOISE_GROUPS, [*sensors, *noise.base_std.tolist(), *limb], strict=True))
+
+
+def noise_of_sensors(builder: RowBuilder) -> dict[str, float]:
+    """Standard deviation of every group that a builder's sensors have, in `NOISE_GROUPS`' order [N m, N]."""
+    names = set(_source_names(builder))
+    return {name: value for name, value in std_by_group(builder.sensors.noise).items() if name in names}
+
+
+def noise_of_groups(values: Mapping[str, float]) -> SensorNoise:
+    """Sensor noise from standard deviations by group."""
+    force, moment = (
+        (values[names[0]], values[names[1]], values[names[2]]) for names in (BASE_GROUPS[:3], BASE_GROUPS[3:])
+    )
+    plain = {name: values[name] for name in NOISE_GROUPS if name not in BASE_GROUPS}
+    return SensorNoise(**plain, base_force=force, base_moment=moment)
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Samples of one log in one contact state.
+
+    `rows`, (B, n_rows, width + 1), whitened with the noise of the builder; `sources`, (B, E, n_rows), one standard
+    deviation of each source of noise in these rows.
+    """
+
+    log: str
+    state: ContactState
+    oversampling: float
+    rows: Tensor
+    sources: Tensor
+
+
+@dataclass(frozen=True)
+class LogElsewhere:
+    """A log that another process has: its number of samples, and their oversampling."""
+
+    count: int
+    oversampling: float
+
+    def __len__(self) -> int:
+        return self.count
+
+
+class SampledRows:
+    """Rows of about a thousand samples of the logs, in memory, to be whitened again with other noise.
+
+    Attributes:
+        builder: of the rows; its sensors' noise is the stated one, which variances are relative to.
+        groups: those that the sensors have, in `NOISE_GROUPS`' order.
+        group_of: (E,), index among `groups` of every source of noise.
+    """
+
+    @one_thread()
+    @torch.no_grad()
+    def __init__(self, logs: Sequence[Samples | LogElsewhere], builder: RowBuilder) -> None:
+        """Compute the rows of random samples, always the same ones.
+
+        Logs elsewhere are those of processes that share the work, each with successive ones; all get the rows of all.
+        """
+        self.builder = builder
+        names = _source_names(builder)
+        self.groups = tuple(name for name in NOISE_GROUPS if name in names)
+        self.group_of = np.array([self.groups.index(name) for name in names], dtype=int)
+        stated = std_by_group(builder.sensors.noise)
+        self._std = torch.tensor([stated[name] for name in names], dtype=torch.float64)
+        n_rows = builder.tree.n_rows
+        most = min(_SAMPLES, _BYTES // (8 * max(n_rows, 1) * (builder.width + 1 + len(names))))
+        self.chunks = [self._chunk(part, state) for part, state in _random_chunks(logs, max(most, 1))]
+        elsewhere = any(isinstance(log, LogElsewhere) for log in logs)
+        if any(ranks.gather(elsewhere, "logs that others have")):
+            self.chunks = list(chain.from_iterable(ranks.gather(self.chunks, "samples for the noise")))
+
+    @property
+    def reference_std(self) -> Array:
+        """Stated standard deviation of each group, which variances are relative to, (G,) [N m, N]."""
+        stated = std_by_group(self.builder.sensors.noise)
+        return np.array([stated[name] for name in self.groups])
+
+    @property
+    def oversampling(self) -> float:
+        """Rows per independent row."""
+        counts = np.array([[len(chunk.rows), len(chunk.rows) / chunk.oversampling] for chunk in self.chunks]).sum(0)
+        return float(counts[0] / counts[1])
+
+    def _chunk(self, samples: Samples, state: ContactState) -> _Chunk:
+        rows, W = self.builder.rows_by_sample(samples.to(self.builder.device), state)
+        sources = (self._unit_forces(samples.to(self.builder.device)) @ W).cpu() * self._std[:, None]
+        return _Chunk(samples.source, state, samples.oversampling, rows.cpu().double(), sources.double())
+
+    def _unit_forces(self, samples: Samples) -> Tensor:
+        """Generalized force of a unit of each noise source, (B, E, n_rows)."""
+        builder, base = self.builder, self.builder.tree.base_rows
+        n_rows = builder.tree.n_rows
+        unit = torch.eye(n_rows, dtype=samples.time.dtype, device=samples.time.device)
+        forces = [unit[:base].expand(len(samples), -1, -1)]
+        if base and (axes := builder.noise_axes(samples.base.rotation)) is not None:
+            rotated = forces[0].clone()
+            rotated[:, :3, :3] = rotated[:, 3:6, 3:6] = axes.mT
+            forces = [rotated]
+        forces.append(unit[(base + np.flatnonzero(builder.sensors.torque)).tolist()].expand(len(samples), -1, -1))
+        components = measured_components(builder.contacts, builder.sensors)
+        if components.any():
+            J = builder.contact_jacobian(samples) * samples.active[..., None, None]
+            forces.append(J[:, torch.from_numpy(components)])
+        return torch.cat(forces, dim=1)
+
+    def whitened(self, variance: Array) -> Iterator[_Chunk]:
+        """The chunks, whitened with variances of the groups relative to the stated ones, (G,)."""
+        if (variance == 1.0).all():
+            yield from self.chunks
+            return
+        scale = torch.from_numpy(np.sqrt(variance)[self.group_of])[:, None]
+        for chunk in self.chunks:
+            sources = chunk.sources * scale
+            S = sources.mT @ sources
+            empty = S.diagonal(dim1=1, dim2=2) == 0.0  # rows of zeros
+            L = torch.linalg.cholesky(S + torch.diag_embed(empty.to(S)))
+            rows = torch.linalg.solve_triangular(L, chunk.rows, upper=False)
+            sources = torch.linalg.solve_triangular(L, sources.mT, upper=False).mT
+            yield replace(chunk, rows=rows, sources=sources)
+
+    @one_thread()
+    def compress(self, variance: Array, columns: Mapping[str, Tensor] | None = None) -> list[Part]:
+        """The rows, whitened with these variances and compressed.
+
+        With parameters of an earlier fit in the builder's columns, by log, samples with large residuals count less, as
+        in Huber's loss: otherwise the effect of impacts on the parameters would look like noise of all rows. A sample's
+        rows are taken together, as another basis of their span must not make a difference.
+        """
+        parts: dict[tuple[str, ContactState], Part] = {}
+        every = tuple(range(self.builder.width))
+        for chunk in self.whitened(variance):
+            key = chunk.log, chunk.state
+            part = parts.setdefault(key, Part(*key, TriangularFactor(self.builder.width), 0))
+            part.samples += len(chunk.rows)
+            rows, present = chunk.rows, chunk.sources.abs().sum(1) > 0.0
+            if columns is not None:
+                size = torch.linalg.vector_norm(rows[..., :-1] @ columns[chunk.log] - rows[..., -1], dim=1)
+                limit = _radius(present.sum(1))
+                rows = rows * (limit / size).clamp_max(1.0).sqrt()[:, None, None]
+            part.factor.add(every, rows[present], chunk.oversampling)
+        return list(parts.values())
+
+
+def _radius(rows: Tensor) -> Tensor:
+    """Size of whitened residuals of so many rows that is exceeded as seldom as `CLIP` standard deviations by one."""
+    return torch.from_numpy(np.sqrt(chi2.isf(2.0 * norm.sf(CLIP), rows.numpy())))
+
+
+def _source_names(builder: RowBuilder) -> list[str]:
+    """The group of every source of noise, in the order of `SampledRows._unit_forces`."""
+    n = builder.tree.n
+    limbs = ["ft_force"] * 3 + ["ft_moment"] * 3
+    dofs = ["joint_torque" if dof < n else limbs[(dof - n) % 6] for dof in np.flatnonzero(builder.sensors.torque)]
+    components = np.argwhere(measured_components(builder.contacts, builder.sensors))[:, 1]
+    contacts = ["contact_force" if k < 3 else "contact_moment" for k in components]
+    return [*BASE_GROUPS[: builder.tree.base_rows], *dofs, *contacts]
+
+
+def _random_chunks(logs: Sequence[Samples | LogElsewhere], most: int) -> Iterator[tuple[Samples, ContactState]]:
+    """About `most` random samples (regular ones could be in phase with a gait), log by log and state by state.
+
+    Of filtered logs at most four for every independent sample: more would add little.
+    """
+    rng, share = np.random.default_rng(0), min(1.0, most / max(sum(map(len, logs)), 1))
+    for log in logs:
+        count = min(len(log), max(round(min(share, 4.0 / log.oversampling) * len(log)), 1))
+        index = torch.from_numpy(np.sort(rng.choice(len(log), count, replace=False)))
+        if isinstance(log, LogElsewhere):
+            continue
+        chosen = replace(log[index], oversampling=max(1.0, log.oversampling * count / len(log)), folder=None)
+        for state, where in chunks_by_state(chosen, _CHUNK):
+            yield chosen[where], state
