@@ -82,6 +82,8 @@ class DeviceTraffic(TorchDispatchMode):
         if DEVICE in devices:
             if name in _WAITS:
                 self.note(f"{name} ({_WAITS[name]})")
+            if kwargs.get("check_errors"):
+                self.note(f"{name} (a verdict on a factorization)")
             if name in _INDEXED and any(x is not None and x.dtype == torch.bool for x in args[1]):
                 self.note(f"{name} by a mask (a shape)")
             if len(devices) > 1:

@@ -133,6 +133,10 @@ def x(*shape: int) -> Tensor:
         (lambda: torch.equal(x(3), x(3)), "equal (a decision)"),
         (lambda: torch.unique(x(3)), "_unique2 (a shape)"),
         (lambda: torch.linalg.cholesky(x(3, 3)), "_linalg_check_errors (a verdict on a factorization)"),
+        (
+            lambda: torch.linalg.cholesky_ex(x(3, 3), check_errors=True),
+            "linalg_cholesky_ex (a verdict on a factorization)",
+        ),
         (lambda: torch.linalg.svd(x(3, 3)), "_linalg_svd (convergence)"),
     ],
 )

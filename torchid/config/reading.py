@@ -131,12 +131,12 @@ class FileKind(Generic[T]):
         keys: the chief keys, as in "a mapping with robot, logs, ...".
         list_example: an override that gives a list as a whole.
         paths: keys that hold a path, such as `robot.urdf`; `logs.train.*` is every item of the list `logs.train`.
-        urls: those of them that may hold a URL instead.
         outputs: keys that hold the path of a result.
         prepare: takes settings and those that will override them, and returns the settings to merge; it is called for
             the file and nothing, then, for each override, for all before and it, and for it and nothing.
         accepted: the accepted values in messages, by key (`*` for a name from the file), where the type alone says
             too little.
+        urls: those of `paths` that may hold a URL instead.
     """
 
     settings: type[T]
@@ -144,10 +144,10 @@ class FileKind(Generic[T]):
     keys: str
     list_example: str
     paths: Sequence[str] = ()
-    urls: Sequence[str] = ()
     outputs: Sequence[str] = ()
     prepare: Callable[[Settings, Settings], Settings] = _as_is
     accepted: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    urls: Sequence[str] = ()
 
     def accepted_at(self, key: Sequence[str], otherwise: str) -> str:
         """What is accepted at a key."""
