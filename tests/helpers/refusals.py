@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,11 @@ from torchid.errors import ConfigError, InputError, UnknownNameError
 
 def files_in(folder: Path) -> dict[str, bytes]:
     """All files with what is in them, and all folders, without what runs keep for later ones."""
-    paths = [path for path in sorted(folder.rglob("*")) if FOLDER not in path.relative_to(folder).parts]
+
+    def is_kept(path: Path) -> bool:
+        return FOLDER in path.relative_to(folder).parts or (path.is_dir() and os.listdir(path) == [FOLDER])
+
+    paths = [path for path in sorted(folder.rglob("*")) if not is_kept(path)]
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in paths}
 
 

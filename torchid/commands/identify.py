@@ -60,7 +60,7 @@ def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
         resume: go on with a training that was interrupted.
 
     Raises:
-        InputError: whatever does not fit; nothing has been written then.
+        InputError: whatever does not fit; nothing but samples in the cache has been written then.
         BaseLostError: the sensors cannot see the base.
         KeyboardInterrupt: a training was interrupted; the message says how it can go on.
     """
