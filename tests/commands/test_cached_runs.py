@@ -187,6 +187,17 @@ def test_sensors_estimators_and_extra_parameters_leave_the_name_of_samples(demo:
     assert content(demo) == content(demo, *more)
 
 
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_offsets_of_contacts_need_samples_with_readings_in_the_air(demo: Path, tmp_path: Path) -> None:
+    offsets = ("sensors.set=full", "sensors.offsets={contact_force: log}")
+    assert content(demo, *offsets) != content(demo)
+    assert content(demo, "sensors.offsets={joint_torque: log}") == content(demo)
+    assert main(["identify", str(demo), *offsets, f"output={tmp_path / 'without'}", NONE]) == 0
+    for name, more in (("plain", ()), ("with", offsets)):
+        assert main(["identify", str(demo), *more, f"output={tmp_path / name}"]) == 0
+    assert results(tmp_path / "with") == results(tmp_path / "without")
+
+
 def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, tmp_path: Path) -> None:
     def key(*more: str) -> str:
         scene = set_up(load_config(demo, (f"output={tmp_path / 'run'}", *more)))

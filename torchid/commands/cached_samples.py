@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchid.commands.cache import Entry, tensor_of
 from torchid.commands.manifest import file_checksum
+from torchid.commands.reading import fits_contact_offsets
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Scene
 from torchid.problem import Samples
@@ -43,7 +44,10 @@ class ReadLog:
 
 
 def content_of_scene(scene: Scene) -> dict[str, Any]:
-    """All that the samples of a log depend on beside the log, as a document; the sensors that are fitted do not."""
+    """All that the samples of a log depend on beside the log, as a document.
+
+    Of the sensors that are fitted it is whether contacts have offsets: then samples have readings in the air.
+    """
     config, robot = scene.config, scene.robot
     settings = {name: x for name, x in vars(config.preprocessing).items() if name not in NOT_IN_SAMPLES}
     topics = None if config.logs is None or config.logs.topics is None else asdict(config.logs.topics)
@@ -52,6 +56,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "urdf": [config.robot.urdf.name, file_checksum(config.robot.urdf)],
         "robot": [robot.base_link, robot.fixed_base, list(robot.ft_names)],
         "contacts": [asdict(contact) for contact in scene.contacts],
+        "unloaded": fits_contact_offsets(scene),
         "preprocessing": settings,
         "topics": topics,
     }

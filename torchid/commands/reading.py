@@ -115,7 +115,7 @@ class LogReader:
         clean = recorded if checked is None else checked.repaired
         log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
         samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
-        if not self._with_unloaded:
+        if not fits_contact_offsets(self.scene):
             samples = replace(samples, unloaded=None)
         if checked is not None:
             count = len(samples)
@@ -139,12 +139,7 @@ class LogReader:
         """A log that is read block by block."""
         scene = self.scene
         log = LargeLog(path, scene.config.preprocessing, scene.robot, scene.contacts, required, folder)
-        return log.samples(self._with_unloaded)
-
-    @property
-    def _with_unloaded(self) -> bool:
-        """Whether offsets of contact sensors are fitted, the only use of their readings in the air."""
-        return any(channel.startswith("contact") for channel in self.scene.terms.offsets)
+        return log.samples(fits_contact_offsets(scene))
 
     def _checked(self, log: Log) -> Checked | None:
         """What the checks of a log say, if condemned samples are to be left out."""
@@ -152,6 +147,11 @@ class LogReader:
         if not settings.exclude_condemned:
             return None
         return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz)
+
+
+def fits_contact_offsets(scene: Scene) -> bool:
+    """Whether offsets of contact sensors are fitted, the only use of their readings in the air."""
+    return any(channel.startswith("contact") for channel in scene.terms.offsets)
 
 
 def memory_needed(path: Path, memory_gb: float, held: float = 0.0) -> float:
