@@ -208,9 +208,11 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             ridge=ready.ridge,
             reused=ready.reused,
         )
+        plotted = next(iter([*logs["test"], *logs["train"]]), None)
+        logs.clear()  # checks of a log and figures need room, too
+        ready.blocks = blocks = []
         require_not_worse(run.worse, experiment)
         bars.add_task("writing", total=None)
-        plotted = next(iter([*logs["test"], *logs["train"]]), None)
         ranks.from_first(partial(write_run, run, evaluation, plotted, compared, training), "run folder")
     return run
 

@@ -48,8 +48,8 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
 _COPIES = 16  # a block takes so many times the memory of its recorded arrays: derivatives, splines, bound tensors
-_BLOCK_GB = 0.02  # recorded arrays of a block; smaller ones spend more on the neighbourhood that a filter needs
-_WHOLE_GB = 2.0 * _BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
+_BLOCK_GB = 0.01  # recorded arrays of a block; smaller ones spend more on the neighbourhood that a filter needs
+_WHOLE_GB = 4.0 * _BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
 
 
 class LogReader:
