@@ -201,7 +201,7 @@ def test_an_implausible_fit_is_refused_without_a_look_for_samples(
     assert main(["compress", str(fleet / "logs.yaml"), logs, "--output", str(tmp_path / "f")]) == 0
     capsys.readouterr()
     looked: list[Path] = []
-    monkeypatch.setattr("torchid.commands.plausibility.read_middle_to_check", lambda path, *_: looked.append(path))
+    monkeypatch.setattr("torchid.commands.plausibility.stretches_to_check", lambda path, *_: looked.append(path))
     factors = f"logs.train=[{tmp_path / 'f' / 'reversed.factor'}]"
     message = refusal(["identify", str(fleet / "experiment.yaml"), factors], tmp_path, capsys)
     assert "usual reasons: torques or wrenches of the opposite sign" in message

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ EXPERIMENTS = (".yaml", ".yml")
 FIGURES = (".png", ".pdf", ".svg")
 _WRENCH = (slice(0, 3), slice(3, 6))
 MOST_CHECKED = 100_000
-"""Samples of a log that are checked for the reason of a bad fit: what spoils all of a log shows in its middle."""
+"""Samples of a log that are checked at once for the reason of a bad fit."""
 
 
 def check_files(
@@ -119,8 +120,8 @@ def read_log_to_check(path: Path, topics: Topics | None, settings: Preprocessing
     return read_log(path, topics, allow_gaps=True)
 
 
-def read_middle_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> tuple[Log, str]:
-    """The log, or the middle `MOST_CHECKED` samples of a longer one, and its name, with their numbers if they are some.
+def stretches_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
+    """The log in equal stretches of at most `MOST_CHECKED` samples, each with a name that says which; the middle first.
 
     Raises:
         LogError: as `read_log_to_check`.
@@ -128,16 +129,18 @@ def read_middle_to_check(path: Path, topics: Topics | None, settings: Preprocess
     _require_memory(path, settings)
     if existing_log_kind(path) is LogKind.BAG:
         log = read_log(path, topics, allow_gaps=True)
-        middle = _middle(len(log))
-        return log.select(middle), _stretch_name(path, middle, len(log))
+        for stretch in _stretches(len(log)):
+            yield log.select(stretch), _stretch_name(path, stretch, len(log))
+        return
     with open_log_blocks(path, None) as blocks:
-        middle = _middle(len(blocks))
-        return blocks.read(middle, allow_gaps=True), _stretch_name(path, middle, len(blocks))
+        for stretch in _stretches(len(blocks)):
+            yield blocks.read(stretch, allow_gaps=True), _stretch_name(path, stretch, len(blocks))
 
 
-def _middle(samples: int) -> slice:
-    first = max(0, (samples - MOST_CHECKED) // 2)
-    return slice(first, min(first + MOST_CHECKED, samples))
+def _stretches(samples: int) -> list[slice]:
+    ends = np.linspace(0, samples, -(-samples // MOST_CHECKED) + 1).round().astype(int).tolist()
+    stretches = [slice(*pair) for pair in pairwise(ends)]
+    return sorted(stretches, key=lambda stretch: abs(stretch.start + stretch.stop - samples))
 
 
 def _stretch_name(path: Path, stretch: slice, samples: int) -> str:

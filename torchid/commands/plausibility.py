@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 
 from torchid import parameters
-from torchid.commands.check import read_middle_to_check
+from torchid.commands.check import stretches_to_check
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn_about_file
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
@@ -183,19 +184,22 @@ def _unexplained(fit: Fit) -> str | None:
 
 
 def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
-    """Findings on a large part of a training log, or of its middle, the most severe first; none without its samples."""
+    """Findings on a large part of a stretch of a training log, the most severe first; none without its samples.
+
+    Stretches after one that is condemned as a whole are not looked at.
+    """
     files = scene.config.logs
     if files is None or files.compressed:
         return
-    findings = []
+    findings: list[tuple[str, Finding]] = []
     for path in files.train:
-        try:
-            log, name = read_middle_to_check(path, files.topics, scene.config.preprocessing)
-            checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
-        except InputError:  # larger than memory: it is not checked
-            continue
-        severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
-        findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
+        with suppress(InputError):  # larger than memory: it is not checked
+            for log, name in stretches_to_check(path, files.topics, scene.config.preprocessing):
+                checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
+                severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
+                findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
+                if any(one.condemns_all for _, one in findings):
+                    break
     yield from sorted(findings, key=lambda pair: _order(pair[1]))
 
 

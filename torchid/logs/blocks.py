@@ -118,7 +118,8 @@ class LogBlocks:
         """Flip quaternions (M, 4) where their sign is not that of the samples before."""
         if self._last is not None:
             index, before = self._last
-            if samples.start <= index + 1 and quat[max(index - samples.start, 0)] @ before < 0.0:
+            place = max(index - samples.start, 0)  # of the sample that was read last, or of the one after it
+            if samples.start <= index + 1 and place < len(quat) and quat[place] @ before < 0.0:
                 quat *= -1.0
         self._last = samples.start + len(quat) - 1, quat[-1].copy()
 
