@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from itertools import chain
+from itertools import chain, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -100,16 +100,18 @@ def _size(samples: Samples, index: slice | torch.Tensor) -> int:
 
 
 def chunks_by_state(samples: Samples, chunk: int = CHUNK) -> Iterator[tuple[ContactState, slice | torch.Tensor]]:
-    """Chunks of samples that share a contact state: the state and an index into the samples."""
+    """Chunks of samples that share a contact state, of about equal size: the state and an index into the samples."""
     active = samples.active.cpu().numpy()
     packed = np.packbits(active, axis=1) if active.shape[1] else np.zeros((len(active), 1), np.uint8)
     keys = packed.view(f"V{packed.shape[1]}")[:, 0]
     unique_keys, first = np.unique(keys, return_index=True)
     for key, sample in zip(unique_keys, first, strict=True):
         if len(unique_keys) == 1:
-            pieces: Iterable[slice | torch.Tensor] = (slice(i, i + chunk) for i in range(0, len(active), chunk))
+            ends = np.linspace(0, len(active), -(-len(active) // chunk) + 1).astype(int).tolist()
+            pieces: Iterable[slice | torch.Tensor] = (slice(*pair) for pair in pairwise(ends))
         else:
-            pieces = torch.from_numpy(np.flatnonzero(keys == key)).split(chunk)
+            index = torch.from_numpy(np.flatnonzero(keys == key))
+            pieces = index.tensor_split(-(-len(index) // chunk))
         for piece in pieces:
             yield tuple(active[sample].tolist()), piece
 
