@@ -23,11 +23,12 @@ import torch
 from benchmark import CASES, Case, PerSample, medians, random_samples, robots_folder
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from torchid.errors import TorchidWarning
 from torchid.estimators import LeastSquares
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.ranks import join_launched, share_work
+from torchid.ranks import join_launched, leave_launched, share_work
 from torchid.report.figures import save_figure
 from torchid.robot import Robot, load_robot
 from torchid.sensing import Contact, named_sensors
@@ -81,7 +82,7 @@ def measure_rank(count: int) -> None:
     bench = Bench.of(CASES[0], 4096)
     bench.fit()
     bench = Bench.of(CASES[0], count)
-    join_launched()
+    launched = join_launched()
     with share_work():
         before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
         bench.fit()
@@ -89,6 +90,8 @@ def measure_rank(count: int) -> None:
     added = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     if os.environ.get("RANK", "0") == "0":
         print(seconds, added / 1024.0)
+    if launched:
+        leave_launched(0)
 
 
 def measure_ranks(count: int, ranks: int) -> tuple[float, float]:
@@ -106,24 +109,26 @@ def draw(
     by_ranks: dict[int, list[tuple[float, float]]], counts: Sequence[int], by_bodies: Sequence[dict[str, float]]
 ) -> Figure:
     """Seconds and memory against samples, microseconds per sample against bodies."""
-    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
+    figure = Figure(figsize=(11.0, 3.8), layout="constrained")
     seconds, memory, bodies = figure.subplots(1, 3)
     for ranks, measured in by_ranks.items():
         label = "1 process" if ranks == 1 else f"{ranks} processes"
         seconds.loglog(counts, [x for x, _ in measured], "o-", label=f"torchid, {label}")
         memory.semilogx(counts, [x for _, x in measured], "o-", label=f"torchid, {label}")
-    for name, style in (("per sample, lstsq", "s--"), ("per sample, Gram", "^--")):
-        slope = by_bodies[0][name] * 1e-6
-        seconds.loglog(
-            counts, [slope * count for count in counts], style[1:], color="0.5", label=f"{name}, extrapolated"
-        )
+    [solo] = (x for case, x in zip(ROBOTS, by_bodies, strict=True) if case is CASES[0])
+    for name, style in (("per sample, lstsq", "--"), ("per sample, Gram", ":")):
+        extrapolated = [1e-6 * solo[name] * count for count in counts]
+        seconds.loglog(counts, extrapolated, style, color="0.5", label=f"{name}, extrapolated")
     ordered = sorted(by_bodies, key=lambda x: x["bodies"])
     for name, style in (("torchid", "o-"), ("per sample, Gram", "^--"), ("per sample, lstsq", "s--")):
         bodies.semilogy([x["bodies"] for x in ordered], [x[name] for x in ordered], style, label=name)
     label_axes(seconds, "samples of Solo12", "time of a fit [s]")
     label_axes(memory, "samples of Solo12", "memory beyond the arrays [MiB]")
     label_axes(bodies, "bodies", "time per sample, one thread [µs]")
-    memory.set_ylim(bottom=0.0)
+    seconds.set_ylim(top=30.0 * seconds.get_ylim()[1])  # room for the legend
+    memory.set_ylim(0.0, 1.4 * memory.get_ylim()[1])
+    for axis in (seconds.xaxis, seconds.yaxis, memory.xaxis, bodies.yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     return figure
 
 
