@@ -90,8 +90,13 @@ def test_the_demo_from_its_factor_is_the_demo_from_its_log(tmp_path: Path, overr
         ("arm", (6.0,), {}),
         ("arm", (3.0, 4.0, 3.0), {"actuators": {"armature": True, "torque_offset": True}}),
         ("biped", (4.0, 3.0, 6.0), {"sensors": OFFSETS}),
-        ("biped", (8.0, 2.0, 2.0), {"sensors": OFFSETS, "estimator": {"name": "consistent", "ridge": 1e-3}}),
-        ("biped", (4.0, 3.0, 6.0), {"sensors": OFFSETS, "estimator": {"ridge": "auto"}}),
+        pytest.param(
+            *("biped", (8.0, 2.0, 2.0), {"sensors": OFFSETS, "estimator": {"name": "consistent", "ridge": 1e-3}}),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            *("biped", (4.0, 3.0, 6.0), {"sensors": OFFSETS, "estimator": {"ridge": "auto"}}), marks=pytest.mark.slow
+        ),
     ],
     ids=["arm", "arm, actuators", "biped", "biped, consistent", "biped, ridge auto"],
 )
@@ -107,6 +112,7 @@ def test_several_logs_from_their_factors_are_fitted_as_from_the_logs(
         assert factors.ridge.ridge == logs.ridge.ridge
 
 
+@pytest.mark.slow
 def test_files_of_two_calls_with_stated_noise_fit_as_those_of_one(tmp_path: Path) -> None:
     file = walks(tmp_path, "biped", (2.0, 2.0, 3.0), sensors=OFFSETS | {"noise": STATED})
     compressed(file, tmp_path / "one")

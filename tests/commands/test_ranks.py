@@ -219,6 +219,7 @@ def test_machines_with_other_logs_are_told_apart(two_machines: tuple[list[str], 
     )
 
 
+@pytest.mark.slow
 def test_other_commands_run_once(tmp_path: Path) -> None:
     for arguments, text in (
         (["convert", str(DEMO / "sway_test.npz"), str(tmp_path / "log.h5")], "written to"),
@@ -297,7 +298,8 @@ def test_an_item_that_fails_ends_what_a_process_does_apart(monkeypatch: pytest.M
 # ------------------------------------------------------------------------------------------------------------ compress
 
 
-@pytest.mark.parametrize("processes", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", [2, 4])
 @pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
 def test_processes_compress_a_log_each_to_the_files_of_one(tmp_path: Path, processes: int) -> None:
     """With noise that is estimated from all logs, offsets, readings in the air, and a process without a log."""
