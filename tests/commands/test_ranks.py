@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import yaml
 from demo import shortened_demo
-from fleets import walks
 from repository import DEMO
 from run_folders import names_in
 from shared_work import (
-    TORCHRUN,
+    TWO,
     children,
     differences,
     finish,
     is_running,
+    lines_of_torchid,
     run_all,
     started,
     write_experiments,
@@ -35,7 +35,6 @@ from torchid.commands.training import CHECKPOINT
 from torchid.parameters import Array
 from torchid.problem.linear import parameter_scale
 
-TWO = (*TORCHRUN, "2")
 DESCENT = ("estimator.name=sgd", "estimator.training.epochs=4", "estimator.ridge=0.1")
 RUNS = {
     "quadruped, consistent": ("quadruped", ("estimator.name=consistent",)),
@@ -157,10 +156,6 @@ def test_every_piece_has_one_owner_and_shares_are_even(
     numbers = range(len(sizes))
     assert [number for share in shares for number in numbers[share]] == list(numbers)
     assert all(abs(sum(sizes[share]) - sum(sizes) / size) <= max(sizes, default=0) for share in shares)
-
-
-def lines_of_torchid(text: str) -> list[str]:
-    return [line for line in text.splitlines() if line.startswith("torchid: ") and "Warning" not in line]
 
 
 def test_a_mistake_that_all_see_is_told_once(tmp_path: Path) -> None:
@@ -293,64 +288,6 @@ def test_an_item_that_fails_ends_what_a_process_does_apart(monkeypatch: pytest.M
         ranks.share_out([0, 0], lambda item: 1 / item, "items", sizes=[1, 1])
     assert ranks._sharing is together
     assert not together.about
-
-
-# ------------------------------------------------------------------------------------------------------------ compress
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("processes", [2, 4])
-@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
-def test_processes_compress_a_log_each_to_the_files_of_one(tmp_path: Path, processes: int) -> None:
-    """With noise that is estimated from all logs, offsets, readings in the air, and a process without a log."""
-    offsets = {"set": "full", "offsets": "log"}
-    file = walks(tmp_path / "walks", "biped", (2.0, 1.5, 3.0), sensors=offsets)
-    printed_by_one: list[str] = []
-    for name, before in (("one", (sys.executable, "-m")), ("shared", (*TORCHRUN, str(processes), "-m", "--"))):
-        folder = tmp_path / name
-        status, printed, complained = finish((*before, "torchid", "compress", str(file), "--output", str(folder)))
-        assert status == 0, complained
-        assert printed.count("written to") == 1
-        assert {path.name: path.read_bytes() for path in folder.glob("*.factor")} == {
-            path.name: path.read_bytes() for path in (tmp_path / "one").glob("*.factor")
-        }
-        assert len([*folder.glob("*.factor")]) == 3
-        printed_by_one = printed_by_one or told(printed)
-        assert told(printed) == printed_by_one
-
-
-def told(printed: str) -> list[str]:
-    """What a command prints, but for the folder."""
-    return [line for line in printed.splitlines() if "written to" not in line]
-
-
-def test_a_log_that_one_process_cannot_compress_ends_all_in_one_line(tmp_path: Path) -> None:
-    file = walks(tmp_path / "walks", "biped", (2.0, 1.5), sensors={"set": "full"})
-    (tmp_path / "walks" / "right.npz").write_bytes(b"no log")
-    command = (*TWO, "-m", "--", "torchid", "compress", str(file), "--output", str(tmp_path / "factors"))
-    status, printed, complained = finish(command)
-    assert status != 0
-    assert not printed
-    (line,) = lines_of_torchid(complained)
-    assert "right.npz" in line
-    assert not (tmp_path / "factors").exists()
-
-
-def test_warnings_of_other_processes_are_told_by_the_first(tmp_path: Path) -> None:
-    file = walks(tmp_path / "walks", "biped", (2.0, 1.5), sensors={"set": "joints", "on_base_lost": "warn"})
-    with np.load(tmp_path / "walks" / "right.npz") as log:
-        fields = {key: log[key] for key in log}
-    fields["contact_wrench_local"] = fields["contact_wrench_local"].copy()
-    fields["contact_wrench_local"][40:44] = np.nan  # a gap
-    np.savez(tmp_path / "walks" / "right.npz", **fields)
-    warned = []
-    for number, before in enumerate(((sys.executable, "-m"), (*TWO, "-m", "--"))):
-        output = str(tmp_path / str(number))
-        status, _, complained = finish((*before, "torchid", "compress", str(file), "--output", output))
-        assert status == 0, complained
-        warned.append([line for line in complained.splitlines() if "right.npz" in line and "torchid: " in line])
-    assert warned[0]
-    assert warned[1] == warned[0]
 
 
 # ------------------------------------------------------------------------------------------------ processes that end

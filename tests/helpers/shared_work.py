@@ -22,6 +22,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node")
+TWO = (*TORCHRUN, "2")
 RANDOM = {"noise": {"joint_torque": 0.1, "contact_force": 0.5, "contact_moment": 0.05}}
 
 
@@ -167,6 +168,10 @@ def _main() -> None:
             identify(load_config(file, [*more, f"output={jobs.parent / name}"]))
     sys.stdout.flush()
     os._exit(0)  # see torchid.ranks.leave_launched
+
+
+def lines_of_torchid(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line.startswith("torchid: ") and "Warning" not in line]
 
 
 if __name__ == "__main__":
