@@ -115,9 +115,9 @@ def test_two_processes_find_what_one_finds(runs: dict[int, Path], experiments: d
 def test_four_processes_find_what_one_finds(
     runs: dict[int, Path], experiments: dict[str, Path], tmp_path: Path
 ) -> None:
-    run_all(4, tmp_path, [(name, experiments[RUNS[name][0]], RUNS[name][1]) for name in BY_FOUR])
+    run_all(4, tmp_path / "4", [(name, experiments[RUNS[name][0]], RUNS[name][1]) for name in BY_FOUR])
     for name in BY_FOUR:
-        assert_same(tmp_path / name, runs[1] / name, experiments[RUNS[name][0]], "descent" in name)
+        assert_same(tmp_path / "4" / name, runs[1] / name, experiments[RUNS[name][0]], "descent" in name)
 
 
 @pytest.mark.slow
