@@ -56,10 +56,6 @@ class Columns:
         """The first of the two friction columns of a body's joint."""
         return self.layout.count + 2 * (body - 1)
 
-    def friction_of(self, joint: int) -> list[int]:
-        """Friction columns of an independent joint and those that mimic it."""
-        return [self.friction(body) + k for body, _ in self.joint_rows[joint].moved for k in (0, 1)]
-
     def joints_above(self, body: int) -> list[int]:
         """Independent joints that move a body."""
         path = set(self.tree.path(body))
@@ -107,7 +103,6 @@ class ContactStateLayout:
         uncoupled_joints: indices of independent joints, with the block of each one's row.
         row_std: noise of the base rows and coupled joints [N, N m].
         wrench_std: noise of the measured components, body by body [N, N m].
-        extras: columns of extra parameters.
         blocks: of the coupled rows.
     """
 
@@ -116,7 +111,6 @@ class ContactStateLayout:
     uncoupled_joints: Mapping[int, RowBlock]
     row_std: Tensor
     wrench_std: Tensor
-    extras: tuple[int, ...]
     blocks: RowBlocks
 
 
@@ -171,7 +165,6 @@ class ContactStateLayouts:
             {joint: self._uncoupled(joint) for joint in measured if joint not in moving},
             self._tensor(np.append(noise.base_std[:base_rows], self.dof_std[list(coupled)])),
             self._tensor(noise.wrench_std[[k for body in bodies for _, k in body.components]]),
-            tuple(column for column, _ in extras),
             RowBlocks(
                 self.columns.tree,
                 self.columns.layout,
