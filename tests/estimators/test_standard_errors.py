@@ -162,7 +162,8 @@ def test_the_noise_bandwidth_is_what_the_filter_leaves_of_white_noise(cutoff: fl
 
 def arm_samples(log: Log) -> Samples:
     robot = load(UR5, fixed_base=True)
-    spread = {name: np.repeat(array, robot.n, axis=1) for name, array in log.arrays().items() if name != "time"}
+    per_joint = log.arrays() | ({} if log.joint_direction is None else {"joint_direction": log.joint_direction})
+    spread = {name: np.repeat(array, robot.n, axis=1) for name, array in per_joint.items() if name != "time"}
     return bind_log(replace(log, joint_names=robot.joint_names, **spread), robot, ())
 
 

@@ -133,3 +133,29 @@ def test_one_spline_and_a_chain_of_short_ones_are_the_same() -> None:
     whole = spline_derivatives(t, values, at, (0, 1, 2), block=10**6)
     for one, other in zip(whole, spline_derivatives(t, values, at, (0, 1, 2), block=100), strict=True):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12 * np.max(np.abs(one)))
+
+
+@pytest.mark.parametrize("time", [uniform(), jittered()], ids=["uniform", "jittered"])
+@pytest.mark.parametrize("given", ["joint_position", "joint_velocity"])
+def test_dry_friction_is_smeared_as_the_filter_smears_its_torque(time: FloatArray, given: str) -> None:
+    angle = 2 * np.pi * 1.3 * time[:, None] + np.array([0.3, 2.0])
+    q, v = np.sin(angle) / (2 * np.pi * 1.3), np.cos(angle)
+    log = Log("friction.npz", time, ("a", "b"), q, v if given == "joint_velocity" else None, joint_torque=np.sign(v))
+    for rate in (None, 100.0):
+        out = preprocess(log, cutoff_hz=10.0, sample_rate_hz=rate)
+        sign, torque = np.sign(value(out.joint_velocity)), value(out.joint_torque)
+        off = np.abs(value(out.joint_direction) - torque)
+        assert off.max() < 0.06  # a recorded sign reverses at a sample, half a step off
+        assert np.sqrt(np.mean(off**2)) < 0.05 * np.sqrt(np.mean((sign - torque) ** 2))
+        assert np.abs(sign - torque).max() > 0.9
+        again = preprocess(out, sample_rate_hz=50.0)
+        np.testing.assert_allclose(value(again.joint_direction)[:, 0], value(again.joint_torque)[:, 0], atol=0.06)
+    assert preprocess(log).joint_direction is None
+    assert preprocess(log, sample_rate_hz=100.0).joint_direction is None
+    assert "joint_direction" not in out.arrays()
+    np.testing.assert_array_equal(value(out.select(slice(3, 9)).joint_direction), value(out.joint_direction)[3:9])
+
+
+def test_a_joint_at_rest_has_no_direction() -> None:
+    log = Log("rest.npz", uniform(2.0), ("a",), np.ones((len(uniform(2.0)), 1)))
+    assert not value(preprocess(log, cutoff_hz=10.0).joint_direction).any()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from synthetic import (
     ROMEO,
     SOLO12,
     TALOS,
+    TALOS_FULL,
     TIAGO,
     TIAGO_PRO,
     UR5,
@@ -30,7 +32,9 @@ from synthetic import (
 from torch import Tensor
 
 from torchid import parameters
-from torchid.regressor import FrameJacobian, Regressor
+from torchid.regressor import FrameJacobian, Motion, Regressor
+from torchid.regressor.kinematics import joint_motion
+from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 
 REFUSED = ("ur3.urdf", "alex_psyonic_hands.urdf")
@@ -148,6 +152,21 @@ def test_friction_takes_torque_in_the_direction_of_motion(small: Robot) -> None:
         body, velocity = small.body_names.index(name), v[:, 6 + joint]
         np.testing.assert_array_equal(K[:, 6 + joint, body, parameters.COULOMB], np.where(velocity > 0.0, 1.0, -1.0))
         np.testing.assert_array_equal(K[:, 6 + joint, body, parameters.VISCOUS], velocity)
+
+
+def test_a_direction_takes_the_place_of_the_sign_of_velocities() -> None:
+    tree = KinematicTree(load(TALOS_FULL))  # whose mimic fingers turn both ways
+    zero, v = torch.zeros(50, 3), torch.randn(50, tree.n, generator=torch.Generator().manual_seed(0))
+    plain = Motion(*(x.double() for x in (v, v, v, zero, zero, zero)))
+    expected = joint_motion(tree, plain).direction
+    assert torch.equal(joint_motion(tree, replace(plain, joint_direction=torch.sign(v.double()))).direction, expected)
+    assert (expected[1:] < 0).any(1).all()
+    halved = joint_motion(tree, replace(plain, joint_direction=0.5 * torch.sign(v.double())))
+    assert torch.equal(halved.direction, 0.5 * expected)
+    assert torch.equal(halved.velocity, joint_motion(tree, plain).velocity)
+    part = replace(plain, joint_direction=torch.sign(v.double()))[3:7]
+    assert part.joint_direction is not None
+    assert part.joint_direction.shape == (4, tree.n)
 
 
 def test_friction_of_a_mimic_joint_reaches_its_master_through_the_ratio(small: Robot) -> None:

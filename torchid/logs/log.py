@@ -107,6 +107,8 @@ class Log:
         imu_specific_force: (N, 3) [m/s^2], acceleration of the frame's origin minus gravity, in that frame.
         imu_angular_velocity: (N, 3) [rad/s], in that frame.
         imu_angular_acceleration: (N, 3) [rad/s^2], in that frame.
+        joint_direction: (N, n), what the filter makes of the sign of the joint velocities; None in a log that was not
+            filtered, where it is that sign. No part of a file.
         contact_share: (N, C), what the filter makes of a reading that is 1 while the contact is active and 0 else; None
             in a log that was not filtered, where it is `contact_active`. No part of a file.
         contact_unloaded: (N, C, 6), as recorded even in a filtered log: what the sensors read in the air, NaN
@@ -141,6 +143,7 @@ class Log:
     imu_specific_force: FloatArray | None = None
     imu_angular_velocity: FloatArray | None = None
     imu_angular_acceleration: FloatArray | None = None
+    joint_direction: FloatArray | None = None
     contact_share: FloatArray | None = None
     contact_unloaded: FloatArray | None = None
     noise_bandwidth_hz: float | None = None
@@ -190,7 +193,7 @@ class Log:
     def select(self, index: slice | NDArray[np.intp] | BoolArray) -> Log:
         """The log of the chosen samples: a slice (no data is copied), sample numbers (M,) or a mask (N,)."""
         chosen: dict[str, Any] = {name: array[index] for name, array in self.arrays().items()}
-        for name in ("contact_share", "contact_unloaded"):
+        for name in ("joint_direction", "contact_share", "contact_unloaded"):
             if (array := getattr(self, name)) is not None:
                 chosen[name] = array[index]
         return dataclasses.replace(self, **chosen)

@@ -55,7 +55,8 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     while its contact is inactive, and a torque or wrench channel that is NaN in some samples becomes NaN throughout.
     In a filtered log a contact is active from 1/cutoff_hz before its recorded start until 1/cutoff_hz after its end, as
     the filter spreads its force over that time: an ignored force would bias the fit, a projected force of 0 would not.
-    Readings of contact sensors without contact, their offsets, are kept as recorded (`contact_unloaded`).
+    Readings of contact sensors without contact, their offsets, are kept as recorded (`contact_unloaded`). The sign of
+    the joint velocities, which dry friction goes with, is filtered as its torque is (`joint_direction`).
 
     Args:
         log: the log.
@@ -156,12 +157,43 @@ def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
         check_finite(name, getattr(log, name), labels=column_labels(name, log.names))
     wanted = [underived(names) for names in given]
     out: dict[str, FloatArray] = {}
+    joints: dict[str, FloatArray] = {}
     for count in dict.fromkeys(map(len, wanted)):
         same = [names for names in wanted if len(names) == count]
         smoothed = [timeline.smooth(_continuous(log, name)) for name, *_ in same]
         for names, derivatives in zip(same, timeline.evaluate_jointly(smoothed, range(count)), strict=True):
             is_turned = names[0] == "base_quat_xyzw"
             out |= _orientation(log, derivatives, timeline) if is_turned else dict(zip(names, derivatives, strict=True))
+        joints |= {names[0]: x for names, x in zip(same, smoothed, strict=True) if names[0] in DERIVATIVE_CHAINS[0]}
+    if (direction := _direction(log, joints, timeline)) is not None:
+        out["joint_direction"] = direction
+    return out
+
+
+def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> FloatArray | None:
+    """What the filter makes of the sign of the joint velocities, (K, n); None where nothing is filtered.
+
+    Dry friction reverses at once, and the filter smears its torque as it smears all others.
+
+    Args:
+        log: the log.
+        smoothed: its joint positions and, if it has them, velocities on the grid.
+        timeline: with the grid.
+    """
+    if log.joint_direction is not None:
+        return timeline.evaluate(timeline.smooth(log.joint_direction), (0,))[0]
+    if timeline.low_pass is None:
+        return None
+    velocity = smoothed.get("joint_velocity")
+    known = smoothed["joint_position"] if velocity is None else velocity
+    out = np.empty((len(timeline.output_stamps), known.shape[1]))
+    for column in range(known.shape[1]):  # one by one: temporaries stay small
+        x = known[:, column]
+        halfway = np.diff(x) if velocity is None else x[1:] + x[:-1]
+        before, after = np.append(halfway[:1], halfway), np.append(halfway, halfway[-1:])
+        size = np.abs(before) + np.abs(after)
+        sign = np.divide(before + after, size, out=np.zeros_like(size), where=size > 0.0)  # mean over a step, v linear
+        out[:, column] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
     return out
 
 
@@ -189,7 +221,7 @@ def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) ->
 # -------------------------------------------------------------------------------------------- fields that may have gaps
 
 #: Channels that are filtered together: few, so that copies are small compared with a long log.
-_CHANNELS_TOGETHER = 4
+_CHANNELS_TOGETHER = 2
 
 
 @dataclass

@@ -149,7 +149,8 @@ class Timeline:
         reach into the neighbourhood, and the spline is drawn through the same blocks of samples.
         """
         at = self.output_stamps[first:last]
-        beyond = SPLINE_OVERLAP + (0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding)
+        spoiled = 0 if self.low_pass is None else self.low_pass.settling + self.low_pass.padding
+        beyond = SPLINE_OVERLAP + 2 * spoiled  # directions are filtered twice
         grid = _around(self.grid, at, beyond)
         samples = grid if self.grid is self.native else _around(self.native, self.grid[grid][[0, -1]], SPLINE_OVERLAP)
         native = self.native[samples]

@@ -95,10 +95,10 @@ def predict_forces(builder: RowBuilder, kinematics: ChunkKinematics, phi: Tensor
     below = tree.ancestors.T @ wrench
     torque = below.mul_(kinematics.screw_axes[:, None]).sum(0)
     coulomb, viscous = phi[:, columns.layout.count : columns.count, None].unflatten(1, (-1, 2)).unbind(2)
-    velocity = kinematics.joints.velocity[1:]
-    torque[:, 1:].addcmul_(coulomb, tree.coulomb_sign(velocity)).addcmul_(viscous, velocity)
-    joints = tree.joint_map.T @ torque
-    return torch.cat([wrench.sum(2).transpose(0, 1), joints], 1) if tree.base_rows else joints
+    joints = kinematics.joints
+    torque[:, 1:].addcmul_(coulomb, joints.direction[1:]).addcmul_(viscous, joints.velocity[1:])
+    by_joint = tree.joint_map.T @ torque
+    return torch.cat([wrench.sum(2).transpose(0, 1), by_joint], 1) if tree.base_rows else by_joint
 
 
 def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, kinematics: ChunkKinematics) -> Tensor:

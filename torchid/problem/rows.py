@@ -308,9 +308,9 @@ class RowBuilder(nn.Module):
         block, X = rows.block, rows.values
         torques = [ratio * W_joints[joint] for _, joint, ratio, _ in block.moved]
         for number, (torque, (node, _, _, _)) in enumerate(zip(torques, block.moved, strict=True)):
-            velocity, friction = dynamics.joints.velocity[node], X[len(block.inertial) + 2 * number :]
-            torch.mul(torque, self.tree.coulomb_sign(velocity), out=friction[0])
-            torch.mul(torque, velocity, out=friction[1])
+            friction = X[len(block.inertial) + 2 * number :]
+            torch.mul(torque, dynamics.joints.direction[node], out=friction[0])
+            torch.mul(torque, dynamics.joints.velocity[node], out=friction[1])
 
         sums = [] if W_base is None or block.base == "none" else [W_base]
         path_sums = workspace.empty("path_sums", W_joints, 6, len(sums) + len(torques), *W_joints.shape[1:])

@@ -45,6 +45,7 @@ class Samples:
             `active`.
         unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
             `Log.contact_unloaded`, on the CPU; None without such readings.
+        direction: (N, n), what Coulomb friction goes with, as `Log.joint_direction`; None for the sign of the velocity.
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
     """
@@ -62,6 +63,7 @@ class Samples:
     oversampling: float = 1.0
     share: Tensor | None = None
     unloaded: Tensor | None = None
+    direction: Tensor | None = None
     folder: Path | None = None
     fold: int = 0
 
@@ -117,7 +119,8 @@ class Samples:
                 force = (rotation.mT @ force[..., None])[..., 0]
         omega = zero if base.angular_velocity is None else base.angular_velocity
         alpha = zero if base.angular_acceleration is None else base.angular_acceleration
-        return Motion(self.joint_position, self.joint_velocity, self.joint_acceleration, omega, alpha, force)
+        joints = self.joint_position, self.joint_velocity, self.joint_acceleration
+        return Motion(*joints, omega, alpha, force, self.direction)
 
     def coordinates(self) -> tuple[Tensor, Tensor, Tensor]:
         """Generalized coordinates q, v, a as `Regressor` takes them.
@@ -175,6 +178,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         oversampling(log.time, log.noise_bandwidth_hz),
         None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
         None if unloaded is None else torch.from_numpy(_columns(unloaded, chosen)),
+        None if log.joint_direction is None else torch.from_numpy(_columns(log.joint_direction, order)),
     )
     if required is not None:
         _require_limb_sensors(log, robot, required)

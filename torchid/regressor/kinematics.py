@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +23,7 @@ class Motion:
         base_angular_velocity, base_angular_acceleration: (B, 3) in the base frame [rad/s, rad/s^2].
         base_specific_force: (B, 3), acceleration of the base origin minus gravity, in the base frame [m/s^2]; what an
             ideal accelerometer there reads.
+        joint_direction: (B, n), what Coulomb friction goes with; None for the sign of the velocity.
     """
 
     joint_position: Tensor
@@ -29,17 +32,21 @@ class Motion:
     base_angular_velocity: Tensor
     base_angular_acceleration: Tensor
     base_specific_force: Tensor
+    joint_direction: Tensor | None = None
 
     def __len__(self) -> int:
         return self.joint_position.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> Motion:
         """The same motion at fewer samples."""
-        return Motion(*(getattr(self, f.name)[index] for f in fields(self)))
+        return self._each(lambda x: x[index])
 
-    def to(self, *args: object, **kwargs: object) -> Motion:
+    def to(self, *args: Any, **kwargs: Any) -> Motion:
         """As `torch.Tensor.to`, for every part."""
-        return Motion(*(getattr(self, f.name).to(*args, **kwargs) for f in fields(self)))
+        return self._each(lambda x: x.to(*args, **kwargs))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Motion:
+        return Motion(**{name: change(x) for name, x in vars(self).items() if x is not None})
 
 
 def motion_from_state(
@@ -80,11 +87,15 @@ def motion_from_state(
 
 @dataclass(frozen=True)
 class JointMotion:
-    """Positions, velocities, accelerations of the base's and all L - 1 joints, (L, B); the base's row is 0."""
+    """Positions, velocities, accelerations of the base's and all L - 1 joints, (L, B); the base's row is 0.
+
+    `direction`, (L, B): what Coulomb friction goes with.
+    """
 
     position: Tensor
     velocity: Tensor
     acceleration: Tensor
+    direction: Tensor
 
 
 def joint_motion(tree: KinematicTree, motion: Motion) -> JointMotion:
@@ -98,7 +109,12 @@ def joint_motion(tree: KinematicTree, motion: Motion) -> JointMotion:
         raise TypeError(f"motion: found {dtype}; accepted: {expected}, or the module moved with .to({dtype})")
     moving = tree.joint_map[:, : tree.n]
     position = moving @ motion.joint_position.T + tree.joint_constant
-    return JointMotion(position, moving @ motion.joint_velocity.T, moving @ motion.joint_acceleration.T)
+    velocity = moving @ motion.joint_velocity.T
+    if motion.joint_direction is None or tree.sign_width is not None:
+        direction = tree.coulomb_sign(velocity)
+    else:
+        direction = torch.sign(moving) @ motion.joint_direction.T  # a mimic joint may turn the other way
+    return JointMotion(position, velocity, moving @ motion.joint_acceleration.T, direction)
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ class Regressor(nn.Module):
         for index, row in enumerate(self._rows, start=tree.base_rows):
             part = joint_row(row, tree, layout, screw_axes, wrenches)
             inertial[index, row.start // width : row.end // width] = part.unflatten(0, (-1, width))
-            for body, coulomb, viscous in friction_columns(row, tree, joints):
+            for body, coulomb, viscous in friction_columns(row, joints):
                 K[index, body, parameters.COULOMB] = coulomb
                 K[index, body, parameters.VISCOUS] = viscous
         if len(tree.node_of) < tree.n_nodes:
@@ -133,15 +133,14 @@ def joint_row(row: JointRow, tree: KinematicTree, layout: ColumnLayout, screw_ax
     return total
 
 
-def friction_columns(row: JointRow, tree: KinematicTree, joints: JointMotion) -> list[tuple[int, Tensor, Tensor]]:
+def friction_columns(row: JointRow, joints: JointMotion) -> list[tuple[int, Tensor, Tensor]]:
     """Friction entries of one joint's row: body, column of fc, column of fv, each (B,).
 
-    Friction adds `fc sign(v) + fv v` to the actuator's torque.
+    Friction adds `fc sign(v) + fv v` to the actuator's torque, in a filtered log what the filter makes of it.
     """
     entries = []
     for body, ratio in row.moved:
-        velocity = joints.velocity[body]
-        entries.append((body, ratio * tree.coulomb_sign(velocity), ratio * velocity))
+        entries.append((body, ratio * joints.direction[body], ratio * joints.velocity[body]))
     return entries
 
 
