@@ -87,6 +87,7 @@ def _packed(parts: Sequence[Part], sources: Sequence[str]) -> tuple[dict[str, An
                 "state": list(part.state),
                 "samples": part.samples,
                 "fold": part.fold,
+                "block": part.block,
                 "unloaded": part.unloaded,
                 "gated": sorted(part.gated),
                 "rows": factor.rows,
@@ -108,7 +109,7 @@ def _unpacked(entry: Entry, builder: RowBuilder, sources: Sequence[str]) -> list
             blocks[tuple(support)] = tensor_of(block).clone().to(builder.device)
             taken += size
         factor = TriangularFactor.from_blocks(builder.width, one["rows"], one["independent_rows"], blocks)
-        plain = {name: one[name] for name in ("samples", "fold", "unloaded")}
+        plain = {name: one[name] for name in ("samples", "fold", "block", "unloaded")}
         parts.append(Part(sources[one["source"]], tuple(one["state"]), factor, gated=set(one["gated"]), **plain))
     if taken != len(values):
         raise ValueError("more numbers than are described")

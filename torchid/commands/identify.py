@@ -33,9 +33,9 @@ from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parameters import PER_BODY, Array
-from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples, compress_parts
+from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
-from torchid.problem.compression import Part, merge_folds, merge_states, split_into_folds
+from torchid.problem.compression import Part, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import SETS
 from torchid.report.tables import progress_bars
@@ -272,7 +272,7 @@ def _compressed(
     streaming = bars.add_task("streaming samples", total=sum(map(len, train)))
 
     def compute() -> list[Part]:
-        return compress_parts(train, builder, progress=lambda n: bars.advance(streaming, n))
+        return compress_in_blocks(train, builder, progress=lambda n: bars.advance(streaming, n))
 
     keys = reader.keys if isinstance(reader, CachedReader) else {}
     paths = [str(path) for path in experiment.config.logs.train]

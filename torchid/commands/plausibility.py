@@ -55,7 +55,8 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     estimate = fit.estimate
     if not estimate.rank:
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
-    mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance)
+    block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error
+    mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance, block_error)
     reason = implausibility(fit.assembly.problem, estimate.phi, mass, scene.robot)
     unexplained = _unexplained(fit)
     if reason is None and unexplained is None:

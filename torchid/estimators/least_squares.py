@@ -29,7 +29,8 @@ class Estimate:
 
     Attributes:
         phi: (P,) estimated parameters; those that were not free are nominal.
-        standard_error: (P,), NaN where the data do not determine the parameter.
+        noise_error: (P,), standard errors if residuals are independent noise, NaN where the data do not determine the
+            parameter.
         observable: (P,) bool, whether the data depend on the parameter at all.
         identifiable: (P,) bool, whether the data alone determine the parameter.
         data_share: (P,), diagonal of the resolution matrix of the scaled problem with its Euclidean ridge: 1 where the
@@ -41,10 +42,12 @@ class Estimate:
         cost, nominal_cost: sum of squared whitened residuals at `phi` and at the nominal parameters.
         rows: number of scalar equations.
         oversampling: of the rows, as in `LinearProblem`.
+        block_error: (P,), standard errors by the scatter between blocks of the logs, see `BlockScatter`; None where
+            there are too few.
     """
 
     phi: Array
-    standard_error: Array
+    noise_error: Array
     observable: np.ndarray
     identifiable: np.ndarray
     data_share: Array
@@ -55,6 +58,12 @@ class Estimate:
     nominal_cost: float
     rows: int
     oversampling: float
+    block_error: Array | None = field(default=None, kw_only=True)
+
+    @property
+    def standard_error(self) -> Array:
+        """The larger of `noise_error` and `block_error`, (P,); NaN where the data do not determine the parameter."""
+        return self.noise_error if self.block_error is None else np.maximum(self.noise_error, self.block_error)
 
     @property
     def residual_std(self) -> float:
@@ -169,9 +178,9 @@ class LeastSquares(Regularized):
     def solve(self, problem: LinearProblem) -> Estimate:
         """Fit the free parameters.
 
-        Standard errors propagate the sensor noise, scaled to the observed residual, through the estimator, and count
-        only as many rows as the filtered noise leaves independent; they do not contain the bias of the prior. They are
-        NaN where the data alone do not determine the parameter.
+        Standard errors, `noise_error`, propagate the sensor noise, scaled to the observed residual, through the
+        estimator, and count only as many rows as the filtered noise leaves independent; they do not contain the bias
+        of the prior. They are NaN where the data alone do not determine the parameter.
 
         Raises:
             InputError: a decomposition failed.
@@ -191,13 +200,13 @@ class LeastSquares(Regularized):
         noise = np.sqrt(problem.oversampling) * residual_std(cost, problem.rows, rank, problem.oversampling)
         observable, identifiable = np.zeros(len(phi), dtype=bool), np.zeros(len(phi), dtype=bool)
         observable[free], identifiable[free] = null_share**2 < 1.0 - _OBSERVABLE, null_share < UNOBSERVABLE_SHARE
-        standard_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
-        standard_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
-        standard_error[~identifiable] = np.nan
+        noise_error, data_share = np.full(len(phi), np.nan), np.full(len(phi), np.nan)
+        noise_error[free] = noise * scale * np.linalg.norm(gain, axis=1)
+        noise_error[~identifiable] = np.nan
         data_share[free] = np.clip(np.einsum("pr,rp->p", gain, A), 0.0, 1.0)  # diagonal of gain @ A
         return Estimate(
             phi=phi,
-            standard_error=standard_error,
+            noise_error=noise_error,
             observable=observable,
             identifiable=identifiable,
             data_share=data_share,

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from torchid.errors import TorchidWarning, UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
+from torchid.identifiability.block_scatter import BlockScatter, block_scatter
 from torchid.identifiability.confounding import ExtraEstimate, estimate_extras
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
-from torchid.problem.compression import Part, merge_states
+from torchid.problem.compression import Part, merge_blocks_of_folds, merge_states
 from torchid.problem.elimination import Assembly
 from torchid.robot import Robot
 
@@ -48,12 +49,16 @@ class LogProblem:
 
 @dataclass(frozen=True)
 class Fit:
-    """A solved `LogProblem`: parameters of the bodies, and the extra parameters of sensors and actuators."""
+    """A solved `LogProblem`: parameters of the bodies, and the extra parameters of sensors and actuators.
+
+    `scatter`: of both between blocks of the logs, None where there are too few.
+    """
 
     parts: list[Part]
     assembly: Assembly
     estimate: Estimate
     extras: list[ExtraEstimate]
+    scatter: BlockScatter | None = None
 
     def columns(self, builder: RowBuilder, log: str) -> Tensor:
         """Parameters in the builder's columns for the rows of a log, (width,)."""
@@ -96,10 +101,14 @@ class LogFitter:
         """Build the problem of compressed logs and solve it.
 
         Args:
-            parts: from `compress_parts`, of this builder.
+            parts: from `compress_in_blocks`, of this builder, or from `compress_parts`, without blocks: standard errors
+                then rest on the assumption that residuals are noise.
             solve: instead of the estimator's.
         """
-        return self.solve_problem(self.build_problem(parts), solve)
+        fit = self.solve_problem(self.build_problem(merge_blocks_of_folds(parts, self.builder)), solve)
+        estimator = self.estimator
+        scatter = block_scatter(parts, self.builder, fit.assembly, estimator.ridge, estimator.rank_tolerance)
+        return fit if scatter is None else with_block_errors(fit, scatter)
 
     def assemble(self, parts: Sequence[Part]) -> Assembly:
         """The problem of compressed logs as they are, with extra parameters eliminated and frozen ones not free."""
@@ -142,6 +151,18 @@ class LogFitter:
             warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
             rests = ([block for block in blocks if block.fold != fold] for fold in folds)
             return [self.solve_problem(LogProblem(rest, self.assemble(rest))) for rest in rests]
+
+
+def with_block_errors(fit: Fit, scatter: BlockScatter, factor: float = 1.0) -> Fit:
+    """The fit with standard errors by the scatter between blocks of the logs, times a factor."""
+    estimate = replace(fit.estimate, block_error=factor * scatter.error)
+    errors = {
+        (elimination.log, extra.label): factor * float(error)
+        for elimination, deviations in zip(fit.assembly.eliminations, scatter.extras, strict=True)
+        for extra, error in zip(elimination.extras, np.linalg.norm(deviations, axis=0), strict=True)
+    }
+    extras = [replace(x, block_error=errors[x.log, x.extra.label]) for x in fit.extras]
+    return replace(fit, estimate=estimate, extras=extras, scatter=scatter)
 
 
 def frozen_parameters(robot: Robot, bodies: Collection[str], field: str = "frozen") -> np.ndarray:

@@ -15,11 +15,11 @@ from torch import Tensor
 from torchid import ranks
 from torchid.errors import UnknownNameError
 from torchid.estimators import ConstrainedEstimate
-from torchid.fitting.fit import Fit, LogFitter, Solve
+from torchid.fitting.fit import Fit, LogFitter, Solve, with_block_errors
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback
-from torchid.problem.compression import Part, merge_factors
+from torchid.problem.compression import Part, compress_in_blocks, merge_factors
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
 """Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
@@ -125,7 +125,7 @@ def fit_robustly(
     Source:
         Huber, "Robust Statistics", 1981, sections 7.6 (standard errors) and 7.8 (re-weighting).
     """
-    fit = fitter.fit(compress_parts(logs, fitter.builder, progress=progress), solve) if first is None else first
+    fit = fitter.fit(compress_in_blocks(logs, fitter.builder, progress=progress), solve) if first is None else first
     scale, first_pass = fit.estimate.residual_std, 0
     step = min(sum(map(len, logs)) // _ROUGH_SAMPLES, min(map(len, logs)) // _LEAST_ROUGH)
     if step >= _WORTHWHILE:
@@ -171,7 +171,7 @@ def _passes(
         by_log = {source: fit.columns(builder, source) for source in sources}
         reweighting = Reweighting(current, by_log, max(scale, _TINY))
         before, done = fit, done + 1
-        fit = fitter.fit(compress_parts(logs, builder, progress=progress, weight_rows=reweighting), solve)
+        fit = fitter.fit(compress_in_blocks(logs, builder, progress=progress, weight_rows=reweighting), solve)
         reweighting.gather()
         settled = current == loss and _settled(fit, before, scale, reweighting.median_scale)
         converged = ranks.as_first(settled, "convergence")
@@ -265,6 +265,11 @@ class Reweighting:
         """Of all rows."""
         return float(self._sums[1] / max(self._sums[0], 1.0))
 
+    @property
+    def stretch(self) -> float:
+        """By how much leaving rows out moves the estimate, over what it does in least squares with these weights."""
+        return float(self._sums[1] / self._sums[3]) if self._sums[3] > _LEAST_SLOPE * self._sums[0] else 1.0
+
     def deviation(self, unknowns: float) -> float:
         """Standard deviation of independent rows with the same standard errors, in least squares with these weights.
 
@@ -320,7 +325,8 @@ def _with_errors(fit: Fit, reweighting: Reweighting) -> Fit:
     if isinstance(estimate, ConstrainedEstimate):
         objectives = {name: getattr(estimate, name) for name in ("objective", "unconstrained")}
         changed |= {name: x + added / problem.rows for name, x in objectives.items() if x is not None}
-    estimate = replace(estimate, standard_error=factor * estimate.standard_error, **changed)
+    estimate = replace(estimate, noise_error=factor * estimate.noise_error, **changed)
     assembly = replace(fit.assembly, problem=replace(problem, residual=problem.residual + added))
-    extras = [replace(x, standard_error=factor * x.standard_error) for x in fit.extras]
-    return replace(fit, assembly=assembly, estimate=estimate, extras=extras)
+    extras = [replace(x, noise_error=factor * x.noise_error) for x in fit.extras]
+    out = replace(fit, assembly=assembly, estimate=estimate, extras=extras)
+    return out if fit.scatter is None else with_block_errors(out, fit.scatter, reweighting.stretch)

@@ -38,18 +38,27 @@ class ExtraEstimate:
         log: source of the log, "" if it is common to all.
         value: in its unit.
         nominal_value: the best fit at the nominal parameters of the bodies.
-        standard_error: without regularization; infinite if the data do not determine it.
+        noise_error: standard error without regularization if residuals are independent noise; infinite if the data do
+            not determine it.
         inflation: of the standard error by not knowing all other parameters, at least 1.
         confounded_with: names of other parameters, those with most influence first; empty if it is separable.
+        block_error: standard error by the scatter between blocks of the logs, see `BlockScatter`; 0 where there are too
+            few.
     """
 
     extra: Extra
     log: str
     value: float
     nominal_value: float
-    standard_error: float
+    noise_error: float
     inflation: float
     confounded_with: tuple[str, ...]
+    block_error: float = 0.0
+
+    @property
+    def standard_error(self) -> float:
+        """The larger of `noise_error` and `block_error`."""
+        return max(self.noise_error, self.block_error)
 
     @property
     def separable(self) -> bool:
@@ -172,29 +181,39 @@ class TotalMass:
         return self.separable and 2.0 * self.standard_error <= self.nominal
 
 
-def total_mass(assembly: Assembly, estimate: Estimate, rank_tolerance: float = RANK_TOLERANCE) -> TotalMass:
+def total_mass(
+    assembly: Assembly, estimate: Estimate, rank_tolerance: float = RANK_TOLERANCE, block_error: float = 0.0
+) -> TotalMass:
     """The total mass of estimated parameters, with a standard error without regularization.
 
     Args:
         assembly: from `assemble`.
         estimate: of its problem.
         rank_tolerance: as in `LeastSquares`.
+        block_error: standard error by the scatter between blocks of the logs, which counts if it is the larger.
     """
-    weights = np.zeros((len(estimate.phi) // parameters.PER_BODY, parameters.PER_BODY))
-    weights[:, parameters.MASS] = 1.0
+    weights = mass_weights(len(estimate.phi) // parameters.PER_BODY)
     error, if_known = (
-        combination_standard_error(problem, estimate, weights.flatten(), rank_tolerance)
+        combination_standard_error(problem, estimate, weights, rank_tolerance)
         for problem in (assembly.problem, assembly.if_known)
     )
-    value, nominal = (float(weights.flatten() @ phi) for phi in (estimate.phi, assembly.problem.nominal))
-    return TotalMass(error, not np.isfinite(if_known) or error <= INFLATION_LIMIT * if_known, value, nominal)
+    separable = not np.isfinite(if_known) or error <= INFLATION_LIMIT * if_known
+    value, nominal = (float(weights @ phi) for phi in (estimate.phi, assembly.problem.nominal))
+    return TotalMass(max(error, block_error), separable, value, nominal)
+
+
+def mass_weights(bodies: int) -> Array:
+    """Weights of the total mass in all parameters of so many bodies, (12 L,)."""
+    weights = np.zeros((bodies, parameters.PER_BODY))
+    weights[:, parameters.MASS] = 1.0
+    return weights.flatten()
 
 
 @one_thread()
 def combination_standard_error(
     problem: LinearProblem, estimate: Estimate, weights: Array, rank_tolerance: float = RANK_TOLERANCE
 ) -> float:
-    """Standard error of a combination `weights @ phi`, (12 L,), without regularization.
+    """Standard error of a combination `weights @ phi`, (12 L,), without regularization, if residuals are noise.
 
     Infinite where the data do not determine it; what is not free counts as known.
     """
@@ -308,7 +327,7 @@ def _estimates(
                 log=elimination.log,
                 value=value,
                 nominal_value=nominal,
-                standard_error=error,
+                noise_error=error,
                 inflation=inflation,
                 confounded_with=confounded,
             )

@@ -68,7 +68,8 @@ class CompressedLog:
         loaded, unloaded = (
             [replace(part, fold=fold) for part in parts] for parts in (loaded, self.unloaded.get((start, stop), []))
         )
-        return CompressedBlock(self.source, fold, stop - start, [*merge_states(loaded, builder), *unloaded])
+        loaded = [replace(part, block=number) for number, part in enumerate(loaded)]
+        return CompressedBlock(self.source, fold, stop - start, [*loaded, *unloaded])
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ def fold_compressed(logs: Sequence[CompressedLog], builder: RowBuilder) -> list[
 def merge_blocks(blocks: Sequence[CompressedBlock], builder: RowBuilder) -> list[Part]:
     """The parts of all blocks, as `merge_states` has those of samples: one for each log and fold."""
     parts = [part for block in blocks for part in block.parts]
-    loaded = merge_states([part for part in parts if not part.unloaded], builder)
+    loaded = [part for part in parts if not part.unloaded]
     unloaded = [part for part in parts if part.unloaded]
     keys = [(part.source, part.state, part.fold) for part in unloaded]
     return [*loaded, *merge_by_key(unloaded, keys, builder)]

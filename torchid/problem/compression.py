@@ -27,6 +27,11 @@ FOLDS = 5
 LEAST_PER_FOLD = 20
 """Independent samples per fold: the filter correlates only a small part of these with neighbours."""
 
+BLOCKS = 20
+"""Number of blocks of the training samples whose scatter gives standard errors, at least where there are so many."""
+
+_LEAST_PER_BLOCK = 10  # independent samples
+
 _MEMORY = 2**30  # [bytes] of factors
 _LEAST_READINGS = 16  # readings for one equation
 _BATCHES = 8  # batches of successive readings, whose means show drift
@@ -37,12 +42,12 @@ _NORMAL = 0.6745  # median of |x| of standard normal x
 RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
 """Weighted rows, from samples, columns and rows."""
 
-_Key = tuple[str, ContactState, int, bool]
+_Key = tuple[str, ContactState, int, int, bool]
 
 
 @dataclass
 class Part:
-    """Compressed rows of one log (named by `source`) in one contact state and one fold.
+    """Compressed rows of one log (named by `source`) in one contact state, one fold and one block of it.
 
     Equations of unloaded contact sensors are in parts of their own, `unloaded`, which count no samples. `gated`:
     indices of extras that are offsets without such an equation, because their readings in the air are masked.
@@ -53,6 +58,7 @@ class Part:
     factor: TriangularFactor
     samples: int
     fold: int = 0
+    block: int = 0
     unloaded: bool = False
     gated: set[int] = field(default_factory=set)
 
@@ -102,6 +108,41 @@ def compress_parts(
     return sorted(parts, key=lambda part: order.index(part.source))
 
 
+def compress_in_blocks(
+    logs: Sequence[Samples],
+    builder: RowBuilder,
+    progress: ProgressCallback | None = None,
+    weight_rows: RowWeighting | None = None,
+) -> list[Part]:
+    """As `compress_parts`, but with a factor for each of some blocks of successive samples in every fold, too.
+
+    Args:
+        logs: as `split_into_folds` cuts them.
+        builder: of their rows.
+        progress: called with the number of samples done.
+        weight_rows: as in `compress_parts`.
+    """
+    pieces = [replace(piece, unloaded=None) for piece in _cut_into_blocks(logs, builder)]
+    parts = compress_parts(pieces, builder, progress=progress, weight_rows=weight_rows)
+    if not any(extra.what == "offset" and extra.contact is not None for extra in builder.extras):
+        return parts
+    return [*parts, *compress_unloaded(logs, builder)]
+
+
+def _cut_into_blocks(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
+    """The logs in blocks of about equal length, some `BLOCKS` in all; fewer where samples or memory are short."""
+    independent = sum(len(log) / log.oversampling for log in logs)
+    states = len({(log.source, state) for log in logs for state, _ in chunks_by_state(log)})
+    count = min(BLOCKS, int(independent / _LEAST_PER_BLOCK), _most_factors(states, builder))
+    count = ranks.as_first(count, "blocks")
+    total, out = sum(map(len, logs)), []
+    for log in logs:
+        spans = block_spans(len(log), max(1, round(count * len(log) / max(total, 1))))
+        for number, (start, stop) in enumerate(spans):
+            out.append(replace(log if len(spans) == 1 else log[start:stop], block=number))
+    return out
+
+
 def _compress_chunks(
     builder: RowBuilder,
     chunks: Iterator[tuple[Samples, ContactState]],
@@ -117,8 +158,10 @@ def _compress_chunks(
     workspace = Workspace()
 
     def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
-        key = (samples.source, state, samples.fold, unloaded) if by_log else ("", state, 0, False)
-        return parts.setdefault(key, Part(*key[:2], TriangularFactor(builder.width), 0, *key[2:]))
+        own = samples.source, state, samples.fold, samples.block, unloaded
+        key = own if by_log else ("", state, 0, 0, False)
+        source, at, fold, block, in_the_air = key
+        return parts.setdefault(key, Part(source, at, TriangularFactor(builder.width), 0, fold, block, in_the_air))
 
     for samples, state in chunks:
         if loaded:
@@ -149,7 +192,7 @@ def _merge_parts(of_workers: Iterable[list[Part]]) -> list[Part]:
     """The parts of all workers, those of one log, contact state and fold merged."""
     total: dict[_Key, Part] = {}
     for part in chain.from_iterable(of_workers):
-        same = total.setdefault((part.source, part.state, part.fold, part.unloaded), part)
+        same = total.setdefault((part.source, part.state, part.fold, part.block, part.unloaded), part)
         if same is not part:
             same.samples += part.samples
             same.gated |= part.gated
@@ -246,9 +289,13 @@ def fold_count(independent: float, states: int, builder: RowBuilder) -> int:
         states: number of contact states, counted log by log.
         builder: of the rows.
     """
-    size = 8 * (builder.width + 1) ** 2 * max(states, 1) * worker_count(builder.device)
-    count = max(1, min(FOLDS, int(independent / LEAST_PER_FOLD), _MEMORY // size))
+    count = max(1, min(FOLDS, int(independent / LEAST_PER_FOLD), _most_factors(states, builder)))
     return ranks.as_first(count, "folds")
+
+
+def _most_factors(states: int, builder: RowBuilder) -> int:
+    """Number of factors of each of some contact states that there is memory for."""
+    return _MEMORY // (8 * (builder.width + 1) ** 2 * max(states, 1) * worker_count(builder.device))
 
 
 def lay_out_folds(
@@ -287,6 +334,14 @@ def merge_states(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
 def merge_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
     """Parts with the folds of each log and contact state merged; offset equations of unloaded sensors stay apart."""
     return merge_by_key(parts, [(part.source, part.state, part.unloaded) for part in parts], builder)
+
+
+def merge_blocks_of_folds(parts: Sequence[Part], builder: RowBuilder) -> list[Part]:
+    """Parts with the blocks of each log, contact state and fold merged."""
+    if not any(part.block for part in parts):
+        return list(parts)
+    keys = [(part.source, part.state, part.fold, part.unloaded) for part in parts]
+    return [replace(part, block=0) for part in merge_by_key(parts, keys, builder)]
 
 
 @one_thread()

@@ -64,6 +64,13 @@ class Assembly:
         remaining = np.concatenate([phi, *of_all])
         return [x.inverse @ (x.z - x.C @ (remaining if x.log else phi)) for x in self.eliminations]
 
+    def extras_sensitivity(self) -> list[Array]:
+        """Change of the eliminated unknowns per unit of phi, (M, 12 L) for each elimination."""
+        count = len(self.problem.nominal)
+        of_all = [-x.inverse @ x.C for x in self.eliminations if not x.log]
+        through = np.concatenate([np.eye(count), *of_all])
+        return [-x.inverse @ x.C @ (through if x.log else np.eye(count)) for x in self.eliminations]
+
 
 @one_thread()
 def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction: bool = True) -> Assembly:

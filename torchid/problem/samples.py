@@ -48,6 +48,7 @@ class Samples:
         direction: (N, n), what Coulomb friction goes with, as `Log.joint_direction`; None for the sign of the velocity.
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
+        block: number of the block in which they are compressed, see `compress_in_blocks`.
     """
 
     source: str
@@ -66,6 +67,7 @@ class Samples:
     direction: Tensor | None = None
     folder: Path | None = None
     fold: int = 0
+    block: int = 0
 
     def __len__(self) -> int:
         return len(self.time)

@@ -1,0 +1,204 @@
+"""How far an estimate moves without each block of the logs: standard errors that need residuals not be noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from torchid.estimators.least_squares import residual_std
+from torchid.identifiability.confounding import ParameterCovariance, mass_weights
+from torchid.parameters import PER_BODY, Array
+from torchid.problem import RowBuilder
+from torchid.problem.chunks import one_thread
+from torchid.problem.compression import Part
+from torchid.problem.elimination import Assembly
+
+LEAST_BLOCKS = 8
+"""With fewer blocks their scatter says too little."""
+
+_LEVERAGE = 0.95  # of the information that a block has on a combination, at most: it alone cannot say how it scatters
+_NORMAL = float(stats.norm.ppf(0.975))
+
+
+@dataclass(frozen=True)
+class BlockScatter:
+    """What parameters scatter by from block to block of the logs, as standard errors.
+
+    Blocks of successive samples are longer than whatever correlates the residuals of neighbouring ones: noise that a
+    filter has smeared, but also what the model lacks, such as friction. Left out one by one, they say how much of such
+    residuals ends up in the estimate; standard errors by the size of the residuals count them as noise instead.
+
+    Source: delete-a-group jackknife (Shao, Wu, Annals of Statistics 17, 1989), which for least squares is the
+    cluster-robust covariance CR3 (Bell, McCaffrey, Survey Methodology 28, 2002), with quantiles of Student's t.
+
+    Attributes:
+        blocks: their number G.
+        deviations: (G, 12 L), whose norm over the blocks is the standard error of the parameters; 1.96 times it is half
+            of a 95 % interval.
+        without_ridge: (G, 12 L), the same of the estimate without regularization.
+        extras: the same of the extra parameters, (G, M) for each elimination, without regularization.
+        lack_of_fit: variance of the blocks' part of the residuals over what it is if residuals are independent noise: 1
+            if the model explains the forces, more if residuals are alike within a block.
+    """
+
+    blocks: int
+    deviations: Array
+    without_ridge: Array
+    extras: tuple[Array, ...]
+    lack_of_fit: float
+
+    @property
+    def error(self) -> Array:
+        """Standard errors of the parameters, (12 L,)."""
+        return np.asarray(np.linalg.norm(self.deviations, axis=0))
+
+    def error_along(self, weights: Array) -> float:
+        """Standard error of a combination `weights @ phi`, (12 L,), without regularization."""
+        return float(np.linalg.norm(self.without_ridge @ weights))
+
+    @property
+    def mass_error(self) -> float:
+        """Standard error of the total mass [kg], without regularization."""
+        return self.error_along(mass_weights(self.without_ridge.shape[1] // PER_BODY))
+
+
+@one_thread()
+def block_scatter(
+    parts: Sequence[Part], builder: RowBuilder, assembly: Assembly, ridge: float, rank_tolerance: float
+) -> BlockScatter | None:
+    """The scatter of an estimate between the blocks of its logs; None if these are too few.
+
+    Args:
+        parts: of the fit, from `compress_in_blocks`.
+        builder: of their rows.
+        assembly: of these parts.
+        ridge: of the estimate.
+        rank_tolerance: as in `LeastSquares`.
+    """
+    keys = list(dict.fromkeys(_key(part) for part in parts if not part.unloaded))
+    if len(keys) < LEAST_BLOCKS:
+        return None
+    problem = assembly.problem
+    covariance = ParameterCovariance.of(problem, rank_tolerance)
+    basis = np.zeros((len(problem.nominal), covariance.root.shape[1]))  # of unit variance by the rows alone
+    basis[problem.free] = covariance.scale[:, None] * covariance.root
+    best = problem.nominal + basis @ (basis.T @ (problem.A.T @ (problem.b - problem.A @ problem.nominal)))
+    gradients, shares = _by_block(parts, keys, builder, assembly, best, basis)
+    scores = gradients["bodies"] @ basis
+    noise = (
+        problem.oversampling * residual_std(problem.cost(best), problem.rows, basis.shape[1], problem.oversampling) ** 2
+    )
+    expected = noise * (np.trace(shares, axis1=1, axis2=2) - np.square(shares).sum((1, 2))).sum()
+    factor = np.sqrt((len(keys) - 1) / len(keys)) * stats.t.ppf(0.975, len(keys) - 1) / _NORMAL
+    without_ridge = factor * _left_out(scores, shares) @ basis.T
+    with_ridge = without_ridge
+    if ridge > 0.0:
+        values = covariance.values[: basis.shape[1]]
+        shrunk = values / np.sqrt(values**2 + ridge * problem.rows)
+        with_ridge = factor * _left_out(scores * shrunk, shares * np.outer(shrunk, shrunk)) * shrunk @ basis.T
+    return BlockScatter(
+        blocks=len(keys),
+        deviations=with_ridge,
+        without_ridge=without_ridge,
+        extras=_of_extras(gradients, without_ridge, assembly, factor),
+        lack_of_fit=float(np.square(scores).sum() / expected) if expected > 0.0 else 1.0,
+    )
+
+
+def _key(part: Part) -> tuple[str, int, int]:
+    return part.source, part.fold, part.block
+
+
+def _left_out(scores: Array, shares: Array) -> Array:
+    """Change of the estimate by each block, (G, r), where it is left out."""
+    identity = np.eye(scores.shape[1])
+    return np.array(
+        [np.linalg.solve(identity - _LEVERAGE * share, score) for score, share in zip(scores, shares, strict=True)]
+    )
+
+
+def _by_block(
+    parts: Sequence[Part],
+    keys: Sequence[tuple[str, int, int]],
+    builder: RowBuilder,
+    assembly: Assembly,
+    phi: Array,
+    basis: Array,
+) -> tuple[dict[str, Array], Array]:
+    """Gradients of half the squared residuals of each block, (G, columns), and its share of the information, (G, r, r).
+
+    Gradients are by "bodies", all parameters with the extra ones at their best, and by the log of each elimination, its
+    extra parameters with those of single logs at their best.
+    """
+    maps = {source: _Columns.of(builder, assembly, source, phi) for source, _, _ in keys}
+    gradients = {name: np.zeros((len(keys), width)) for name, width in _widths(assembly).items()}
+    shares = np.zeros((len(keys), basis.shape[1], basis.shape[1]))
+    for part in parts:
+        if part.unloaded:
+            continue
+        number, columns = keys.index(_key(part)), maps[part.source]
+        along = columns.by_phi @ basis
+        for support, block in part.factor.blocks.items():
+            rows, at = block.cpu().double().numpy(), list(support)
+            residual = rows[:, -1] - rows[:, :-1] @ columns.values[at]
+            gradient = rows[:, :-1].T @ residual
+            gradients["bodies"][number] += columns.by_phi[at].T @ gradient
+            for log, by_extras in columns.by_extras.items():
+                gradients[_name(log)][number] += by_extras[at].T @ gradient
+            projected = rows[:, :-1] @ along[at]
+            shares[number] += projected.T @ projected
+    return gradients, shares
+
+
+def _name(log: str) -> str:
+    return f"extras of {log}"
+
+
+def _widths(assembly: Assembly) -> dict[str, int]:
+    return {"bodies": len(assembly.problem.nominal)} | {
+        _name(one.log): len(one.extras) for one in assembly.eliminations
+    }
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Parameters in the columns of a log's rows, (width,), and how they depend on those that a fit has.
+
+    `by_phi`, (width, 12 L), with the extra parameters at their best; `by_extras`: (width, M) by the log of an
+    elimination, "" for that of all logs, with the unknowns of single logs at their best.
+    """
+
+    values: Array
+    by_phi: Array
+    by_extras: dict[str, Array]
+
+    @classmethod
+    def of(cls, builder: RowBuilder, assembly: Assembly, source: str, phi: Array) -> _Columns:
+        own = {one.log: number for number, one in enumerate(assembly.eliminations) if one.log in ("", source)}
+        values, by_phi = np.zeros(builder.width), np.zeros((builder.width, len(phi)))
+        count = builder.columns.count
+        values[:count], by_phi[:count] = builder.columns.parameter_map @ phi, builder.columns.parameter_map
+        at_best, sensitivities = assembly.extras_at(phi), assembly.extras_sensitivity()
+        by_extras: dict[str, Array] = {}
+        for log, number in sorted(own.items()):  # that of all logs comes first
+            elimination = assembly.eliminations[number]
+            places = [count + builder.extras.index(extra) for extra in elimination.extras]
+            values[places], by_phi[places] = at_best[number], sensitivities[number]
+            by_extras[log] = np.zeros((builder.width, len(places)))
+            by_extras[log][places, range(len(places))] = 1.0
+            if log and "" in own:
+                by_extras[""][places] = -elimination.inverse @ elimination.C[:, len(phi) :]
+        return cls(values, by_phi, by_extras)
+
+
+def _of_extras(gradients: dict[str, Array], bodies: Array, assembly: Assembly, factor: float) -> tuple[Array, ...]:
+    """Deviations of the extra parameters of each elimination, (G, M), from those of the bodies', (G, 12 L)."""
+    out: dict[str, Array] = {}
+    for one in sorted(assembly.eliminations, key=lambda elimination: elimination.log):  # that of all logs comes first
+        moved = np.hstack([bodies, out[""]]) if one.log and "" in out else bodies
+        direct = factor * gradients[_name(one.log)] @ one.inverse @ one.inverse.T
+        out[one.log] = direct - moved @ (one.inverse @ one.C[:, : moved.shape[1]]).T
+    return tuple(out[one.log] for one in assembly.eliminations)
