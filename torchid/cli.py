@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torchid.commands import Identification
     from torchid.commands.analyze import ScenarioAnalysis
     from torchid.fitting.cross_validation import CrossValidation
+    from torchid.fitting.misfit import Misfit
     from torchid.fitting.noise import NoiseSummary
     from torchid.identifiability.confounding import TotalMass
     from torchid.problem.metrics import WorseThanNominal
@@ -146,6 +147,8 @@ def _identify(options: argparse.Namespace) -> None:
     estimate, robot = run.estimate, run.experiment.robot
     if run.worse:
         _print_headline(run.worse)
+    if not run.misfit.explained:
+        _print_misfit(run.misfit)
     print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
     if 0 < run.evaluated["train"] < run.samples:
         print(f"train         errors of forces of {run.evaluated['train']} of {run.samples} samples, evenly spaced")
@@ -179,6 +182,14 @@ def _print_headline(worse: list[WorseThanNominal]) -> None:
         print(fill(line, 100, subsequent_indent="  "))
 
 
+def _print_misfit(misfit: Misfit) -> None:
+    print(fill(f"NOT EXPLAINED: the model does not explain these forces: {misfit}", 100, subsequent_indent="  "))
+    if misfit.error_growth is not None and misfit.error_growth > 1.0:
+        advice = "look for friction, compliance or contacts that the model lacks, and for wrong sensors (torchid check)"
+        growth = f"standard errors are {misfit.error_growth:.2g} times (median) what noise alone would make of them"
+        print(fill(f"  {growth}; {advice}", 100, subsequent_indent="  "))
+
+
 def _print_noise(noise: NoiseSummary) -> None:
     from torchid.report.tables import noise_advice, noise_table, print_tables
 
@@ -195,7 +206,9 @@ def _print_fit(run: Identification) -> None:
     estimate, robot = run.estimate, run.experiment.robot
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
-    print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise")
+    expected = run.misfit.expected
+    rest = "" if expected is None else f"; {expected:.3g} are left by noise alone"
+    print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise{rest}")
     if run.validation is not None:
         _print_validation(run.validation)
     if run.ridge is not None:

@@ -28,6 +28,7 @@ from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.fleet import read_fleet
+from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
@@ -192,6 +193,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             estimate=estimate,
             extras=fit.extras,
             noise=ready.noise,
+            misfit=misfit(estimate, ready.noise, fit.scatter),
             robust=robust,
             states=ready.states,
             by_state=alone,

@@ -19,6 +19,7 @@ from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
+from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary
 from torchid.identifiability.base_parameters import StateReport
@@ -59,6 +60,7 @@ class Identification:
         estimate: the fit.
         extras: offsets, scales and actuator terms.
         noise: that rows were weighed with.
+        misfit: what the fit leaves of the forces, and what noise would leave.
         robust: how outliers were weighed down, if so.
         states: contact states of the training logs.
         by_state: what each of them determines on its own.
@@ -80,6 +82,7 @@ class Identification:
     estimate: Estimate
     extras: list[ExtraEstimate]
     noise: NoiseSummary
+    misfit: Misfit
     robust: RobustSummary | None
     states: list[StateReport]
     by_state: dict[str, Estimate]
@@ -197,6 +200,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         **({"factors": [_factor_entry(one) for one in run.factors]} if run.factors else {}),
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
+        "misfit": _misfit_document(run.misfit),
         "total_mass": run.mass.value if run.mass.determined else None,
         "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
         "total_mass_told_from_offsets": run.mass.separable,
@@ -213,6 +217,17 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "contact_states": run.state_entries(),
         "identifiability": _identifiability_document(run),
         "seconds": run.seconds,
+    }
+
+
+def _misfit_document(misfit: Misfit) -> dict[str, object]:
+    """What the fit leaves of the forces."""
+    return {
+        "explained": misfit.explained,
+        "message": str(misfit),
+        "expected_residual_std": misfit.expected,
+        "lack_of_fit": misfit.lack_of_fit,
+        "standard_error_growth": misfit.error_growth,
     }
 
 

@@ -1,0 +1,87 @@
+"""Whether the model explains the forces of the training logs, or leaves more than the sensors' noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchid.estimators import Estimate
+from torchid.fitting.noise import GroupNoise, NoiseSummary
+from torchid.identifiability.block_scatter import BlockScatter
+
+_MUCH = 1.5  # times the residual that noise leaves; stated noise is seldom known better
+_ALIKE = 2.0  # times the blocks' part of the residuals if these were noise, which alone gives 0.8 to 1.3
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """What a fit leaves of the forces, and what noise alone would leave.
+
+    Attributes:
+        residual: standard deviation of the whitened residuals.
+        expected: the same if the stated noise and the filter were all there is; None where no noise is stated, as
+            residuals say what noise there is.
+        lack_of_fit: as `BlockScatter` has it, None where blocks are too few.
+        error_growth: median over the identified parameters of the standard error by the scatter between blocks over
+            that by noise, None likewise.
+        groups: of readings and base rows that exceed their noise most.
+    """
+
+    residual: float
+    expected: float | None
+    lack_of_fit: float | None
+    error_growth: float | None
+    groups: tuple[GroupNoise, ...]
+
+    @property
+    def explained(self) -> bool:
+        """Whether noise may be all that the model leaves."""
+        much = self.expected is not None and self.residual > _MUCH * self.expected
+        return not much and (self.lack_of_fit is None or self.lack_of_fit <= _ALIKE)
+
+    def __str__(self) -> str:
+        """In words, "" where the model explains the forces."""
+        if self.explained:
+            return ""
+        reasons = []
+        if self.expected is not None and self.residual > _MUCH * self.expected:
+            reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
+        if self.lack_of_fit is not None and self.lack_of_fit > _ALIKE:
+            reasons.append(
+                f"residuals of neighbouring samples are alike, {self.lack_of_fit:.2g} times as much as noise"
+            )
+        share = self.expected or 1.0
+        shown = [
+            f"{one.group} {one.residual:.2g} {one.unit} where {share * one.used:.2g} are expected"
+            for one in self.groups
+            if one.residual is not None
+        ]
+        where = f"; most in {', '.join(shown[:_NAMED])}" if shown else ""
+        return f"{' and '.join(reasons)}{where}"
+
+
+def misfit(estimate: Estimate, noise: NoiseSummary, scatter: BlockScatter | None) -> Misfit:
+    """What a fit leaves of the forces.
+
+    Args:
+        estimate: of the training logs.
+        noise: that rows were weighed with.
+        scatter: of the estimate between blocks of these logs.
+    """
+    share = float(1.0 / np.sqrt(estimate.oversampling))
+    stated = any(one.origin == "stated" for one in noise.groups)
+    expected = share if stated else None
+    excess = {one.group: (one.residual or 0.0) / ((expected or 1.0) * one.used) for one in noise.groups}
+    beyond = [one for one in noise.groups if excess[one.group] > _MUCH and (one.origin == "stated" or not stated)]
+    growth = None
+    if estimate.block_error is not None and (known := estimate.verdict == "identified").any():
+        growth = float(np.median(estimate.block_error[known] / np.maximum(estimate.noise_error[known], 1e-300)))
+    return Misfit(
+        residual=estimate.residual_std,
+        expected=expected,
+        lack_of_fit=None if scatter is None else scatter.lack_of_fit,
+        error_growth=growth,
+        groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
+    )
