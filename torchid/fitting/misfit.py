@@ -49,9 +49,7 @@ class Misfit:
         if self.expected is not None and self.residual > _MUCH * self.expected:
             reasons.append(f"residuals are {self.residual / self.expected:.2g} times what the stated noise leaves")
         if self.lack_of_fit is not None and self.lack_of_fit > _ALIKE:
-            reasons.append(
-                f"residuals of neighbouring samples are alike, {self.lack_of_fit:.2g} times as much as noise"
-            )
+            reasons.append(f"neighbouring residuals agree {self.lack_of_fit:.2g} times as much as those of noise")
         share = self.expected or 1.0
         shown = [
             f"{one.group} {one.residual:.2g} {one.unit} where {share * one.used:.2g} are expected"
