@@ -59,6 +59,8 @@ def parameters_document(
 def _by_body(robot: Robot, estimate: Estimate, **columns: np.ndarray) -> list[dict[str, Any]]:
     """Columns (12 L,) and the statistics of the estimate, by body and parameter."""
     columns |= {name: getattr(estimate, name) for name in ("standard_error", "identifiable", "data_share", "verdict")}
+    if estimate.block_error is not None:  # else the standard error is that by noise
+        columns |= {"noise_error": estimate.noise_error, "block_error": estimate.block_error}
     per_body = {name: x.reshape(-1, PER_BODY) for name, x in columns.items()}
     return [
         {"name": name} | {column: _by_name(values[body]) for column, values in per_body.items()}
@@ -82,6 +84,8 @@ def _extra_entry(estimate: ExtraEstimate) -> dict[str, Any]:
         "value": estimate.value,
         "nominal_value": estimate.nominal_value,
         "standard_error": _json_value(estimate.standard_error),
+        "noise_error": _json_value(estimate.noise_error),
+        "block_error": _json_value(estimate.block_error),
         "inflation": _json_value(estimate.inflation),
         "told_apart": estimate.separable,
         "mixed_with": list(estimate.confounded_with),
