@@ -9,7 +9,7 @@ MuJoCo simulates a robot with other masses, centres of mass and inertias than it
 its joints, which sways, crawls and trots. Signals are exact (positions, rates and forces of one instant), sampled
 (exact positions, torques, forces and IMU at 500 Hz, rates derived by the preprocessing), or noisy (encoders 1e-3 rad,
 gyroscope 0.01 rad/s, accelerometer 0.05 m/s^2, torques 0.3 N m). Errors of base parameters are given as shares of the
-URDF's errors, their median over all combinations; those of forces are for a second log that no fit has seen. Needs MuJoCo
+URDF's errors, their median over all combinations, those of forces for a second log that no fit has seen. Needs MuJoCo
 and the package example-robot-data (extra `[oracle]`).
 """
 

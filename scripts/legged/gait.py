@@ -51,8 +51,8 @@ class Steps:
     ) -> Steps:
         """Swings of groups of feet in turn, to places around where the feet stood at first."""
         swings: list[tuple[float, float, tuple[int, ...]]] = []
-        start, turn = _START, int(rng.integers(len(groups)))
-        while start < seconds - 2.0 * legged.swing:
+        start, turn = _START, int(rng.integers(max(len(groups), 1)))
+        while groups and start < seconds - 2.0 * legged.swing:
             feet = groups[(len(swings) + turn) % len(groups)]
             length = legged.swing if legged.holds(feet) else legged.hop
             swings.append((start, length, feet))
@@ -81,7 +81,8 @@ class Steps:
 
     def support(self, time: Array) -> Array:
         """Horizontal path (N, 2) [m] from one middle of the feet that stand to the next, at rest while others swing."""
-        knots, places = [0.0], [self.home[:, :2].mean(axis=0)]
+        middle = self.home[:, :2].mean(axis=0)
+        knots, places = [-1.0, 0.0], [middle, middle]
         for start, seconds, feet in self.swings:
             place, _ = self.feet(np.array([start + 0.5 * seconds]))
             knots += [start, start + seconds]
