@@ -34,10 +34,8 @@ def measure(robot: str, situation: Situation, repetitions: int, seconds: float, 
     """Coverage of one robot in one situation."""
     bar = bars.add_task(f"{robot}: {situation.name}", total=repetitions)
     start = time.process_time()
-    for tally in Repetitions(robot, situation, seconds).run(repetitions):
-        bars.advance(bar)
+    found = summarize(Repetitions(robot, situation, seconds).run(repetitions, lambda: bars.advance(bar)))
     bars.remove_task(bar)
-    found = summarize(tally)
     return {"robot": robot, "situation": situation.name, "seconds": time.process_time() - start, **found}
 
 

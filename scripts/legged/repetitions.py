@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
+
 from legged.errors import structural_base
 from legged.gait import Reference
 from legged.recording import Noise, record
 from legged.robots import ROBOTS, TrueRobot
 from legged.simulate import Exact, prescribed, simulated
-
 from torchid.commands.plausibility import _unexplained
 from torchid.errors import TorchidWarning
 from torchid.estimators import LeastSquares
@@ -153,15 +153,16 @@ class Repetitions:
         friction = self.situation.friction
         return LogFitter(robot=self.true.robot, builder=builder, estimator=LeastSquares(), friction=friction)
 
-    def run(self, count: int) -> Iterator[Tally]:
-        """The tally after each repetition, up to so many."""
+    def run(self, count: int, done: Callable[[], object] = lambda: None) -> Tally:
+        """So many of them; `done` is called after each."""
         truth = structural_base(self.true.legged).reduce(self.true.phi.flatten())
         tally = Tally(truth, float(self.true.phi[:, MASS].sum()))
         for number in range(count):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TorchidWarning)
                 self._add(tally, self._fit(self._samples(np.random.default_rng([number, 17]))))
-            yield tally
+            done()
+        return tally
 
     def _samples(self, rng: np.random.Generator) -> Samples:
         situation, exact = self.situation, self.exact
