@@ -222,12 +222,13 @@ def summarize(tally: Tally) -> Mapping[str, float]:
     """Coverage and sizes of intervals; shares are of 1.
 
     `average`, `worst`: coverage of combinations; `ratio`: median over them of standard error over scatter; `bias`:
-    median of their mean error in scatters; `parameters`, `mass`: coverage of single parameters and of the total mass.
+    median of their mean error in scatters; `parameters`, `mass`: coverage of single parameters and of the total mass,
+    NaN where the fit does not determine it.
     """
     estimates, errors, mass = np.array(tally.estimates), np.array(tally.errors), np.array(tally.mass)
     called = np.isfinite(errors).all(axis=0)
     estimates, errors, off = estimates[:, called], errors[:, called], (estimates - tally.truth)[:, called]
-    holds = np.abs(off) <= NORMAL * errors
+    holds, known = np.abs(off) <= NORMAL * errors, bool(np.isfinite(mass[:, 1]).all())
     scatter = estimates.std(axis=0, ddof=1) if len(estimates) > 1 else np.full(errors.shape[1], np.nan)
     single = np.array(tally.parameters, dtype=float)
     by_parameter = single[:, np.isfinite(single).any(axis=0)]
@@ -239,7 +240,7 @@ def summarize(tally: Tally) -> Mapping[str, float]:
         "ratio": float(np.median(errors.mean(axis=0) / scatter)),
         "bias": float(np.median(np.abs(off.mean(axis=0)) / scatter)),
         "parameters": float(np.nanmean(by_parameter)) if by_parameter.size else float("nan"),
-        "mass": float(np.mean(np.abs(mass[:, 0] - tally.true_mass) <= NORMAL * mass[:, 1])),
+        "mass": float(np.mean(np.abs(mass[:, 0] - tally.true_mass) <= NORMAL * mass[:, 1])) if known else float("nan"),
         "mass_error": float(mass[:, 1].mean()),
         "mass_off": float(np.sqrt(np.mean((mass[:, 0] - tally.true_mass) ** 2))),
         "residual": float(np.mean(tally.residual)),

@@ -25,8 +25,8 @@ FRICTION_WIDTH = 0.02  # rad/s: Coulomb friction of the truth is fc tanh(v / wid
 _EXAMPLES = Path("cmeel.prefix/share/example-robot-data/robots")
 _DEMO = Path(torchid.__file__).parent / "demo"
 _GRIP = (1.5, 0.0, 0.0)  # sliding friction; a sphere or a corner of a sole neither resists turning nor rolling
-_FLOOR = (0.002, 1.0)  # time constant [s] and damping ratio of the contacts
-_STIFF = (0.999, 0.9999, 1e-4, 0.5, 2.0)  # impedance: standing feet sink by less than a micrometre
+_FLOOR = (0.004, 1.0)  # time constant [s] and damping ratio of the contacts
+_STIFF = (0.98, 0.998, 1e-4, 0.5, 2.0)  # impedance; a harder floor lets standing feet jump from step to step
 _SLIP_RATIO = 20.0  # friction's stiffness over the normal one's: soft friction creeps
 
 

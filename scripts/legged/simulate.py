@@ -146,7 +146,7 @@ def _gather(origins: Array, feet: list[int], points: Array, force: Array) -> tup
         wrench[foot] += np.concatenate([one, np.cross(lever, one)])
         arm[foot] += abs(one[2]) * lever
         weight[foot] += abs(one[2])
-    return wrench, arm / np.maximum(weight, 1e-12)[:, None]
+    return wrench, arm / np.where(weight > 0.0, weight, 1.0)[:, None]
 
 
 class _Recorder:
