@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.linalg import solve_banded
 from scipy.spatial.transform import Rotation
 
-from legged.robots import Legged, TrueRobot
+from legged.robots import Legged, TrueRobot, sphere_radius
 from torchid.parameters import Array
 
 _KNOTS_HZ = 50.0
@@ -186,8 +186,9 @@ class _Legs:
         """Feet (F, 3), centre of mass (3,) and height of the base [m], of a posture with the spheres on the ground."""
         self._place(np.zeros(6), posture)
         feet = np.array([self._centre(index, place) for index, place, _ in self._feet])
-        height = self._true.radius - float(feet[:, 2].mean())
-        feet[:, 2] = self._true.radius
+        radius = sphere_radius(self._true.legged)
+        height = radius - float(feet[:, 2].mean())
+        feet[:, 2] = radius
         return feet, self._data.subtree_com[1] + [0.0, 0.0, height], height
 
     def reach(self, base: Array, joints: Array, targets: Array) -> tuple[Array, Array]:

@@ -92,7 +92,7 @@ class Legged:
 
 
 def sphere_radius(legged: Legged) -> float:
-    """Of the spheres that touch the ground [m]; a point is a small one."""
+    """Of the spheres that touch the ground in MuJoCo [m], which has no points."""
     return max(legged.radius, 1e-4)
 
 
@@ -189,11 +189,6 @@ class TrueRobot:
     def strength(self) -> Array:
         """Size of the joints' actuators (n,), 1 of most."""
         return _strength(self.model)
-
-    @property
-    def radius(self) -> float:
-        """Of the spheres that touch the ground [m]."""
-        return sphere_radius(self.legged)
 
     def origins(self, data: Any) -> Array:
         """Where the feet's frames are in a state of MuJoCo, (F, 3) [m]."""

@@ -117,7 +117,7 @@ def _inverse_dynamics(true: TrueRobot, motion: Motion) -> _Forces:
     data, spheres = mujoco.MjData(model), list(true.foot_of_geom.items())
     feet, nv = [foot for _, foot in spheres], model.nv
     bodies = [int(model.geom_bodyid[geom]) for geom, _ in spheres]
-    down = np.array([0.0, 0.0, true.radius])
+    down = np.array([0.0, 0.0, true.legged.radius])
     count = len(motion.time)
     torque, wrench = np.zeros((count, nv - 6)), np.zeros((count, len(true.legged.feet), 6))
     arm, missed = np.zeros((count, len(true.legged.feet), 3)), 0.0

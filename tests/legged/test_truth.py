@@ -22,7 +22,7 @@ from torchid.problem import Evaluation, ExtraTerms, bind_log
 from torchid.problem.predict import force_series
 from torchid.sensing import Contact
 
-SECONDS = 2.0
+SECONDS = 1.6
 INSTALLED = pytest.mark.skipif(
     not (GO2.available and G1.available), reason="the package example-robot-data is not installed"
 )
