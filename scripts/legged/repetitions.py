@@ -1,0 +1,248 @@
+"""The same motion recorded again and again: do the intervals of what is identified hold the truth?"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+
+import numpy as np
+
+from legged.errors import structural_base
+from legged.gait import Reference
+from legged.recording import Noise, record
+from legged.robots import ROBOTS, TrueRobot
+from legged.simulate import Exact, prescribed, simulated
+from torchid.commands.plausibility import _unexplained
+from torchid.errors import TorchidWarning
+from torchid.estimators import LeastSquares
+from torchid.estimators.least_squares import IDENTIFIED
+from torchid.fitting.fit import Fit, LogFitter
+from torchid.fitting.noise import estimate_noise
+from torchid.fitting.robust import RobustLoss, fit_robustly
+from torchid.identifiability.confounding import ParameterCovariance, total_mass
+from torchid.logs import Log
+from torchid.logs.preprocess import preprocess
+from torchid.parameters import FRICTION, MASS, PER_BODY, Array
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
+from torchid.problem.compression import split_into_folds
+from torchid.rounding import UNOBSERVABLE_SHARE
+from torchid.sensing import SensorNoise, named_sensors
+
+NORMAL = 1.959964
+_SPARSE = 5  # of exact signals every so many samples are fitted: 100 Hz
+_CUTOFF, _RATE = 20.0, 100.0  # Hz
+_OFFSET = 0.5  # N m, standard deviation
+_OUTLIERS, _OUTLYING = 0.01, 20.0  # share of the readings, and by how much their noise is larger
+
+
+@dataclass(frozen=True)
+class Situation:
+    """How a motion is recorded and what is fitted.
+
+    Attributes:
+        name: for tables.
+        filtered: positions, orientation and IMU are recorded and filtered; else exact rates of the same instants are.
+        motion: noise of positions, orientation and IMU, in usual ones.
+        walked: in MuJoCo, with impacts; else feet take their load within a tenth of a second.
+        steps, coulomb: whether feet are lifted, and joints have Coulomb friction.
+        offsets, outliers, robust, friction: unknown torque offsets; one reading in a hundred is far off; Huber's loss;
+            whether friction is fitted.
+        level: of friction, times the usual.
+    """
+
+    name: str
+    filtered: bool = False
+    motion: float = 0.0
+    walked: bool = False
+    steps: bool = True
+    coulomb: bool = True
+    offsets: bool = False
+    outliers: bool = False
+    robust: bool = False
+    friction: bool = True
+    level: float = 1.0
+
+
+SITUATIONS = (
+    Situation("torque noise"),
+    Situation("filtered, smooth", filtered=True, steps=False, coulomb=False),
+    Situation("motion noise, smooth", filtered=True, motion=1.0, steps=False, coulomb=False),
+    Situation("filtered, switches, Coulomb", filtered=True),
+    Situation("motion noise, switches, Coulomb", filtered=True, motion=1.0),
+    Situation("walked in MuJoCo, motion noise", filtered=True, motion=1.0, walked=True),
+    Situation("unknown offsets", offsets=True),
+    Situation("outliers, robust loss", outliers=True, robust=True),
+    Situation("friction not fitted, x 0.3", filtered=True, friction=False, level=0.3),
+    Situation("friction not fitted, x 1", filtered=True, friction=False),
+    Situation("friction not fitted, x 3", filtered=True, friction=False, level=3.0),
+)
+
+
+def truth(robot: str, situation: Situation, seconds: float) -> tuple[TrueRobot, Exact]:
+    """The true robot and what happened to it; point feet."""
+    true = TrueRobot.unlike_its_urdf(replace(ROBOTS[robot], radius=0.0))
+    phi = true.phi.copy()
+    phi[:, FRICTION] *= situation.level
+    phi[:, FRICTION.start] *= situation.coulomb
+    true = replace(true, phi=phi)
+    if situation.walked:
+        return true, simulated(true, Reference(true, seconds, seed=1), seconds)
+    exact = _without_friction(robot, situation.steps, seconds)
+    velocity, torque = exact.log.joint_velocity, exact.log.joint_torque
+    assert velocity is not None
+    assert torque is not None
+    friction = true.friction[:, 0] * np.sign(velocity) + true.friction[:, 1] * velocity
+    return true, replace(exact, log=replace(exact.log, joint_torque=torque + friction))
+
+
+@cache
+def _without_friction(robot: str, steps: bool, seconds: float) -> Exact:
+    """A prescribed motion of a robot without friction, with or without steps."""
+    true = TrueRobot.unlike_its_urdf(replace(ROBOTS[robot], radius=0.0))
+    phi = true.phi.copy()
+    phi[:, FRICTION] = 0.0
+    legged = true.legged if steps else replace(true.legged, lifted=())
+    true = replace(true, phi=phi, legged=legged)
+    return prescribed(true, Reference(true, seconds, seed=1, static=True), seconds)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What the repetitions have found.
+
+    Attributes:
+        estimates, errors: of combinations called identified, and their standard errors, (R, K), NaN if not called so.
+        truth: (K,).
+        mass: total mass and its standard error, (R, 2) [kg]; `true_mass`.
+        parameters: whether intervals of single parameters hold the truth, by repetition.
+        residual: standard deviation of whitened residuals, (R,).
+        misfit: whether torchid says that the model does not explain the forces, (R,).
+    """
+
+    truth: Array
+    true_mass: float
+    estimates: list[Array] = field(default_factory=list)
+    errors: list[Array] = field(default_factory=list)
+    mass: list[tuple[float, float]] = field(default_factory=list)
+    parameters: list[np.ndarray] = field(default_factory=list)
+    residual: list[float] = field(default_factory=list)
+    misfit: list[bool] = field(default_factory=list)
+
+
+class Repetitions:
+    """Fits of one motion with new noise each time."""
+
+    def __init__(self, robot: str, situation: Situation, seconds: float) -> None:
+        """Simulate it once."""
+        self.situation = situation
+        self.true, self.exact = truth(robot, situation, seconds)
+        self.contacts = self.true.legged.contacts(rolling=False)
+        self.noise = Noise().times(situation.motion, 1.0)
+        n, stated = self.true.robot.n, SensorNoise(joint_torque=self.noise.joint_torque)
+        sensors = named_sensors("joints", n, len(self.contacts), stated)
+        terms = ExtraTerms(armature=True, offsets={"joint_torque": "log"} if situation.offsets else {})
+        builder = RowBuilder(self.true.robot, self.contacts, sensors, terms)
+        fitter = self._fitter(builder)
+        weights = estimate_noise([self._samples(np.random.default_rng(0))], fitter).noise  # as identify does by default
+        builder = RowBuilder(self.true.robot, self.contacts, replace(sensors, noise=weights), terms)
+        self.fitter = self._fitter(builder)
+
+    def _fitter(self, builder: RowBuilder) -> LogFitter:
+        friction = self.situation.friction
+        return LogFitter(robot=self.true.robot, builder=builder, estimator=LeastSquares(), friction=friction)
+
+    def run(self, count: int, done: Callable[[], object] = lambda: None) -> Tally:
+        """So many of them; `done` is called after each."""
+        truth = structural_base(self.true.legged).reduce(self.true.phi.flatten())
+        tally = Tally(truth, float(self.true.phi[:, MASS].sum()))
+        for number in range(count):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", TorchidWarning)
+                self._add(tally, self._fit(self._samples(np.random.default_rng([number, 17]))))
+            done()
+        return tally
+
+    def _samples(self, rng: np.random.Generator) -> Samples:
+        situation, exact = self.situation, self.exact
+        log = self._recorded(rng) if situation.filtered else exact.log.select(slice(None, None, _SPARSE))
+        if not situation.filtered:
+            assert log.joint_torque is not None
+            deviation = self.noise.joint_torque * rng.normal(size=log.joint_torque.shape)
+            if situation.outliers:
+                deviation *= np.where(rng.uniform(size=deviation.shape) < _OUTLIERS, _OUTLYING, 1.0)
+            if situation.offsets:
+                deviation += _OFFSET * np.random.default_rng(23).normal(size=deviation.shape[1])
+            log = replace(log, joint_torque=log.joint_torque + deviation)
+        return bind_log(log, self.true.robot, self.contacts)
+
+    def _recorded(self, rng: np.random.Generator) -> Log:
+        return preprocess(record(self.exact, self.true.robot.base_link, self.noise, rng), _CUTOFF, _RATE)
+
+    def _fit(self, samples: Samples) -> Fit:
+        logs = split_into_folds([samples], self.fitter.builder)
+        if self.situation.robust:
+            return fit_robustly(logs, self.fitter, RobustLoss.named("huber")).fit
+        return self.fitter.fit(compress_parts(logs, self.fitter.builder))
+
+    def _add(self, tally: Tally, fit: Fit) -> None:
+        base, estimate = structural_base(self.true.legged), fit.estimate
+        mass = total_mass(fit.assembly, estimate)
+        known = estimate.verdict == IDENTIFIED
+        off = np.abs(estimate.phi - self.true.phi.flatten()) / estimate.standard_error
+        errors = combination_errors(fit, base.combination)
+        if not self.situation.friction:
+            errors[base.kept % PER_BODY >= FRICTION.start] = np.nan
+        tally.estimates.append(base.reduce(estimate.phi))
+        tally.errors.append(errors)
+        tally.mass.append((mass.value, mass.standard_error))
+        tally.parameters.append(np.where(known, off <= NORMAL, np.nan))
+        tally.residual.append(estimate.residual_std)
+        tally.misfit.append(says_misfit(fit))
+
+
+def combination_errors(fit: Fit, combinations: Array) -> Array:
+    """Standard errors of combinations (K, 12 L) of parameters, as `combination_standard_error`; NaN if undetermined."""
+    problem, estimate = fit.assembly.problem, fit.estimate
+    covariance = ParameterCovariance.of(problem, LeastSquares().rank_tolerance)
+    along = covariance.scale_sensitivity(combinations)
+    size = np.maximum(np.linalg.norm(along, axis=1), np.finfo(float).tiny)
+    lost = np.linalg.norm(along @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
+    noise = np.sqrt(problem.oversampling) * estimate.residual_std
+    return np.where(lost, np.nan, noise * np.linalg.norm(along @ covariance.root, axis=1))
+
+
+def says_misfit(fit: Fit) -> bool:
+    """Whether torchid warns that no model explains the forces."""
+    return _unexplained(fit) is not None
+
+
+def summarize(tally: Tally) -> Mapping[str, float]:
+    """Coverage and sizes of intervals; shares are of 1.
+
+    `average`, `worst`: coverage of combinations; `ratio`: median over them of standard error over scatter; `bias`:
+    median of their mean error in scatters; `parameters`, `mass`: coverage of single parameters and of the total mass,
+    NaN where the fit does not determine it.
+    """
+    estimates, errors, mass = np.array(tally.estimates), np.array(tally.errors), np.array(tally.mass)
+    called = np.isfinite(errors).all(axis=0)
+    estimates, errors, off = estimates[:, called], errors[:, called], (estimates - tally.truth)[:, called]
+    holds, known = np.abs(off) <= NORMAL * errors, bool(np.isfinite(mass[:, 1]).all())
+    scatter = estimates.std(axis=0, ddof=1) if len(estimates) > 1 else np.full(errors.shape[1], np.nan)
+    single = np.array(tally.parameters, dtype=float)
+    by_parameter = single[:, np.isfinite(single).any(axis=0)]
+    return {
+        "repetitions": len(errors),
+        "combinations": int(called.sum()),
+        "average": float(holds.mean()),
+        "worst": float(holds.mean(axis=0).min()),
+        "ratio": float(np.median(errors.mean(axis=0) / scatter)),
+        "bias": float(np.median(np.abs(off.mean(axis=0)) / scatter)),
+        "parameters": float(np.nanmean(by_parameter)) if by_parameter.size else float("nan"),
+        "mass": float(np.mean(np.abs(mass[:, 0] - tally.true_mass) <= NORMAL * mass[:, 1])) if known else float("nan"),
+        "mass_error": float(mass[:, 1].mean()),
+        "mass_off": float(np.sqrt(np.mean((mass[:, 0] - tally.true_mass) ** 2))),
+        "residual": float(np.mean(tally.residual)),
+        "misfit": float(np.mean(tally.misfit)),
+    }

@@ -1,0 +1,158 @@
+"""Coverage is counted rightly: tallies with known answers, and standard errors that are torchid's own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from legged import repetitions
+from legged.errors import structural_base
+from legged.repetitions import (
+    NORMAL,
+    SITUATIONS,
+    Repetitions,
+    Tally,
+    combination_errors,
+    summarize,
+)
+from legged.robots import GO2, QUADRUPED
+from script_calls import call
+from synthetic import Array
+
+from torchid.identifiability.confounding import combination_standard_error
+from torchid.parameters import FRICTION, PER_BODY
+
+SITUATION = {one.name: one for one in SITUATIONS}
+SECONDS, COUNT = 3.0, 3
+
+
+@pytest.fixture(scope="module")
+def exact() -> Repetitions:
+    """Torques without noise."""
+    quiet = Repetitions("quadruped", SITUATION["torque noise"], SECONDS)
+    quiet.noise = replace(quiet.noise, joint_torque=0.0)
+    return quiet
+
+
+def drawn(rng: np.random.Generator, count: int, stated: float = 1.0) -> Tally:
+    """Estimates with noise of 1 whose standard errors are as stated."""
+    tally = Tally(np.arange(5.0), 20.0)
+    for _ in range(count):
+        tally.estimates.append(np.arange(5.0) + rng.normal(size=5))
+        tally.errors.append(np.array([stated, stated, stated, stated, np.nan]))
+        tally.mass.append((20.0 + 0.5 * rng.normal(), 0.5))
+        tally.parameters.append(np.array([1.0, np.nan]))
+        tally.residual.append(1.0)
+        tally.misfit.append(False)
+    return tally
+
+
+def test_honest_intervals_hold_the_truth_in_95_of_100_cases() -> None:
+    found = summarize(drawn(np.random.default_rng(0), 4000))
+    assert found["combinations"] == 4, "what is not determined does not count"
+    assert found["average"] == pytest.approx(0.95, abs=0.006)
+    assert 0.935 < found["worst"] <= found["average"]
+    assert found["ratio"] == pytest.approx(1.0, abs=0.03)
+    assert found["bias"] < 0.03
+    assert found["mass"] == pytest.approx(0.95, abs=0.012)
+    assert found["parameters"] == 1.0
+
+
+def test_intervals_of_half_the_size_hold_it_in_67() -> None:
+    found = summarize(drawn(np.random.default_rng(1), 4000, stated=0.5))
+    assert found["average"] == pytest.approx(0.673, abs=0.012)
+    assert found["ratio"] == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_bias_is_seen_and_makes_the_worst_combination_worse() -> None:
+    tally = drawn(np.random.default_rng(2), 2000)
+    tally.truth[1] += 3.0
+    found = summarize(tally)
+    assert found["worst"] == pytest.approx(0.149, abs=0.03)
+    assert found["average"] == pytest.approx((3 * 0.95 + 0.149) / 4, abs=0.02)
+
+
+def test_a_mass_that_is_not_determined_has_no_coverage() -> None:
+    tally = drawn(np.random.default_rng(3), 2)
+    tally.mass[0] = (20.0, np.inf)
+    assert np.isnan(summarize(tally)["mass"])
+
+
+def test_without_noise_the_truth_is_found(exact: Repetitions) -> None:
+    tally = exact.run(1)
+    base = structural_base(exact.true.legged)
+    scale = np.abs(tally.truth).max()
+    assert np.isfinite(tally.errors[0]).sum() > 80
+    known = np.isfinite(tally.errors[0])
+    assert np.abs(tally.estimates[0] - tally.truth)[known].max() < 1e-6 * scale
+    assert len(base.kept) == len(tally.truth)
+    if np.isfinite(tally.mass[0][1]):
+        assert tally.mass[0][0] == pytest.approx(tally.true_mass, abs=1e-5)
+
+
+def test_errors_of_combinations_are_those_of_torchid(exact: Repetitions) -> None:
+    fit = exact._fit(exact._samples(np.random.default_rng(0)))
+    base = structural_base(exact.true.legged)
+    found = combination_errors(fit, base.combination)
+    for number in range(0, len(found), 17):
+        expected = combination_standard_error(fit.assembly.problem, fit.estimate, base.combination[number])
+        assert np.isnan(found[number]) == np.isinf(expected)
+        if np.isfinite(expected):
+            assert found[number] == pytest.approx(expected, rel=1e-9)
+
+
+def test_each_repetition_has_its_own_noise_and_the_same_motion() -> None:
+    again = Repetitions("quadruped", SITUATION["torque noise"], SECONDS)
+    first, second = (again._samples(np.random.default_rng([number, 17])) for number in range(2))
+    assert (first.joint_position == second.joint_position).all()
+    difference: Array = (first.torque - second.torque).numpy()  # type: ignore[operator]
+    assert difference.std() == pytest.approx(0.3 * np.sqrt(2.0), rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["filtered, switches, Coulomb", "unknown offsets", "friction not fitted, x 3"])
+def test_situations_are_what_their_names_say(name: str) -> None:
+    situation = SITUATION[name]
+    one = Repetitions("quadruped", situation, SECONDS)
+    samples = one._samples(np.random.default_rng(0))
+    assert (samples.oversampling > 1.0) == situation.filtered
+    assert not samples.active.all()
+    usual = repetitions.truth("quadruped", SITUATION["torque noise"], SECONDS)[0]
+    np.testing.assert_allclose(one.true.friction, situation.level * usual.friction)
+    tally = one.run(1)
+    friction = structural_base(one.true.legged).kept % PER_BODY >= FRICTION.start
+    assert np.isnan(tally.errors[0][friction]).all() == (not situation.friction)
+    assert len(one.fitter.builder.extras) == (24 if situation.offsets else 12)
+
+
+def test_normal_intervals_have_95_per_cent() -> None:
+    draws = np.random.default_rng(4).normal(size=10**6)
+    assert (np.abs(draws) <= NORMAL).mean() == pytest.approx(0.95, abs=1e-3)
+
+
+def test_scripts_refuse_what_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    status, _, err = call("interval_coverage", "--situations", "torque nose")
+    assert status == 2
+    assert "torque noise" in err
+    monkeypatch.setattr(type(GO2), "available", property(lambda self: self == QUADRUPED))
+    for script in ("interval_coverage", "legged_accuracy"):
+        status, _, err = call(script, "--robots", "Go2")
+        assert status == 2
+        assert "example-robot-data" in err
+
+
+@pytest.mark.slow
+def test_coverage_of_white_torque_noise_is_right_and_that_of_switches_is_too_low() -> None:
+    situations = ("torque noise", "filtered, switches, Coulomb")
+    status, out, err = call("interval_coverage", "--quick", "--robots", "quadruped", "--situations", *situations)
+    assert status == 0, err
+    assert "coverage of 95 % intervals" in out
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not GO2.available, reason="the package example-robot-data is not installed")
+def test_the_accuracy_of_go2_is_measured() -> None:
+    status, out, err = call("legged_accuracy", "--quick", "--robots", "Go2", "--sensors", "joints")
+    assert status == 0, err
+    assert "ball feet, as points" in out
+    assert "refused" not in out
