@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torchid.errors import InputError, LogError, about_file, warn
 from torchid.logs.log import (
     NAN_ALLOWED,
+    NORMALS,
     WRENCHES,
     BoolArray,
     FloatArray,
@@ -124,11 +125,26 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
         if timeline.low_pass is not None or timeline.output is not None:
             share = log.contact_active if log.contact_share is None else log.contact_share
             fields["contact_share"] = timeline.evaluate(timeline.smooth(share.astype(np.float64)), (0,))[0]
+    if log.contact_normal_world is not None:
+        fields[NORMALS] = timeline.hold(nearest_known(log.contact_normal_world))
     if (readings := unloaded_readings(log)) is not None:
         fields["contact_unloaded"] = timeline.hold(readings)
     if timeline.bandwidth_hz is not None:
         fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
     return fields
+
+
+def nearest_known(normals: FloatArray) -> FloatArray:
+    """Normals (N, C, 3), where NaN those of the nearest sample in which they are known: filters widen contacts."""
+    out = normals.copy()
+    known, every = np.asarray(np.isfinite(normals).all(axis=2)), np.arange(len(normals))
+    for contact in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)):
+        samples = np.flatnonzero(known[:, contact])
+        after = np.searchsorted(samples, every).clip(0, len(samples) - 1)
+        before = (after - 1).clip(0)
+        nearer_before = np.abs(every - samples[before]) < np.abs(samples[after] - every)
+        out[:, contact] = normals[samples[np.where(nearer_before, before, after)], contact]
+    return out
 
 
 def lacks_derivatives(log: Log) -> bool:

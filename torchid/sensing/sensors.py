@@ -22,22 +22,42 @@ class Contact:
 
     `kind`: "point" exerts three force components; "flat" all six; "line" all but the moment about the line, which runs
     along the frame's `line_axis`.
+
+    With a `radius` [m] a point is a sphere about the frame's origin c that rolls on the ground, a line a cylinder about
+    `line_axis`: the ground acts at c - radius n, n being `normal`, (3,), a unit vector in the world that points away
+    from the ground (of a cylinder its part across the axis). Readings are wrenches at c all the same; of a line's
+    force, the part along the axis then counts as acting at c, since moments across the axis are free.
     """
 
     frame: str
     kind: str
     line_axis: str = "y"
+    radius: float = 0.0
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Validate kind and line axis.
+        """Validate all, and give the normal unit length.
 
         Raises:
-            SensorError: an unknown kind or line axis.
+            SensorError: an unknown kind or line axis, a radius that is negative or a flat contact's, a normal of no
+                length.
         """
         if self.kind not in CONTACT_TYPES:
             raise SensorError(f"contact '{self.frame}'", "type", f"'{self.kind}'", ", ".join(CONTACT_TYPES))
         if self.line_axis not in ("x", "y", "z"):
             raise SensorError(f"contact '{self.frame}'", "line_axis", f"'{self.line_axis}'", "x, y, z")
+        if not 0.0 <= self.radius < np.inf:
+            raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g}", "a number of at least 0 [m]")
+        if self.radius and self.kind == "flat":
+            accepted = "type point (a sphere) or line (a cylinder), or radius 0"
+            raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g} of a flat contact", accepted)
+        length = float(np.linalg.norm(self.normal))
+        if len(self.normal) != 3 or not 0.0 < length < np.inf:
+            found = f"[{', '.join(f'{x:g}' for x in self.normal)}]"
+            raise SensorError(f"contact '{self.frame}'", "normal", found, "three numbers, not all 0, in the world")
+        if length != 1.0:
+            x, y, z = (float(component) / length for component in self.normal)
+            object.__setattr__(self, "normal", (x, y, z))
 
     @property
     def components(self) -> tuple[int, ...]:
