@@ -179,6 +179,11 @@ def _print_headline(worse: list[WorseThanNominal]) -> None:
         print(fill(line, 100, subsequent_indent="  "))
 
 
+def _print_rolling(rolling: str) -> None:
+    if rolling:
+        print(fill(f"rolling       {rolling}", 100, subsequent_indent=" " * 14))
+
+
 def _print_noise(noise: NoiseSummary) -> None:
     from torchid.report.tables import noise_advice, noise_table, print_tables
 
@@ -193,6 +198,7 @@ def _print_fit(run: Identification) -> None:
     from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, SgdEstimate
 
     estimate, robot = run.estimate, run.experiment.robot
+    _print_rolling(run.experiment.rolling)
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
     print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise")
@@ -247,6 +253,7 @@ def _compress(options: argparse.Namespace) -> None:
     print_tables(state_table([asdict(state) for state in done.states]))
     _print_noise(done.noise)
     print_tables(compression_table([asdict(file) for file in done.files]))
+    _print_rolling(done.rolling)
     print(f"written to    {done.output}")
 
 
@@ -268,6 +275,7 @@ def _analyze(options: argparse.Namespace) -> None:
         from torchid.report.tables import print_tables
 
     analysis = analyze(load_analysis(options.file, options.overrides))
+    _print_rolling(analysis.scene.rolling)
     for scenario in analysis.scenarios:
         _print_scenario(scenario)
     if analysis.accuracies:
@@ -318,6 +326,8 @@ def _check(options: argparse.Namespace) -> int:
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
     write_check_outputs(checked, options.json, options.figure)
+    if checked:
+        _print_rolling(checked[0].rolling)
     for log in checked:
         print(log_heading(log))
         if log.findings:

@@ -17,7 +17,7 @@ from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import BodyStates
-from torchid.regressor.regressor import JointRow, joint_rows, rolling_arms, wrench_transform
+from torchid.regressor.regressor import JointRow, contact_arms, joint_rows, rolling_arms, wrench_transform
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
@@ -239,10 +239,8 @@ class ContactStateLayouts:
                 normal = normals[:, index].T
             if rotation_world_base is not None:
                 normal = (normal.T[:, None] @ rotation_world_base)[:, 0].T
-            axis = None
-            if contact.kind == "line":
-                axis = self.frame_rotation(index)[:, "xyz".index(contact.line_axis)] @ states.rotation[:, :, body]
-            arms[index] = rolling_arms(contact.radius, normal, axis)
+            axes, axis = self.frame_rotation(index), contact.rolling_axis
+            arms[index] = contact_arms(states, body, axes, contact.radius, normal, axis)
         return arms
 
     def clear(self) -> None:

@@ -216,6 +216,23 @@ def wrench_transform(T: Array) -> Array:
     return np.block([[R, np.zeros((3, 3))], [np.cross(np.eye(3), p) @ R, R]])
 
 
+def contact_arms(
+    states: BodyStates, body: int, axes: Tensor, radius: float, normal: Tensor, axis: str | None
+) -> Tensor:
+    """`rolling_arms` of a frame on a body in base axes.
+
+    Args:
+        states: of the joint frames.
+        body: the node that carries the frame.
+        axes: of the frame, (3, 3), in the node's joint frame, as columns.
+        radius: [m].
+        normal: of the ground, (3, B), in base axes.
+        axis: x, y or z of the frame, along which a cylinder is; None for a sphere.
+    """
+    along = None if axis is None else axes[:, "xyz".index(axis)] @ states.rotation[:, :, body]
+    return rolling_arms(radius, normal, along)
+
+
 class FrameJacobian(nn.Module):
     """Jacobian of a URDF frame: `J(q) v` is the twist of its origin in its own axes, linear velocity first.
 
@@ -243,7 +260,7 @@ class FrameJacobian(nn.Module):
         unit_wrenches = wrench_transform(T_joint_frame).T
         self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
         self._joints = range(robot.n_dofs)
-        self.radius, self.axis = radius, None if axis is None else "xyz".index(axis)
+        self.radius, self.axis = radius, axis
 
     def forward(self, q: Tensor, normal: Tensor | None = None) -> Tensor:
         """Jacobian at coordinates.
@@ -267,8 +284,7 @@ class FrameJacobian(nn.Module):
             up = up.expand(len(q), 3)
             if tree.base_rows:
                 up = (rotation_matrix(q[:, 3:7]).mT @ up[..., None])[..., 0]
-            axis = None if self.axis is None else units[self.axis, :3] @ states.rotation[:, :, self._body]
-            arms = rolling_arms(self.radius, up.T, axis)
+            arms = contact_arms(states, self._body, units[:3, :3].T, self.radius, up.T, self.axis)
         wrenches = wrenches_at_base(states, self._body, units, arms)
         J = generalized_forces(tree, joint_screw_axes(tree, states), self._body, wrenches, self._joints)
         return J.permute(2, 0, 1)

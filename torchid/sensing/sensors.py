@@ -16,6 +16,14 @@ _FORCES, _MOMENTS = (0, 1, 2), (3, 4, 5)
 CONTACT_TYPES = ("point", "line", "flat")
 
 
+UP = (0.0, 0.0, 1.0)
+
+
+def join_numbers(numbers: Iterable[float]) -> str:
+    """Numbers as a list of a settings file."""
+    return f"[{', '.join(f'{x:g}' for x in numbers)}]"
+
+
 @dataclass(frozen=True)
 class Contact:
     """A contact at a URDF frame.
@@ -33,7 +41,7 @@ class Contact:
     kind: str
     line_axis: str = "y"
     radius: float = 0.0
-    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    normal: tuple[float, float, float] = UP
 
     def __post_init__(self) -> None:
         """Validate all, and give the normal unit length.
@@ -53,8 +61,9 @@ class Contact:
             raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g} of a flat contact", accepted)
         length = float(np.linalg.norm(self.normal))
         if len(self.normal) != 3 or not 0.0 < length < np.inf:
-            found = f"[{', '.join(f'{x:g}' for x in self.normal)}]"
-            raise SensorError(f"contact '{self.frame}'", "normal", found, "three numbers, not all 0, in the world")
+            raise SensorError(
+                f"contact '{self.frame}'", "normal", join_numbers(self.normal), "three numbers, not all 0, in the world"
+            )
         if length != 1.0:
             x, y, z = (float(component) / length for component in self.normal)
             object.__setattr__(self, "normal", (x, y, z))
@@ -67,6 +76,11 @@ class Contact:
         if self.kind == "flat":
             return _FORCES + _MOMENTS
         return _FORCES + tuple(m for m in _MOMENTS if m != _MOMENTS["xyz".index(self.line_axis)])
+
+    @property
+    def rolling_axis(self) -> str | None:
+        """Axis of the frame about which a line rolls; None for a point, whose sphere has none."""
+        return self.line_axis if self.kind == "line" else None
 
     @property
     def component_names(self) -> tuple[str, ...]:
