@@ -18,6 +18,26 @@ _MAX_OFFSET_M, _MAX_OFFSET_SHARE = 1e-3, 0.1
 _MAX_ANGLE = 0.02  # rad, between a cylinder and the axis of its contact
 
 
+def rolled_distance(rotation: Array, radius: float, normal: Array, axis: str | None = None) -> Array:
+    """How far the origin of a frame goes that rolls without slipping, (N, 3) [m], from the first sample on.
+
+    Args:
+        rotation: of the frame to the world, (N, 3, 3).
+        radius: of the sphere or cylinder about its origin [m].
+        normal: of the ground, (3,) or (N, 3).
+        axis: x, y or z of the frame, along which a cylinder is; None for a sphere.
+    """
+    normals = np.broadcast_to(normal, (len(rotation), 3))
+    if axis is not None:
+        along = rotation[:, :, "xyz".index(axis)]
+        across = normals - along * (along * normals).sum(axis=1, keepdims=True)
+        normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
+    turned = Rotation.from_matrix(rotation[1:] @ rotation[:-1].transpose(0, 2, 1)).as_rotvec()
+    steps = radius * np.cross(turned, 0.5 * (normals[1:] + normals[:-1]))
+    out: Array = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    return out
+
+
 @dataclass(frozen=True)
 class RollingShape:
     """A collision shape about a frame's origin: a "sphere" or "cylinder", its radius [m], and the link that has it."""
