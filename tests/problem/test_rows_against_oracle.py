@@ -25,6 +25,7 @@ from welded import CONTACTS, SENSORS, machine
 from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.chunks import chunks_by_state
+from torchid.problem.predict import force_series
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
@@ -308,6 +309,16 @@ def test_rows_are_white_combinations_of_pinocchios_equations_that_no_unmeasured_
     assert_close(rows[..., :-1] @ phi, rows[..., -1], np.abs(rows[..., -1]).max(initial=1.0))
     again, _ = rows_of(r, builder, recorded_as(r, with_wild_unmeasured_forces(r, chosen)))
     assert_close(again, rows, size)
+
+
+@pytest.mark.parametrize("name", [name for name, machine in MACHINES.items() if any(c.radius for c in machine[2])])
+def test_forces_measured_where_contacts_roll_are_those_that_the_true_parameters_predict(name: str) -> None:
+    r = recorded(name)
+    builder = row_builder(name, "full")
+    for log in (r.log, in_world(r.oracle, r.log)):
+        phi = true_parameters(r.oracle, r.robot).flatten()
+        measured, (predicted,) = force_series(builder, bind_log(log, r.robot, r.contacts), phi[None])
+        assert_close(predicted, measured, np.abs(measured).max())
 
 
 @pytest.mark.parametrize("sensors", SETS)

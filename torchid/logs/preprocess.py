@@ -126,7 +126,8 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
             share = log.contact_active if log.contact_share is None else log.contact_share
             fields["contact_share"] = timeline.evaluate(timeline.smooth(share.astype(np.float64)), (0,))[0]
     if log.contact_normal_world is not None:
-        fields[NORMALS] = timeline.hold(nearest_known(log.contact_normal_world))
+        normals = timeline.hold(nearest_known(log.contact_normal_world))
+        fields[NORMALS] = np.where(fields["contact_active"][..., None], normals, np.nan)
     if (readings := unloaded_readings(log)) is not None:
         fields["contact_unloaded"] = timeline.hold(readings)
     if timeline.bandwidth_hz is not None:
