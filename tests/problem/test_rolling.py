@@ -156,9 +156,8 @@ def test_a_normal_that_is_none_is_refused_by_name(tmp_path: Path, change: Any, f
     assert found in message
     if "finite" not in found:
         changed = replace(preprocess(log), contact_normal_world=normals[2:-2], contact_active=active[2:-2])
-        assert found in refused(
-            lambda: bind_log(changed, load(ANYMAL), BALLS), "walk.npz: contact_normal_world", LogError
-        )
+        message = refused(lambda: bind_log(changed, load(ANYMAL), BALLS), "walk.npz: contact_normal_world", LogError)
+        assert found.replace("sample 3", "sample 1") in message
 
 
 def test_normals_need_flags_of_contacts(tmp_path: Path) -> None:
