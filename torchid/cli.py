@@ -349,11 +349,12 @@ def _convert(options: argparse.Namespace) -> None:
 
 def _simulate(options: argparse.Namespace) -> None:
     with interrupts_deferred():
-        from torchid.commands.simulate import simulate
+        from torchid.commands.simulate import simulate, simulated_balls
         from torchid.config import load_simulation
         from torchid.report.tables import print_tables, stability_table
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)
+    _print_rolling(simulated_balls(config))
     print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
     print(f"written to    {config.output}")

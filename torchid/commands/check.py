@@ -26,7 +26,7 @@ from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, n
 from torchid.report.figures import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
-from torchid.robot import load_robot
+from torchid.robot import CollisionShapes, load_robot
 
 EXPERIMENTS = (".yaml", ".yml")
 FIGURES = (".png", ".pdf", ".svg")
@@ -110,7 +110,8 @@ def check_log(
     with about_file(log.source):
         for name in log.contact_names:
             robot.link(name, "contact_names")
-    settings = [_contact(log, index) for index in range(len(log.contact_names))]
+    shapes = CollisionShapes(robot)
+    settings = [_contact(log, index, shapes) for index in range(len(log.contact_names))]
     if log.base_quat_xyzw is None and not fixed_base:  # which way the ground's normal points is not known
         settings = [replace(contact, radius=0.0) for contact in settings]
     contacts, rolling = resolve_contacts(settings, robot)
@@ -164,11 +165,13 @@ def _require_memory(path: Path, settings: PreprocessingConfig) -> None:
         raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
 
 
-def _contact(log: Log, index: int) -> ContactConfig:
-    """A contact of a log without an experiment file: a point if forces without any moment were measured."""
-    wrench = log.contact_wrench
+def _contact(log: Log, index: int, shapes: CollisionShapes) -> ContactConfig:
+    """A contact of a log without an experiment file: a point if it is a ball or has forces without any moment."""
+    wrench, name = log.contact_wrench, log.contact_names[index]
+    if shapes.about(name) is not None:
+        return ContactConfig(name, "point")
     force, moment = (False, True) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
-    return ContactConfig(log.contact_names[index], "point" if force and not moment else "flat")
+    return ContactConfig(name, "point" if force and not moment else "flat")
 
 
 def check_outputs(

@@ -234,7 +234,8 @@ def _radius_findings(log: Log, robot: Robot, contacts: Sequence[Contact], slip: 
     points = [c for c in contacts if c.kind == "point" and c.frame in log.contact_names and c.frame in robot.links]
     if slip < MIN_ROLLING_SHARE or not points:
         return
-    unit = {c.frame: c.radius if any(p.radius for p in points) else _TRIAL_RADIUS_M for c in points}
+    usual = max(c.radius for c in points) or _TRIAL_RADIUS_M
+    unit = {c.frame: c.radius or usual for c in points}
 
     def squared_slip(factor: float) -> float:
         trial = [replace(c, radius=factor * unit[c.frame]) if c.frame in unit else c for c in contacts]
