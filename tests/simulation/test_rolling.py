@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +14,16 @@ from simulated import QUADRUPED, feet_of, quadruped
 from synthetic import Array, load
 
 from torchid import parameters
-from torchid.config import FootConfig, MotionConfig
+from torchid.cli import main
+from torchid.config import FootConfig, MotionConfig, load_config
 from torchid.config.sensors import ContactConfig
 from torchid.config.simulation import SimulatedRobotConfig, WaveConfig
 from torchid.estimators import LeastSquares
 from torchid.fitting.contacts import resolve_contacts
+from torchid.fitting.experiment import set_up
 from torchid.log_checks.contacts import check_standing_feet
 from torchid.log_checks.findings import Finding
-from torchid.logs import Log
+from torchid.logs import Log, write_log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.robot import Robot
 from torchid.robot.rolling import rolled_distance
@@ -126,6 +129,21 @@ def test_the_radius_is_found_in_the_urdf(on_balls: OnBalls) -> None:
     )
     assert {contact.radius for contact in contacts} == {RADIUS}
     assert text == f"{', '.join(on_balls.log.contact_names)}: radius 0.03 m (collision sphere)"
+
+
+def test_commands_say_what_rolls_and_settings_have_the_number(
+    on_balls: OnBalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_log(on_balls.log, tmp_path / "sway.npz")
+    feet = "".join(f"\n- {{frame: {frame}, type: point}}" for frame in on_balls.log.contact_names)
+    text = f"robot: {{urdf: {on_balls.robot.path}}}\nlogs: {{train: [sway.npz]}}\nsensors: joints\noutput: run\n"
+    (tmp_path / "run.yaml").write_text(f"{text}contacts:{feet}")
+    config = set_up(load_config(tmp_path / "run.yaml")).config
+    assert [contact.radius for contact in config.contacts] == [RADIUS] * 4
+    for arguments in ([tmp_path / "run.yaml"], [tmp_path / "sway.npz", "--urdf", on_balls.robot.path]):
+        assert main(["check", *map(str, arguments)]) == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        assert f"rolling {', '.join(on_balls.log.contact_names)}: radius 0.03 m (collision sphere)" in printed
 
 
 @pytest.mark.parametrize("stated", [0.0, 0.01, 0.05])

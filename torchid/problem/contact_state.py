@@ -151,6 +151,7 @@ class ContactStateLayouts:
         self.rolling = tuple(index for index, contact in enumerate(contacts) if contact.radius)
         self._cache: dict[tuple[ContactState, bool], ContactStateLayout] = {}
         self._rotations: dict[int, Tensor] = {}
+        self._normals: dict[int, Tensor] = {}
 
     def layout(self, state: ContactState, recorded_normals: bool = False) -> ContactStateLayout:
         """The layout of a contact state, cached.
@@ -234,7 +235,7 @@ class ContactStateLayouts:
         for index in self.rolling:
             contact, body = self.contacts[index], self.frames[index][0]
             if normals is None:
-                normal = states.position.new_tensor(contact.normal)[:, None].expand(3, states.position.shape[-1])
+                normal = self._normal(index)[:, None].expand(3, states.position.shape[-1])
             else:
                 normal = normals[:, index].T
             if rotation_world_base is not None:
@@ -243,10 +244,17 @@ class ContactStateLayouts:
             arms[index] = contact_arms(states, body, axes, contact.radius, normal, axis)
         return arms
 
+    def _normal(self, contact: int) -> Tensor:
+        """Stated normal of a contact, (3,), cached."""
+        if contact not in self._normals:
+            self._normals[contact] = self._tensor(np.array(self.contacts[contact].normal))
+        return self._normals[contact]
+
     def clear(self) -> None:
         """Drop all layouts, when the robot's constants move to another device or precision."""
         self._cache.clear()
         self._rotations.clear()
+        self._normals.clear()
 
     def _contact_body(
         self, body: int, contacts: list[int], coupled: tuple[int, ...], recorded_normals: bool
