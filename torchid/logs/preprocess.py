@@ -24,7 +24,7 @@ from torchid.logs.log import (
     describe_element,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline
+from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
 DERIVATIVE_CHAINS = (
@@ -133,19 +133,6 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
     if timeline.bandwidth_hz is not None:
         fields["noise_bandwidth_hz"] = min(timeline.bandwidth_hz, log.noise_bandwidth_hz or np.inf)
     return fields
-
-
-def nearest_known(normals: FloatArray) -> FloatArray:
-    """Normals (N, C, 3), where NaN those of the nearest sample in which they are known: filters widen contacts."""
-    out = normals.copy()
-    known, every = np.asarray(np.isfinite(normals).all(axis=2)), np.arange(len(normals))
-    for contact in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)):
-        samples = np.flatnonzero(known[:, contact])
-        after = np.searchsorted(samples, every).clip(0, len(samples) - 1)
-        before = (after - 1).clip(0)
-        nearer_before = np.abs(every - samples[before]) < np.abs(samples[after] - every)
-        out[:, contact] = normals[samples[np.where(nearer_before, before, after)], contact]
-    return out
 
 
 def lacks_derivatives(log: Log) -> bool:

@@ -41,12 +41,12 @@ class Samples:
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
+        contact_normal: (N, C, 3), unit vectors in the world that point away from the ground; None for those that the
+            contacts state.
         share: (N, C), share of a constant contact reading that the filter leaves, as `Log.contact_share`; None if it is
             `active`.
         unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
             `Log.contact_unloaded`, on the CPU; None without such readings.
-        contact_normal: (N, C, 3), unit vectors in the world that point away from the ground; None for those that the
-            contacts state.
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
     """
@@ -62,9 +62,9 @@ class Samples:
     wrench_in_world: bool
     active: Tensor
     oversampling: float = 1.0
+    contact_normal: Tensor | None = None
     share: Tensor | None = None
     unloaded: Tensor | None = None
-    contact_normal: Tensor | None = None
     folder: Path | None = None
     fold: int = 0
 
@@ -177,9 +177,9 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         log.contact_wrench_world is not None,
         torch.from_numpy(active),
         oversampling(log.time, log.noise_bandwidth_hz),
+        normals,
         None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
         None if unloaded is None else torch.from_numpy(_columns(unloaded, chosen)),
-        normals,
     )
     if required is not None:
         _require_limb_sensors(log, robot, required)
