@@ -179,11 +179,6 @@ def _print_headline(worse: list[WorseThanNominal]) -> None:
         print(fill(line, 100, subsequent_indent="  "))
 
 
-def _print_rolling(rolling: str) -> None:
-    if rolling:
-        print(fill(f"rolling       {rolling}", 100, subsequent_indent=" " * 14))
-
-
 def _print_noise(noise: NoiseSummary) -> None:
     from torchid.report.tables import noise_advice, noise_table, print_tables
 
@@ -231,6 +226,11 @@ def _print_validation(validation: CrossValidation) -> None:
     texts = (describe_errors(group, identified.get(group), nominal.get(group)) for group in DECISIVE_GROUPS)
     text = f"held out      each of {validation.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
     print(fill(text, 100, subsequent_indent=" " * 14))
+
+
+def _print_rolling(rolling: str) -> None:
+    if rolling:
+        print(fill(f"rolling       {rolling}", 100, subsequent_indent=" " * 14))
 
 
 def _mass_text(mass: TotalMass) -> str:
