@@ -18,7 +18,7 @@ from synthetic import ANYMAL, PANDA, SOLO12, Array, load
 import torchid
 from torchid.errors import LogError, SensorError
 from torchid.logs import Log, preprocess, read_log, write_log
-from torchid.problem import RowBuilder, bind_log, compress
+from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress
 from torchid.sensing import Contact
 
 ASKEW = (0.3, -0.2, 0.8)
@@ -82,6 +82,30 @@ def test_without_a_radius_nothing_changes_to_the_last_bit(sensors: str) -> None:
         factors.append(compress([samples], builder).triangle())
     assert torch.equal(factors[0], factors[1])
     assert not torch.allclose(factors[0], factors[2])
+
+
+@pytest.mark.parametrize("world", [False, True])
+def test_offsets_of_the_readings_of_a_ball_act_where_its_force_does(world: bool) -> None:
+    robot, rng = load(ANYMAL), np.random.default_rng(3)
+    samples, _ = random_samples(robot, BALLS, 20, 0, world, states=1)
+    terms = ExtraTerms(offsets={"contact_force": "all"})
+    builder = RowBuilder(robot, BALLS, sensor_set("mixed", robot, BALLS), terms)
+    state = (True,) * 4
+    samples = replace(samples, active=torch.ones_like(samples.active))
+    assert samples.wrench is not None
+    offsets = rng.normal(size=len(builder.extras))
+    shifted = samples.wrench.clone()
+    for extra, offset in zip(builder.extras, offsets.tolist(), strict=True):
+        assert extra.contact is not None
+        shifted[:, extra.contact[0], extra.contact[1]] += offset
+    (rows, _), (moved, _) = (
+        builder.rows_by_sample(replace(samples, wrench=wrench), state) for wrench in (samples.wrench, shifted)
+    )
+    columns = rows[..., builder.columns.count : builder.width]
+    assert len(offsets) >= 5
+    torch.testing.assert_close(
+        moved[..., -1] - rows[..., -1], columns @ torch.from_numpy(offsets), rtol=0.0, atol=1e-12
+    )
 
 
 # --------------------------------------------------------------------------------------------------- logs with normals
