@@ -204,6 +204,7 @@ def _print_fit(run: Identification) -> None:
     from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, SgdEstimate
 
     estimate, robot = run.estimate, run.experiment.robot
+    _print_rolling(run.experiment.rolling)
     print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
     print(f"condition     {estimate.condition_number:.3g}")
     expected = run.misfit.expected
@@ -240,6 +241,11 @@ def _print_validation(validation: CrossValidation) -> None:
     print(fill(text, 100, subsequent_indent=" " * 14))
 
 
+def _print_rolling(rolling: str) -> None:
+    if rolling:
+        print(fill(f"rolling       {rolling}", 100, subsequent_indent=" " * 14))
+
+
 def _mass_text(mass: TotalMass) -> str:
     """The total mass with its standard error, or the reason why it is not determined."""
     if mass.determined:
@@ -260,6 +266,7 @@ def _compress(options: argparse.Namespace) -> None:
     print_tables(state_table([asdict(state) for state in done.states]))
     _print_noise(done.noise)
     print_tables(compression_table([asdict(file) for file in done.files]))
+    _print_rolling(done.rolling)
     print(f"written to    {done.output}")
 
 
@@ -281,6 +288,7 @@ def _analyze(options: argparse.Namespace) -> None:
         from torchid.report.tables import print_tables
 
     analysis = analyze(load_analysis(options.file, options.overrides))
+    _print_rolling(analysis.scene.rolling)
     for scenario in analysis.scenarios:
         _print_scenario(scenario)
     if analysis.accuracies:
@@ -331,6 +339,8 @@ def _check(options: argparse.Namespace) -> int:
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
     write_check_outputs(checked, options.json, options.figure)
+    if checked:
+        _print_rolling(checked[0].rolling)
     for log in checked:
         print(log_heading(log))
         if log.findings:
@@ -352,11 +362,12 @@ def _convert(options: argparse.Namespace) -> None:
 
 def _simulate(options: argparse.Namespace) -> None:
     with interrupts_deferred():
-        from torchid.commands.simulate import simulate
+        from torchid.commands.simulate import simulate, simulated_balls
         from torchid.config import load_simulation
         from torchid.report.tables import print_tables, stability_table
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)
+    _print_rolling(simulated_balls(config))
     print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
     print(f"written to    {config.output}")

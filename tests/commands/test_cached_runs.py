@@ -148,12 +148,14 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
         "robot.base_link=front_left_hip_link",
         "contacts.0.type=flat",
         "contacts.0={type: line, line_axis: x}",
+        "contacts.0={type: point, radius: 0.02}",
+        "contacts.0={type: point, normal: [0, 0.1, 1]}",
         "logs.topics.joint_states=/joints",
     ],
 )
 def test_robot_contacts_and_topics_change_the_name_of_samples(demo: Path, tmp_path: Path, other: str) -> None:
     assert {x.name for x in fields(RobotConfig)} == {"urdf", "base_link", "fixed_base"}
-    assert {x.name for x in fields(ContactConfig)} == {"frame", "type", "line_axis"}
+    assert {x.name for x in fields(ContactConfig)} == {"frame", "type", "line_axis", "radius", "normal"}
     document = yaml.safe_load(demo.read_text())
     key, _, value = other.partition("=")
     if key.startswith("contacts"):

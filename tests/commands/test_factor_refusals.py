@@ -53,6 +53,11 @@ REFUSED = {
          "{frame: rear_left_foot, type: point}, {frame: rear_right_foot, type: point}]"],
         "contacts: without front_left_foot (flat) and with front_left_foot (point)",
     ),
+    "radius": (
+        ["contacts=[{frame: front_left_foot, type: point, radius: 0.02}, {frame: front_right_foot, type: point}, "
+         "{frame: rear_left_foot, type: point}, {frame: rear_right_foot, type: point}]"],
+        "contacts: without front_left_foot (point, radius 0.02 m, normal 0.0, 0.0, 1.0) and with front_left_foot (poi",
+    ),
     "base": (["robot.base_link=front_left_hip_link"], "robot.base_link: trunk; accepted: front_left_hip_link"),
 }  # fmt: skip
 

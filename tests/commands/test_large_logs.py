@@ -74,6 +74,25 @@ def test_a_long_log_in_memory_is_worked_on_in_blocks_by_threads(
     assert sorted(os.listdir(tmp_path)) == ["log.npz", "run.yaml"]
 
 
+@pytest.mark.parametrize("cutoff", ["null", "20"])
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
+def test_normals_of_the_ground_come_in_blocks_too(
+    tmp_path: Path, suffix: str, cutoff: str, request: pytest.FixtureRequest
+) -> None:
+    fields = recorded(9_000)
+    normals = np.random.default_rng(0).normal(size=(9_000, 4, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    fields["contact_normal_world"] = np.where(fields["contact_active"][..., None], normals, np.nan)
+    feet = ", ".join(f"{{frame: {foot}, type: point, radius: 0.02}}" for foot in fields["contact_names"])
+    file = experiment(tmp_path, fields, suffix)
+    settings = ("sensors=joints", f"preprocessing.cutoff_hz={cutoff}", f"contacts=[{feet}]")
+    whole = samples_of(file, *settings)
+    assert whole.contact_normal is not None
+    request.getfixturevalue("small_blocks")
+    for more in ((), (SMALL,)):
+        assert_same(samples_of(file, *settings, *more), whole, 1e-10)
+
+
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
 @pytest.mark.parametrize("terms", ["{}", "{contact_force: log}"])
 def test_readings_in_the_air_are_kept_where_offsets_are_fitted(

@@ -18,7 +18,10 @@ from torchid.errors import ConfigError, InputError
 
 ALL: dict[str, Any] = {
     "robot": {"urdf": "models/robot.urdf", "base_link": "pelvis", "fixed_base": True},
-    "contacts": [{"frame": "l_sole", "type": "flat"}, {"frame": "r_sole", "type": "line", "line_axis": "x"}],
+    "contacts": [
+        {"frame": "l_sole", "type": "flat"},
+        {"frame": "r_sole", "type": "line", "line_axis": "x", "radius": 0.3, "normal": [0.0, 0.1, 1.0]},
+    ],
     "logs": {"train": ["a.npz", "/logs/b.h5"], "test": ["../c.csv"]},
     "preprocessing": {"cutoff_hz": 20, "sample_rate_hz": 200.0, "contact_margin_s": 0.05},
     "sensors": {
@@ -86,7 +89,7 @@ def test_every_key_of_the_file_arrives(file: Path) -> None:
     for name in ("contacts", "preprocessing", "sensors", "actuators", "estimator", "analysis", "device", "overwrite"):
         expected = ALL[name]
         if name == "contacts":
-            expected = [{"line_axis": "y"} | contact for contact in expected]
+            expected = [{"line_axis": "y", "radius": "auto", "normal": None} | contact for contact in expected]
         if name == "estimator":
             expected = dataclasses.asdict(EstimatorConfig()) | expected
         if name == "preprocessing":
@@ -296,6 +299,13 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
         ("logs.topics={}", "logs.topics.joint_states: missing; accepted: the name of a topic, or a mapping with topic"),
         ("estimator.symmetry={left: l}", "estimator.symmetry.right: missing; accepted: a name"),
         ("contacts=[{frame: a}]", "contacts.0.type: missing; accepted: point, line, flat"),
+        (
+            "contacts=[{frame: a, type: point, radius: big}]",
+            "contacts.0.radius: found 'big'; accepted: auto, or a numb",
+        ),
+        ("contacts=[{frame: a, type: point, radius: -0.1}]", "contacts.0.radius: found -0.1; accepted: auto, or a n"),
+        ("contacts=[{frame: a, type: point, normal: [0, 0, 0]}]", "contacts.0.normal: found a list; accepted: three"),
+        ("contacts=[{frame: a, type: point, normal: [1, 0]}]", "contacts.0.normal: found a list; accepted: three num"),
         ("estimator.symmetry={}", "symmetry.left, estimator.symmetry.right: missing; accepted: estimator.symmetry.l"),
         ("memory_gb=4", "key: unknown name 'memory_gb'; accepted: preprocessing.memory_gb"),
         ("seed=4", "key: unknown name 'seed'; accepted: estimator.training.seed, analysis.seed"),

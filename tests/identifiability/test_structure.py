@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 import torch
 from contact_states import BOTH, FEET, FLIGHT, LEFT, RIGHT, biped, bipeds
-from synthetic import G1, PANDA, SOLO12, TIAGO, UR5, Array, Oracle, load
+from synthetic import ANYMAL, G1, PANDA, SOLO12, TIAGO, UR5, Array, Oracle, load
 
 from torchid import parameters
 from torchid.identifiability.base_parameters import (
@@ -63,6 +63,49 @@ def test_active_contacts_neither_move_nor_accelerate_and_the_robot_does(case: st
     assert np.linalg.norm(v, axis=1).min() > 0.1
     assert np.linalg.norm(a, axis=1).min() > 0.1
     assert np.abs(a).max() < 1e3
+
+
+ASKEW = (0.2, -0.4, 0.9)
+ROLLING = {
+    "balls": (ANYMAL, False, [Contact(f"{leg}_FOOT", "point", radius=0.05, normal=ASKEW) for leg in ("LF", "RH")]),
+    "a rocker and a point": (
+        G1,
+        False,
+        [Contact(FEET["G1"][1], "line", "x", 0.3, ASKEW), Contact(FEET["G1"][2], "point")],
+    ),
+    "a bolted arm on a ball": (PANDA, True, [Contact("panda_hand", "point", radius=0.1, normal=ASKEW)]),
+}
+
+
+@pytest.mark.parametrize("case", ROLLING)
+def test_the_material_point_on_the_ground_neither_moves_nor_begins_to(case: str) -> None:
+    """Its velocity over a step of the motion, taken where contact is after the step: the arm turns with the ground."""
+    urdf, fixed_base, contacts = ROLLING[case]
+    robot = load(urdf, fixed_base=fixed_base)
+    states = standing_states(robot, contacts, (True,) * len(contacts), 20, np.random.default_rng(1))
+    oracle, step = Oracle.of(robot), 1e-4
+    for contact in contacts:
+        frame = oracle.model.getFrameId(contact.frame, pin.FrameType.BODY)
+        for state in zip(*(x.numpy() for x in states), strict=True):
+            q, v, a = oracle._state(*state)
+            slips, centres, turns = [], [], []
+            for dt in (-step, 0.0, step):
+                at, velocity = pin.integrate(oracle.model, q, dt * v + 0.5 * dt * dt * a), v + dt * a
+                pin.forwardKinematics(oracle.model, oracle.data, at, velocity)
+                pin.updateFramePlacements(oracle.model, oracle.data)
+                twist = pin.getFrameVelocity(oracle.model, oracle.data, frame, pin.LOCAL_WORLD_ALIGNED)
+                normal = np.array(contact.normal)
+                if contact.kind == "line":
+                    axis = oracle.data.oMf[frame].rotation[:, "xyz".index(contact.line_axis)]
+                    normal = normal - axis * (axis @ normal)
+                    normal /= np.linalg.norm(normal)
+                    turns.append(np.cross(axis, twist.angular))
+                slips.append(twist.linear - np.cross(twist.angular, contact.radius * normal))
+                centres.append(twist.linear)
+            assert np.abs(slips[1]).max() < 1e-10
+            assert np.abs(slips[2] - slips[0]).max() / (2.0 * step) < 1e-5
+            assert not contact.radius or np.abs(centres[1]).max() > 1e-6
+            assert not turns or (np.abs(turns[1]).max() < 1e-10 and np.abs(turns[2] - turns[0]).max() < 2e-9)
 
 
 def test_what_a_contact_cannot_hold_goes_on_moving() -> None:

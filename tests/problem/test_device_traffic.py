@@ -30,7 +30,8 @@ DECISION = "sensing/projection.py, _exists: _local_scalar_dense (a number)"
 CHUNK = 32
 LEGS = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
 SOLES = tuple(Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right"))
-ROBOTS = {"quadruped": (SOLO12, False, LEGS), "humanoid": (G1, False, SOLES),
+BALLS = tuple(replace(contact, radius=0.03) for contact in LEGS)
+ROBOTS = {"quadruped": (SOLO12, False, LEGS), "balls": (SOLO12, False, BALLS), "humanoid": (G1, False, SOLES),
           "bolted arm": (PANDA, True, (Contact("panda_hand", "line", "x"),)),
           "sensors in limbs": (None, False, CONTACTS)}  # fmt: skip
 TERMS = ExtraTerms(

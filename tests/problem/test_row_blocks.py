@@ -11,8 +11,7 @@ from random_samples import random_samples, sensor_set
 import torchid
 from torchid import parameters
 from torchid.problem import RowBuilder, TriangularFactor
-from torchid.problem.row_blocks import RowBlock
-from torchid.problem.rows import turn_rows
+from torchid.problem.row_blocks import RowBlock, turn_rows
 
 ROBOT = torchid.load_robot(Path(torchid.__file__).parent / "demo" / "quadruped.urdf")
 FEET = [torchid.Contact(f"{end}_{side}_foot", "point") for end in ("front", "rear") for side in ("left", "right")]
@@ -68,7 +67,7 @@ def test_the_basis_is_zero_where_blocks_say_so(sensors: str) -> None:
         builder = RowBuilder(ROBOT, FEET, sensor_set(sensors, ROBOT, FEET))
         _, W = builder.rows_by_sample(samples, state)
         layout = builder.layout(state)
-        rank = 6 + len(layout.coupled_joints) - sum(len(body.unmeasured) for body in layout.contact_bodies)
+        rank = 6 + len(layout.coupled_joints) - sum(body.count for body in layout.contact_bodies)
         W = W / W.abs().amax(dim=(0, 1))
         for block in layout.blocks.of_rank(rank):
             own = W[..., block.rows]

@@ -18,13 +18,14 @@ import torch
 from motions import value
 from recordings import GRAVITY, in_world, states_of, with_imu
 from scipy.spatial.transform import Rotation
-from synthetic import ANYMAL, DRONE, G1, PANDA, SOLO12, TALOS_FULL, Array, Oracle, load, make_log
+from synthetic import ANYMAL, DRONE, G1, PANDA, SOLO12, TALOS_FULL, TIAGO, Array, Oracle, load, make_log
 from true_robots import true_parameters
 from welded import CONTACTS, SENSORS, machine
 
 from torchid.logs import Log
 from torchid.problem import RowBuilder, bind_log, compress, linear_problem
 from torchid.problem.chunks import chunks_by_state
+from torchid.problem.predict import force_series
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 
@@ -34,6 +35,15 @@ JOINT, WRENCH, LIMB = 0.3, *(np.repeat(pair, 3) for pair in ((1.5, 0.1), (0.9, 0
 EXACT = 1e-11  # of the largest number; 1e-12 measured
 
 SOLES = tuple(Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right"))
+ASKEW = (0.3, -0.2, 0.8)
+"""A normal of the ground, not of unit length."""
+
+
+def rolling(*radii: tuple[str, float]) -> list[Contact]:
+    """Spheres about frames on ground that is not level."""
+    return [Contact(frame, "point", radius=radius, normal=ASKEW) for frame, radius in radii]
+
+
 MACHINES: dict[str, tuple[Path | None, bool, Sequence[Contact]]] = {
     "quadruped": (ANYMAL, False, [Contact(f"{leg}_FOOT", "point") for leg in ("LF", "RF", "LH", "RH")]),
     "humanoid": (G1, False, SOLES),
@@ -48,6 +58,28 @@ MACHINES: dict[str, tuple[Path | None, bool, Sequence[Contact]]] = {
     "bolted arm in free motion": (PANDA, True, []),
     "bolted humanoid": (G1, True, SOLES[:1]),
     "bolted skew tree with sensors in limbs": (None, True, CONTACTS),
+    "balls": (ANYMAL, False, rolling(("LF_FOOT", 0.03), ("RF_FOOT", 0.03), ("LH_FOOT", 0.05), ("RH_FOOT", 0.0))),
+    "balls on recorded ground": (ANYMAL, False, rolling(*((f"{leg}_FOOT", 0.04) for leg in ("LF", "RF", "LH", "RH")))),
+    "balls and rockers below sensors in limbs": (
+        None, False, [Contact("sole", "line", "x", 0.3, ASKEW), Contact("thigh", "point", radius=0.1),
+                      Contact("fin", "line", "z", 0.07)]),
+    "rockers on recorded ground": (
+        None, False, [Contact("sole", "line", "x", 0.3), Contact("fin", "line", "z", 0.07)]),
+    "welded, two equal balls on a foot": (None, False, rolling(("foot", 0.05), ("sole", 0.05), ("hand", 0.02))),
+    "welded, two balls on a foot": (None, False, rolling(("foot", 0.05), ("sole", 0.02))),
+    "welded, two equal balls on recorded ground": (None, False, rolling(("foot", 0.05), ("sole", 0.05))),
+    "welded, a ball and a point on a foot": (None, False, rolling(("foot", 0.05), ("sole", 0.0))),
+    "welded, a ball and a plate on a foot": (None, False, [*rolling(("foot", 0.05)), Contact("sole", "flat")]),
+    "welded, two rockers on a foot": (
+        None, False, [Contact("foot", "line", "x", 0.05), Contact("sole", "line", "y", 0.2, ASKEW)]),
+    "welded, a rocker and a ball on a foot": (
+        None, False, [Contact("foot", "line", "x", 0.05), *rolling(("sole", 0.2))]),
+    "three balls on a base": (
+        TIAGO, False, rolling(("base_link", 0.1), ("base_imu_link", 0.1), ("caster_front_left_1_link", 0.1))),
+    "three unequal balls on a base": (
+        TIAGO, False, rolling(("base_link", 0.1), ("base_imu_link", 0.2), ("caster_front_left_1_link", 0.0))),
+    "bolted arm on a ball": (
+        PANDA, True, [*rolling(("panda_rightfinger", 0.02)), Contact("panda_hand", "line", "x", 0.04)]),
 }  # fmt: skip
 
 
@@ -63,20 +95,56 @@ class Recorded:
     J: Array
 
 
+class RollingOracle(Oracle):
+    """An oracle whose contacts roll: forces act at c - r n, and a wrench is what a sensor at c reads of them."""
+
+    contacts: dict[str, Contact] = {}
+    normals: dict[str, Array] = {}
+    mounting: Array = np.eye(3)
+
+    def jacobian(self, q: Array, frame: str) -> Array:
+        J = super().jacobian(q, frame)
+        contact = self.contacts.get(frame, Contact(frame, "flat"))
+        normal = self.normals.get(frame, unit(np.array(contact.normal)))
+        n = (
+            (self.mounting @ self.pose(q, frame)[0]).transpose(0, 2, 1)
+            @ np.broadcast_to(normal, (len(q), 3))[..., None]
+        )[..., 0]
+        if contact.kind == "line":
+            along = "xyz".index(contact.line_axis)
+            n[:, along] = 0.0
+            n = unit(n)
+        moment = np.cross(-contact.radius * n[:, None], np.eye(3))  # of a unit force along each axis, about c
+        if contact.kind == "line":  # the ground has no moment about the axis; those across it are unknowns of their own
+            moment[..., [axis for axis in range(3) if axis != along]] = 0.0
+        J[:, :3] += moment @ J[:, 3:]
+        return J
+
+
+def unit(x: Array) -> Array:
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
 @cache
 def recorded(name: str) -> Recorded:
     urdf, fixed_base, contacts = MACHINES[name]
-    robot = load(urdf or machine(Path.cwd()), None, fixed_base, () if urdf else SENSORS)
-    oracle, rng = Oracle.of(robot), np.random.default_rng(len(name))
+    robot = load(urdf or machine(Path.cwd()), None, fixed_base, () if urdf or "welded" in name else SENSORS)
+    oracle, rng = RollingOracle.of(robot), np.random.default_rng(len(name))
     oracle.perturb(rng, 0.2)
+    oracle.contacts = {contact.frame: contact for contact in contacts}
+    if "recorded ground" in name:
+        oracle.normals = {contact.frame: unit(rng.normal(size=(4, 3))) for contact in contacts}
     if fixed_base:
         mounting = Rotation.from_rotvec([0.4, -0.7, 0.2])
-        oracle.model.gravity.linear = mounting.inv().apply(GRAVITY)
+        oracle.model.gravity.linear, oracle.mounting = mounting.inv().apply(GRAVITY), mounting.as_matrix()
     count = len(contacts)
     states = [[foot in down for foot in range(count)] for down in (range(count), [0], [count - 1], [])]
     log = make_log(oracle, [(contact.frame, contact.components) for contact in contacts], states, len(states), rng)
     if fixed_base:
         log = replace(log, base_quat_xyzw=np.tile(mounting.as_quat(), (len(log), 1)))
+    if oracle.normals:
+        normals = np.stack(list(oracle.normals.values()), axis=1)
+        log = replace(log, contact_normal_world=np.where(value(log.contact_active)[..., None], normals, np.nan))
     state = states_of(log)
     K = np.concatenate([oracle.regressor(robot, *state), oracle.friction_regressor(robot, state[1])], axis=3)
     J = np.array([oracle.jacobian(state[0], contact.frame) for contact in contacts])
@@ -118,7 +186,8 @@ def in_other_order(log: Log) -> Log:
         contact_names=log.contact_names[::-1],
         ft_names=log.ft_names[::-1],
         **backwards(["joint_position", "joint_velocity", "joint_acceleration", "joint_torque"]),
-        **backwards(["contact_active", "contact_wrench_local", "contact_wrench_world", "ft_wrench"]),
+        **backwards(["contact_active", "contact_wrench_local", "contact_wrench_world", "contact_normal_world"]),
+        **backwards(["ft_wrench"]),
     )
 
 
@@ -138,7 +207,12 @@ FREE_BASE: dict[str, Convention] = {
 }
 CONVENTIONS = ANY_BASE | FREE_BASE
 """Axes that contact wrenches are along, names from last to first, and an IMU's readings in place of the base's pose."""
-CASES = [(name, convention) for name in MACHINES for convention in (ANY_BASE if MACHINES[name][1] else CONVENTIONS)]
+CASES = [
+    (name, convention)
+    for name, (_, fixed_base, contacts) in MACHINES.items()
+    for convention in (ANY_BASE if fixed_base else CONVENTIONS)
+    if convention != "IMU" or not any(contact.radius for contact in contacts)
+]
 
 
 def with_wild_unmeasured_forces(r: Recorded, sensors: SensorSet) -> Log:
@@ -235,6 +309,16 @@ def test_rows_are_white_combinations_of_pinocchios_equations_that_no_unmeasured_
     assert_close(rows[..., :-1] @ phi, rows[..., -1], np.abs(rows[..., -1]).max(initial=1.0))
     again, _ = rows_of(r, builder, recorded_as(r, with_wild_unmeasured_forces(r, chosen)))
     assert_close(again, rows, size)
+
+
+@pytest.mark.parametrize("name", [name for name, machine in MACHINES.items() if any(c.radius for c in machine[2])])
+def test_forces_measured_where_contacts_roll_are_those_that_the_true_parameters_predict(name: str) -> None:
+    r = recorded(name)
+    builder = row_builder(name, "full")
+    for log in (r.log, in_world(r.oracle, r.log)):
+        phi = true_parameters(r.oracle, r.robot).flatten()
+        measured, (predicted,) = force_series(builder, bind_log(log, r.robot, r.contacts), phi[None])
+        assert_close(predicted, measured, np.abs(measured).max())
 
 
 @pytest.mark.parametrize("sensors", SETS)

@@ -73,10 +73,13 @@ def test_a_foots_force_torque_sensor_may_be_traded_for_the_six_torques_of_its_le
         assert [c.kind for c in torques] == ["joint_torque"] * 6
 
 
+@pytest.mark.parametrize("radius", [0.0, 0.03])
 @pytest.mark.parametrize("name", QUADRUPEDS)
-def test_a_quadruped_on_point_feet_needs_three_readings_per_leg_whatever_its_gait(name: str) -> None:
+def test_a_quadruped_on_points_or_balls_needs_three_readings_per_leg_whatever_its_gait(
+    name: str, radius: float
+) -> None:
     urdf, feet = QUADRUPEDS[name]
-    robot, contacts = load(urdf), tuple(Contact(foot, "point") for foot in feet)
+    robot, contacts = load(urdf), tuple(Contact(foot, "point", radius=radius) for foot in feet)
     gait = states_of("1111", "1001", "0110", "0000")
     choice = candidates(robot, contacts)
     least = cheapest_set(demands(robot, contacts, gait, choice), choice)
@@ -86,6 +89,7 @@ def test_a_quadruped_on_point_feet_needs_three_readings_per_leg_whatever_its_gai
         (3, True, (foot,)) for foot in feet
     ]
     assert all(len(need.joints) == 3 and len(need.branches) == 1 for need in found)
+    assert sees_the_base(robot, contacts, gait[:3], [sensor_set(robot, contacts, least.chosen)]).all()
 
 
 @pytest.mark.parametrize("per", ["device", "axis"])

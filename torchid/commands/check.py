@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from torchid.commands.folder import check_free_file
 from torchid.commands.reading import memory_needed
 from torchid.config import load_analysis
 from torchid.config.experiment import PreprocessingConfig, load_topics
+from torchid.config.sensors import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file
+from torchid.fitting.contacts import resolve_contacts
 from torchid.fitting.experiment import set_up_scene
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
@@ -23,8 +26,7 @@ from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, n
 from torchid.report.figures import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
-from torchid.robot import load_robot
-from torchid.sensing import Contact
+from torchid.robot import CollisionShapes, load_robot
 
 EXPERIMENTS = (".yaml", ".yml")
 FIGURES = (".png", ".pdf", ".svg")
@@ -77,7 +79,8 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
             log = read_log_to_check(file, config.logs.topics, config.preprocessing)
-            checked.append(check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz))
+            found = check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz)
+            checked.append(replace(found, rolling=scene.rolling))
     return checked
 
 
@@ -107,7 +110,12 @@ def check_log(
     with about_file(log.source):
         for name in log.contact_names:
             robot.link(name, "contact_names")
-    return check(log, robot, [_contact(log, index) for index in range(len(log.contact_names))])
+    shapes = CollisionShapes(robot)
+    settings = [_contact(log, index, shapes) for index in range(len(log.contact_names))]
+    if log.base_quat_xyzw is None and not fixed_base:  # which way the ground's normal points is not known
+        settings = [replace(contact, radius=0.0) for contact in settings]
+    contacts, rolling = resolve_contacts(settings, robot)
+    return replace(check(log, robot, contacts), rolling=rolling)
 
 
 def read_log_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Log:
@@ -157,11 +165,13 @@ def _require_memory(path: Path, settings: PreprocessingConfig) -> None:
         raise LogError(path, "file", f"arrays of {size:.2g} GB, which are not in memory at once", accepted)
 
 
-def _contact(log: Log, index: int) -> Contact:
-    """A contact of a log without an experiment file: a point if forces without any moment were measured."""
-    wrench = log.contact_wrench
+def _contact(log: Log, index: int, shapes: CollisionShapes) -> ContactConfig:
+    """A contact of a log without an experiment file: a point if it is a ball or has forces without any moment."""
+    wrench, name = log.contact_wrench, log.contact_names[index]
+    if shapes.about(name) is not None:
+        return ContactConfig(name, "point")
     force, moment = (False, True) if wrench is None else (np.nan_to_num(wrench[:, index, k]).any() for k in _WRENCH)
-    return Contact(log.contact_names[index], "point" if force and not moment else "flat")
+    return ContactConfig(name, "point" if force and not moment else "flat")
 
 
 def check_outputs(

@@ -51,12 +51,14 @@ class Compression:
         states: contact states of all logs.
         noise: that rows were weighed with.
         output: the folder.
+        rolling: which contacts roll, on what.
     """
 
     files: list[CompressedFile]
     states: list[StateReport]
     noise: NoiseSummary
     output: Path
+    rolling: str
 
 
 def compress(config: ExperimentConfig, output: str | Path) -> Compression:
@@ -93,7 +95,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
         noise = experiment.estimate_noise(_with_those_elsewhere(logs), experiment.sensors)
         factors = _compressed(with_noise(experiment, noise), paths, logs, states, excluded, bars)
         files = _write_all(names, zip(names[share], factors, strict=True), output, config.overwrite)
-    return Compression(files=files, states=together, noise=noise, output=output)
+    return Compression(files=files, states=together, noise=noise, output=output, rolling=experiment.rolling)
 
 
 def _file_names(logs: Sequence[Path]) -> list[str]:

@@ -25,6 +25,7 @@ from torchid.report import identified_urdf
 from torchid.report.tables import progress_bars
 from torchid.robot import Robot, load_robot
 from torchid.simulation import LEAD_S, Stability, sensor_log, set_up_simulation
+from torchid.simulation.plant import find_feet
 
 _POLL_S = 0.2
 
@@ -55,6 +56,13 @@ def simulate(config: SimulationConfig) -> dict[str, Stability]:
         write_json(folder / "stability.json", {name: asdict(stability) for name, stability in stabilities.items()})
         (folder / "nominal.urdf").write_bytes(identified_urdf(robot, nominal_parameters(robot, config.nominal)))
     return stabilities
+
+
+def simulated_balls(config: SimulationConfig) -> str:
+    """The feet that roll on one collision sphere of the URDF, with its radius, "" if none does."""
+    feet = find_feet(config.feet, config.robot.urdf)
+    rolling = [f"{foot.frame}: radius {foot.rolling_radius:g} m" for foot in feet if foot.rolling_radius]
+    return ", ".join(rolling) + (" (collision spheres)" if rolling else "")
 
 
 def nominal_parameters(robot: Robot, settings: NominalConfig, draw: int = 0) -> Array:

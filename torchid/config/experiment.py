@@ -17,6 +17,7 @@ from torchid.config.sensors import (
     SCOPES_ACCEPTED,
     STRICT,
     Choice,
+    ContactConfig,
     Device,
     FileName,
     Sensors,
@@ -81,15 +82,6 @@ class RobotConfig:
     urdf: Path
     base_link: str | None = None
     fixed_base: bool = False
-
-
-@dataclass(config=STRICT, frozen=True)
-class ContactConfig:
-    """A contact at a URDF frame: `line_axis` is the frame's axis that a line contact runs along."""
-
-    frame: str
-    type: Literal["point", "line", "flat"]
-    line_axis: Literal["x", "y", "z"] = "y"
 
 
 @dataclass(config=STRICT, frozen=True)

@@ -1,4 +1,4 @@
-"""The sensors of an experiment file with their noise, and values that all settings files share."""
+"""The contacts and sensors of an experiment file with their noise, and values that all settings files share."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import dataclasses
 import re
 from typing import Annotated, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError
 from torchid.problem.extras import CHANNELS
-from torchid.settings import Positive
+from torchid.settings import NotNegative, Number, Positive
 
 STRICT = ConfigDict(extra="forbid")
 
@@ -50,8 +50,45 @@ def _plain(value: float | tuple[float, float, float]) -> float | list[float]:
     return list(value) if isinstance(value, tuple) else value
 
 
+def _radius(value: object) -> float | str:
+    """A number of at least 0, or auto."""
+    try:
+        return "auto" if value == "auto" else _NOT_NEGATIVE.validate_python(value)
+    except ValueError as error:
+        raise ValueError("auto, or a number of at least 0 [m]") from error
+
+
+def _normal(value: object) -> list[float] | None:
+    """Three numbers, not all 0, or none."""
+    try:
+        normal = None if value is None else _VECTOR.validate_python(value)
+    except ValueError:
+        normal = []
+    if normal is not None and not any(normal):
+        raise ValueError("three numbers [x, y, z] in the world, not all 0")
+    return normal
+
+
+_NOT_NEGATIVE: TypeAdapter[float] = TypeAdapter(NotNegative)
+_VECTOR: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=3, max_length=3)])
 _POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
 PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(_plain)]
+
+
+@dataclass(config=STRICT, frozen=True)
+class ContactConfig:
+    """A contact at a URDF frame: `line_axis` is the frame's axis that a line contact runs along.
+
+    `radius` [m]: a point is a sphere, a line a cylinder about the frame's origin, which rolls; auto: that of the
+    collision sphere (of a line: cylinder) about this origin in the URDF, 0 without one. `normal`: of the ground, in the
+    world, where the logs do not record it (`contact_normal_world`); None for upwards.
+    """
+
+    frame: str
+    type: Literal["point", "line", "flat"]
+    line_axis: Literal["x", "y", "z"] = "y"
+    radius: Annotated[float | Literal["auto"], PlainValidator(_radius)] = "auto"
+    normal: Annotated[list[float] | None, PlainValidator(_normal)] = None
 
 
 @dataclass(config=STRICT, frozen=True)

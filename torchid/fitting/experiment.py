@@ -16,6 +16,7 @@ from torchid.config.sensors import ChoiceConfig, NoiseConfig
 from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
+from torchid.fitting.contacts import resolve_contacts
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
@@ -34,7 +35,6 @@ from torchid.sensing import (
     SensorSet,
     chosen_sensors,
     named_sensors,
-    validate_contacts,
     with_ft_sensors,
 )
 
@@ -50,11 +50,13 @@ class Scene:
         config: the settings.
         robot: the robot.
         contacts: the contacts in use.
+        rolling: what the contacts that roll roll on, and where that is stated, "" if none does.
     """
 
     config: ExperimentConfig | AnalyzeConfig
     robot: Robot
     contacts: tuple[Contact, ...]
+    rolling: str = ""
 
     @property
     def noise(self) -> SensorNoise:
@@ -214,8 +216,9 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         raise UnknownNameError.at_field(field, error.name, error.valid, error.what) from error
     if not robot.nv:
         raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
-    contacts = validate_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in config.contacts])
-    return Scene(config=config, robot=robot, contacts=contacts)
+    contacts, rolling = resolve_contacts(config.contacts, robot)
+    stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
+    return Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
 
 
 def set_up(config: ExperimentConfig) -> Experiment:
@@ -227,7 +230,8 @@ def set_up(config: ExperimentConfig) -> Experiment:
     """
     scene = set_up_scene(config)
     sensors = scene.sensors_of(config.sensors)
-    experiment = Experiment(config=config, robot=scene.robot, contacts=scene.contacts, sensors=sensors)
+    config = replace(config, contacts=scene.config.contacts)
+    experiment = Experiment(**vars(scene) | {"config": config}, sensors=sensors)
     _check_terms(experiment)
     return experiment
 

@@ -117,6 +117,8 @@ def require_same_noise(path: object, found: RowModel, expected: RowModel, refere
 
 def _contact_text(contact: Contact) -> str:
     kind = f"line along {contact.line_axis}" if contact.kind == "line" else contact.kind
+    if contact.radius:  # a factor of a contact that does not roll stays what it was
+        kind += f", radius {contact.radius!r} m, normal {', '.join(map(repr, contact.normal))}"
     return f"{contact.frame} ({kind})"
 
 

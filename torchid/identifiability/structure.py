@@ -15,7 +15,15 @@ from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import ContactState
 from torchid.regressor import FrameJacobian, motion_from_state
-from torchid.regressor.kinematics import GRAVITY_WORLD, BodyStates, body_states, cross_product, joint_motion
+from torchid.regressor.kinematics import (
+    GRAVITY_WORLD,
+    BodyStates,
+    body_states,
+    cross_product,
+    joint_motion,
+    rotation_matrix,
+)
+from torchid.regressor.regressor import contact_arms
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE
@@ -108,12 +116,17 @@ def standing_states(
     """Coordinates q, v, a, as `Regressor` takes them, with `J_C v = 0` and `J_C a + dJ_C/dt v = 0`.
 
     J_C has the rows of the components that active contacts can exert: a point contact fixes its frame's origin, a flat
-    one the whole frame, a line contact all but the rotation about itself. Twice as many states are drawn, and those
-    nearest to a singular J_C are dropped: accelerations are unbounded there.
+    one the whole frame, a line contact all but the rotation about itself; with a radius, they roll. Twice as many
+    states are drawn, and those nearest to a singular J_C are dropped: accelerations are unbounded there.
     """
     q, v, a = _random_states(robot, 2 * count, rng)
     constrained = [contact for contact, active in zip(contacts, state, strict=True) if active]
-    rows = [FrameJacobian(robot, contact.frame)(q)[:, list(contact.components), : robot.nv] for contact in constrained]
+    rows = [
+        FrameJacobian(robot, contact.frame, contact.radius, contact.rolling_axis)(q, q.new_tensor(contact.normal))[
+            :, list(contact.components), : robot.nv
+        ]
+        for contact in constrained
+    ]
     J = torch.cat([q.new_zeros(len(q), 0, robot.nv), *rows], dim=1)
     if not constrained:
         return q[:count], v[:count], a[:count]
@@ -177,17 +190,26 @@ def _drift(robot: Robot, constrained: Sequence[Contact], q: Tensor, v: Tensor) -
     rows = []
     for contact in constrained:
         node, T_joint_frame = tree.frame(robot, contact.frame)
-        rows.append(_acceleration(states, node, v.new_tensor(T_joint_frame))[list(contact.components)])
+        normal = q.new_tensor(contact.normal).expand(len(q), 3)
+        if not robot.fixed_base:
+            normal = (rotation_matrix(q[:, 3:7]).mT @ normal[..., None])[..., 0]
+        pose = v.new_tensor(T_joint_frame)
+        arms = contact_arms(states, node, pose[:3, :3], contact.radius, normal.T, contact.rolling_axis)
+        rows.append(_acceleration(states, node, pose, arms)[list(contact.components)])
     return torch.cat(rows).T
 
 
-def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor) -> Tensor:
-    """Acceleration of a frame's origin, then angular acceleration, in the frame's axes, (6, B), without gravity."""
+def _acceleration(states: BodyStates, body: int, T_joint_frame: Tensor, arms: Tensor) -> Tensor:
+    """Acceleration of a frame's origin, then angular acceleration, in the frame's axes, (6, B), without gravity.
+
+    With arms, (3, 3, B), where it rolls: d/dt (v + omega x l), of the arm l whose direction the ground fixes. It is not
+    the acceleration of the material point, whose arm turns with the body.
+    """
     rotation = states.rotation[:, :, body]
     arm = (rotation * T_joint_frame[:3, 3, None]).sum(1)
     omega, alpha = states.angular_velocity[:, body], states.angular_acceleration[:, body]
     linear = (
         states.specific_force[:, body] + cross_product(alpha, arm) + cross_product(omega, cross_product(omega, arm))
-    )
+    ) + (arms * alpha[:, None]).sum(0)
     in_joint_frame = (rotation[:, :, None] * torch.stack([linear, alpha], dim=1)[:, None]).sum(0)
     return torch.cat(list(T_joint_frame[:3, :3].T @ in_joint_frame.transpose(0, 1)))

@@ -56,12 +56,14 @@ class Checked:
         repaired: with condemned values interpolated, so that a filter does not smear them.
         findings: the most severe first.
         skipped: checks that could not be made.
+        rolling: which contacts were taken to roll, on what, "" if none was.
     """
 
     log: Log
     repaired: Log
     findings: tuple[Finding, ...]
     skipped: tuple[Skipped, ...]
+    rolling: str = ""
 
     @cached_property
     def condemned(self) -> BoolArray:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs import Log
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray, column_labels
+from torchid.logs.log import NORMALS, WRENCHES, BoolArray, FloatArray, column_labels
 from torchid.parameters import WRENCH_COMPONENTS
 
 #: The samples must not be fitted.
@@ -149,7 +149,7 @@ FIELD_UNITS = {
     "imu_angular_acceleration": "rad/s^2",
 }
 #: Fields that are not sensor signals.
-NON_SIGNAL_FIELDS = ("time", "contact_active")
+NON_SIGNAL_FIELDS = ("time", "contact_active", NORMALS)
 
 
 def median_step(log: Log) -> float:
@@ -191,7 +191,8 @@ def channel_names(log: Log, field: str) -> tuple[str, ...]:
     labels = column_labels(field, log.names)
     array = log.arrays()[field]
     if array.ndim == 3:
-        return tuple(f"{label} {component}" for label in labels for component in WRENCH_COMPONENTS)
+        components = "xyz" if field == NORMALS else WRENCH_COMPONENTS
+        return tuple(f"{label} {component}" for label in labels for component in components)
     return labels or tuple("xyzw"[: array.shape[1]] if array.ndim == 2 else ("",))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +36,7 @@ SHAPES: dict[str, FieldShape] = {
     "contact_active": ("N", "C"),
     "contact_wrench_local": ("N", "C", 6),
     "contact_wrench_world": ("N", "C", 6),
+    "contact_normal_world": ("N", "C", 3),
     "ft_names": ("F",),
     "ft_wrench": ("N", "F", 6),
     "imu_frame": (),
@@ -58,6 +59,7 @@ REQUIRED = ("time", "joint_names", "joint_position")
 #: Fields that name columns, and the letter of their number.
 NAME_FIELDS = {"joint_names": "n", "contact_names": "C", "ft_names": "F"}
 WRENCHES = ("contact_wrench_local", "contact_wrench_world")
+NORMALS = "contact_normal_world"
 
 #: NaN marks "not measured here" in these fields and is an error in all others.
 NAN_ALLOWED = ("joint_torque", *WRENCHES, "ft_wrench")
@@ -66,7 +68,7 @@ IMU_FIELDS = ("imu_frame", "imu_specific_force", "imu_angular_velocity")
 
 #: Fields that a field requires.
 REQUIRED_WITH: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("contact_active", *WRENCHES), ("contact_names", "contact_active")),
+    **dict.fromkeys(("contact_active", *WRENCHES, NORMALS), ("contact_names", "contact_active")),
     "ft_wrench": ("ft_names",),
     **dict.fromkeys((*IMU_FIELDS, "imu_angular_acceleration"), IMU_FIELDS),
 }
@@ -100,6 +102,8 @@ class Log:
         contact_wrench_local: (N, C, 6) [N, N m] on the robot at the contact frame's origin, in that frame's axes;
             NaN where not measured.
         contact_wrench_world: as `contact_wrench_local` but in world axes; at most one of the two is given.
+        contact_normal_world: (N, C, 3) unit vectors away from the ground under a contact that rolls; any values, NaN
+            too, while it is in the air.
         ft_names: F names of fixed joints with a force/torque sensor.
         ft_wrench: (N, F, 6) [N, N m] that the parent side exerts on the child side, in the joint's child frame; NaN
             where not measured.
@@ -137,6 +141,7 @@ class Log:
     contact_active: BoolArray | None = None
     contact_wrench_local: FloatArray | None = None
     contact_wrench_world: FloatArray | None = None
+    contact_normal_world: FloatArray | None = None
     ft_names: tuple[str, ...] = ()
     ft_wrench: FloatArray | None = None
     imu_frame: str = ""
@@ -227,8 +232,8 @@ def column_labels(name: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str,
     return names[of] if of in NAME_FIELDS else ()
 
 
-#: Deviation of a quaternion's norm from 1 up to which it is normalised.
-QUATERNION_TOLERANCE = 1e-3
+#: Deviation of the norm of a quaternion or a normal from 1 up to which it is normalised.
+UNIT_TOLERANCE = 1e-3
 #: Deviation of the norm of a normalised quaternion from 1.
 ROUNDING = 4.0 * np.finfo(np.float64).eps
 #: Size of a value in any unit: products of several stay within the range of float64.
@@ -255,17 +260,20 @@ def to_float64(name: str, array: NDArray[Any]) -> FloatArray:
         return np.asarray(array, dtype=np.float64)
 
 
-def describe_element(index: tuple[int, ...], labels: tuple[str, ...]) -> str:
+def describe_element(
+    index: tuple[int, ...], labels: tuple[str, ...], components: Sequence[str] = WRENCH_COMPONENTS
+) -> str:
     """An element of a field as text: sample and, if any, channel.
 
     Args:
         index: sample number, column, wrench component; as many as the field has axes.
         labels: names of the columns, empty where they have none.
+        components: names of what the last of three axes has.
     """
     words = f"sample {index[0]}"
     if len(index) > 1:
         words += f", {labels[index[1]] if labels else f'component {index[1]}'}"
-    return words + (f" {WRENCH_COMPONENTS[index[2]]}" if len(index) > 2 else "")
+    return words + (f" {components[index[2]]}" if len(index) > 2 else "")
 
 
 def check_finite(name: str, values: FloatArray, *, allow_nan: bool = False, labels: tuple[str, ...] = ()) -> None:
@@ -277,7 +285,8 @@ def check_finite(name: str, values: FloatArray, *, allow_nan: bool = False, labe
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
         accepted = f"numbers of at most {LARGEST:g}" if np.isfinite(values[index]) else "finite numbers"
         accepted += ", or NaN where nothing was measured" if allow_nan else ""
-        raise LogError.at_field(name, f"{values[index]} at {describe_element(index, labels)}", accepted)
+        where = describe_element(index, labels, "xyz" if name == NORMALS else WRENCH_COMPONENTS)
+        raise LogError.at_field(name, f"{values[index]} at {where}", accepted)
 
 
 def check_time(time: FloatArray) -> None:
@@ -300,13 +309,30 @@ def normalize_quaternions(name: str, quat: FloatArray, allow_nan: bool = False) 
     check_finite(name, quat, allow_nan=allow_nan)
     with np.errstate(over="ignore"):  # an infinite norm is refused below
         norm = np.linalg.norm(quat, axis=1)
-    bad = ~((np.abs(norm - 1.0) <= QUATERNION_TOLERANCE) | np.isnan(norm))
+    bad = ~((np.abs(norm - 1.0) <= UNIT_TOLERANCE) | np.isnan(norm))
     if bad.any():
         i = int(np.argmax(bad))
         found = f"norm {norm[i]:.6g} at sample {i}"
-        raise LogError.at_field(name, found, f"unit quaternions, to {QUATERNION_TOLERANCE:g}")
+        raise LogError.at_field(name, found, f"unit quaternions, to {UNIT_TOLERANCE:g}")
     norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0  # normalised quaternions stay bit for bit
     return np.asarray(quat / norm[:, None], dtype=np.float64)
+
+
+def normalize_normals(normals: FloatArray, active: BoolArray, labels: tuple[str, ...]) -> FloatArray:
+    """Normals (N, C, 3) with a norm of exactly one, NaN where they are not known in the air.
+
+    LogError at the first active contact, (N, C) bool, whose normal has another norm.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = np.linalg.norm(normals, axis=2)
+        known = np.abs(norm - 1.0) <= UNIT_TOLERANCE
+    bad = active & ~known
+    if bad.any():
+        sample, contact = (int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
+        found = f"norm {norm[sample, contact]:.6g} at {describe_element((sample, contact), labels)}, while in contact"
+        raise LogError.at_field(NORMALS, found, f"unit vectors, to {UNIT_TOLERANCE:g}")
+    norm[np.abs(norm - 1.0) <= ROUNDING] = 1.0
+    return np.where(known[..., None], normals / np.where(known, norm, 1.0)[..., None], np.nan)
 
 
 def parse_names(name: str, array: NDArray[Any]) -> tuple[str, ...]:

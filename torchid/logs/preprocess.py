@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torchid.errors import InputError, LogError, about_file, warn
 from torchid.logs.log import (
     NAN_ALLOWED,
+    NORMALS,
     WRENCHES,
     BoolArray,
     FloatArray,
@@ -23,7 +24,7 @@ from torchid.logs.log import (
     describe_element,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
-from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline
+from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
 DERIVATIVE_CHAINS = (
@@ -125,6 +126,9 @@ def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Cov
         if timeline.low_pass is not None or timeline.output is not None:
             share = log.contact_active if log.contact_share is None else log.contact_share
             fields["contact_share"] = timeline.evaluate(timeline.smooth(share.astype(np.float64)), (0,))[0]
+    if log.contact_normal_world is not None:
+        normals = timeline.hold(nearest_known(log.contact_normal_world))
+        fields[NORMALS] = np.where(fields["contact_active"][..., None], normals, np.nan)
     if (readings := unloaded_readings(log)) is not None:
         fields["contact_unloaded"] = timeline.hold(readings)
     if timeline.bandwidth_hz is not None:

@@ -23,6 +23,7 @@ from torchid.logs.log import (
     EXCLUSIVE,
     NAME_FIELDS,
     NAN_ALLOWED,
+    NORMALS,
     REQUIRED,
     REQUIRED_WITH,
     SHAPES,
@@ -36,6 +37,7 @@ from torchid.logs.log import (
     column_labels,
     field_shape,
     is_quaternion,
+    normalize_normals,
     normalize_quaternions,
     parse_flags,
     parse_frame,
@@ -150,8 +152,10 @@ def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, A
             fields[name] = parse_flags(name, array, labels)
             continue
         values = to_float64(name, array)
-        check_finite(name, values, allow_nan=allow_gaps or name in NAN_ALLOWED, labels=labels)
+        check_finite(name, values, allow_nan=allow_gaps or name in (*NAN_ALLOWED, NORMALS), labels=labels)
         fields[name] = normalize_quaternions(name, values, allow_gaps) if is_quaternion(name) else values
+    if NORMALS in fields and not allow_gaps:
+        fields[NORMALS] = normalize_normals(fields[NORMALS], fields["contact_active"], names["contact_names"])
     return fields
 
 

@@ -207,6 +207,19 @@ class Timeline:
         return np.asarray(count[last + 1] > count[np.maximum(first, 0)])
 
 
+def nearest_known(normals: FloatArray) -> FloatArray:
+    """Normals (N, C, 3), where NaN those of the nearest sample in which they are known: filters widen contacts."""
+    out = normals.copy()
+    known, every = np.asarray(np.isfinite(normals).all(axis=2)), np.arange(len(normals))
+    for contact in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)):
+        samples = np.flatnonzero(known[:, contact])
+        after = np.searchsorted(samples, every).clip(0, len(samples) - 1)
+        before = (after - 1).clip(0)
+        nearer_before = np.abs(every - samples[before]) < np.abs(samples[after] - every)
+        out[:, contact] = normals[samples[np.where(nearer_before, before, after)], contact]
+    return out
+
+
 def _around(stamps: FloatArray, at: FloatArray, beyond: int) -> slice:
     """Samples up to some beyond the first and last of `at`, in whole blocks of the spline."""
     first = int(np.searchsorted(stamps, at[0], side="right")) - 1 - beyond

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -34,12 +35,16 @@ class ChunkKinematics:
         states: of the joint frames of all nodes.
         screw_axes: (6, L, B), see `joint_screw_axes`.
         rotation_world_base: (B, 3, 3), None where it was not recorded.
+        arms: (3, 3, B) [m] by rolling contact, see `torchid.regressor.regressor.rolling_arms`.
+        recorded_normals: whether each of these has normals of its own.
     """
 
     joints: JointMotion
     states: BodyStates
     screw_axes: Tensor
     rotation_world_base: Tensor | None
+    arms: Mapping[int, Tensor]
+    recorded_normals: bool
 
 
 @dataclass(frozen=True)
@@ -66,5 +71,7 @@ class ChunkDynamics(ChunkKinematics):
             BodyStates(*map(pick, vars(self.states).values())),
             pick(self.screw_axes),
             None if self.rotation_world_base is None else self.rotation_world_base[index],
+            {contact: pick(arms) for contact, arms in self.arms.items()},
+            self.recorded_normals,
             pick(self.wrenches),
         )

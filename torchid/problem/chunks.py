@@ -55,8 +55,8 @@ def map_chunks(
     """
     size = chunk or chunk_size(builder.device)
     tasks = [(samples, state, index) for samples in logs for state, index in chunks_by_state(samples, size)]
-    for _, state, _ in tasks:
-        builder.layout(state)
+    for samples, state, _ in tasks:
+        builder.layout(state, samples.contact_normal is not None)
     sizes = [_size(samples, index) for samples, _, index in tasks]
     ranks.require_same(hash(tuple((size, state) for size, (_, state, _) in zip(sizes, tasks, strict=True))), "logs")
     share = ranks.own_share(sizes)

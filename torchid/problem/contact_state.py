@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +16,8 @@ from torchid.problem.extras import Extra, measured_components
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import reduced_layout, reduction_matrix
-from torchid.regressor.regressor import JointRow, joint_rows, wrench_transform
+from torchid.regressor.kinematics import BodyStates
+from torchid.regressor.regressor import JointRow, contact_arms, joint_rows, rolling_arms, wrench_transform
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
@@ -75,17 +76,31 @@ class Columns:
 
 
 @dataclass(frozen=True)
+class WrenchRows:
+    """Wrenches, (k, 6), at a body's joint frame, in its axes.
+
+    `rolling`: contact whose `rolling_arms` they have, so that their forces act where it touches the ground; None for
+    those whose points of action are fixed to the body.
+    """
+
+    rows: Tensor
+    rolling: int | None = None
+
+
+@dataclass(frozen=True)
 class ContactBody:
     """A body with active contacts.
 
-    `unmeasured`, (k_x, 6): orthonormal rows that span the unmeasured wrench directions, `measured`, (k_m, 6): one row
-    per measured component, both as wrenches at the body's joint frame, in its axes. `components`: contact and component
-    of each measured row. `joints`: indices, among the coupled joints, of those that move the body.
+    `unmeasured`: rows that span the unmeasured wrench directions, `measured`: one row per measured component.
+    `count`: dimension of that span at almost every sample; more rows are reduced to a basis at each. `components`:
+    contact and component of each measured row. `joints`: indices, among the coupled joints, of those that move the
+    body.
     """
 
     body: int
-    unmeasured: Tensor
-    measured: Tensor
+    unmeasured: tuple[WrenchRows, ...]
+    count: int
+    measured: tuple[WrenchRows, ...]
     components: tuple[tuple[int, int], ...]
     joints: tuple[int, ...]
 
@@ -133,13 +148,20 @@ class ContactStateLayouts:
         self.frames = [columns.tree.frame(robot, contact.frame) for contact in contacts]
         self._measured = measured_components(self.contacts, sensors)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
-        self._cache: dict[ContactState, ContactStateLayout] = {}
+        self.rolling = tuple(index for index, contact in enumerate(contacts) if contact.radius)
+        self._cache: dict[tuple[ContactState, bool], ContactStateLayout] = {}
         self._rotations: dict[int, Tensor] = {}
+        self._normals: dict[int, Tensor] = {}
 
-    def layout(self, state: ContactState) -> ContactStateLayout:
-        """The layout of a contact state, cached."""
-        if state in self._cache:
-            return self._cache[state]
+    def layout(self, state: ContactState, recorded_normals: bool = False) -> ContactStateLayout:
+        """The layout of a contact state, cached.
+
+        `recorded_normals`: whether each rolling contact has normals of its own, so that those of one body differ.
+        """
+        recorded_normals = recorded_normals and any(state[contact] for contact in self.rolling)
+        key = (state, recorded_normals)
+        if key in self._cache:
+            return self._cache[key]
         touching: dict[int, list[int]] = {}
         for contact, active in enumerate(state):
             if active:
@@ -147,7 +169,9 @@ class ContactStateLayouts:
         moving = {joint for body in touching for joint in self.columns.joints_above(body)}
         measured = np.flatnonzero(self.sensors.torque).tolist()
         coupled = tuple(joint for joint in measured if joint in moving)
-        bodies = tuple(self._contact_body(body, members, coupled) for body, members in touching.items())
+        bodies = tuple(
+            self._contact_body(body, members, coupled, recorded_normals) for body, members in touching.items()
+        )
         moved = sorted(
             (body, index, ratio)
             for index, joint in enumerate(coupled)
@@ -159,7 +183,7 @@ class ContactStateLayouts:
             if extra.dof in coupled or (extra.contact is not None and state[extra.contact[0]])
         ]
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
-        self._cache[state] = ContactStateLayout(
+        self._cache[key] = ContactStateLayout(
             bodies,
             coupled,
             {joint: self._uncoupled(joint) for joint in measured if joint not in moving},
@@ -171,11 +195,11 @@ class ContactStateLayouts:
                 moved,
                 [(self.columns.friction(body), self.columns.friction(body) + 1) for body, _, _ in moved],
                 [body.joints for body in bodies],
-                sum(len(body.unmeasured) for body in bodies),
+                sum(body.count for body in bodies),
                 [(column, *self._met(extra, coupled, bodies)) for column, extra in extras],
             ),
         )
-        return self._cache[state]
+        return self._cache[key]
 
     def _uncoupled(self, joint: int) -> RowBlock:
         columns, row = self.columns, self.columns.joint_rows[joint]
@@ -199,30 +223,122 @@ class ContactStateLayouts:
             self._rotations[contact] = self._tensor(self.frames[contact][1][:3, :3])
         return self._rotations[contact]
 
+    def arms(self, states: BodyStates, normals: Tensor | None, rotation_world_base: Tensor | None) -> dict[int, Tensor]:
+        """Moments of unit forces of the ground on each rolling contact, (3, 3, B) [m], see `rolling_arms`.
+
+        Args:
+            states: of the joint frames.
+            normals: (B, C, 3), in the world; None for those of the contacts.
+            rotation_world_base: (B, 3, 3); None where the base's axes are the world's.
+        """
+        arms = {}
+        for index in self.rolling:
+            contact, body = self.contacts[index], self.frames[index][0]
+            if normals is None:
+                normal = self._normal(index)[:, None].expand(3, states.position.shape[-1])
+            else:
+                normal = normals[:, index].T
+            if rotation_world_base is not None:
+                normal = (normal.T[:, None] @ rotation_world_base)[:, 0].T
+            axes, axis = self.frame_rotation(index), contact.rolling_axis
+            arms[index] = contact_arms(states, body, axes, contact.radius, normal, axis)
+        return arms
+
+    def _normal(self, contact: int) -> Tensor:
+        """Stated normal of a contact, (3,), cached."""
+        if contact not in self._normals:
+            self._normals[contact] = self._tensor(np.array(self.contacts[contact].normal))
+        return self._normals[contact]
+
     def clear(self) -> None:
         """Drop all layouts, when the robot's constants move to another device or precision."""
         self._cache.clear()
         self._rotations.clear()
+        self._normals.clear()
 
-    def _contact_body(self, body: int, contacts: list[int], coupled: tuple[int, ...]) -> ContactBody:
-        unmeasured, measured, components = [np.zeros((0, 6))], [np.zeros((0, 6))], []
+    def _contact_body(
+        self, body: int, contacts: list[int], coupled: tuple[int, ...], recorded_normals: bool
+    ) -> ContactBody:
+        unmeasured, measured, components = _Grouped(), _Grouped(), []
         for contact in contacts:
             at_body = wrench_transform(self.frames[contact][1]).T
+            rolling = contact if contact in self.rolling else None
             for k in self.contacts[contact].components:
                 if self._measured[contact, k]:
-                    measured.append(at_body[k][None])
+                    measured.setdefault(rolling, []).append(at_body[k])
                     components.append((contact, k))
                 else:
-                    unmeasured.append(at_body[k][None])
-        _, values, Vh = np.linalg.svd(np.concatenate(unmeasured), full_matrices=False)
-        span = Vh[is_significant(values, KINEMATIC_TOLERANCE)]
+                    alike = self._rolling_alike(rolling, unmeasured, recorded_normals)
+                    unmeasured.setdefault(alike, []).append(at_body[k])
+        components.sort(key=lambda component: list(measured).index(self._rolls(component[0])))
+        spans = {rolling: _span(np.array(rows)) for rolling, rows in unmeasured.items()}
+        count = sum(map(len, spans.values()))
+        if len(spans) > 1:
+            count = self._generic_rank(spans)
+            if count == _WRENCH:
+                spans = {None: np.eye(_WRENCH)}
         above = set(self.columns.joints_above(body))
         joints = tuple(index for index, joint in enumerate(coupled) if joint in above)
-        return ContactBody(body, self._tensor(span), self._tensor(np.concatenate(measured)), tuple(components), joints)
+        rows = [
+            tuple(WrenchRows(self._tensor(np.array(x)), rolling) for rolling, x in part.items())
+            for part in (spans, measured)
+        ]
+        return ContactBody(body, rows[0], count, rows[1], tuple(components), joints)
+
+    def _rolls(self, contact: int) -> int | None:
+        return contact if contact in self.rolling else None
+
+    def _rolling_alike(self, rolling: int | None, others: Iterable[int | None], recorded_normals: bool) -> int | None:
+        """The first of other contacts of the body that touches the ground by the same arm from its origin, or itself.
+
+        Forces of contacts with the same arm span a space that is moved as a whole by it.
+        """
+        if rolling is None or recorded_normals:
+            return rolling
+        own = self.contacts[rolling]
+        for other in others:
+            if other is not None:
+                contact = self.contacts[other]
+                alike = (contact.kind, contact.radius, contact.normal) == (own.kind, own.radius, own.normal)
+                if alike and (own.kind == "point" or np.allclose(self._axis(other), self._axis(rolling), atol=1e-12)):
+                    return other
+        return rolling
+
+    def _axis(self, contact: int) -> Array:
+        """Axis of a cylinder in its node's joint frame, (3,)."""
+        return self.frames[contact][1][:3, "xyz".index(self.contacts[contact].line_axis)]
+
+    def _generic_rank(self, spans: Mapping[int | None, Array]) -> int:
+        """Dimension of the space that wrenches span with normals in any directions; it is never larger."""
+        rng, moved = np.random.default_rng(0), []
+        for rolling, rows in spans.items():
+            if rolling is not None:
+                contact, normal = self.contacts[rolling], torch.from_numpy(_unit(rng.normal(size=3)))[:, None]
+                axis = torch.from_numpy(self._axis(rolling).copy())[:, None] if contact.kind == "line" else None
+                arms = rolling_arms(contact.radius, normal, axis)[..., 0].numpy()
+                rows = np.hstack([rows[:, :3], rows[:, 3:] + rows[:, :3] @ arms.T])
+            moved.append(rows)
+        return len(_span(np.concatenate(moved)))
 
     def _tensor(self, values: Array) -> Tensor:
         ancestors = self.columns.tree.ancestors
         return torch.tensor(values, dtype=ancestors.dtype, device=ancestors.device)
+
+
+_WRENCH = 6
+_Grouped = dict[int | None, list[Array]]
+
+
+def _span(rows: Array) -> Array:
+    """Orthonormal rows that span the same wrenches as others, (k, 6)."""
+    _, values, Vh = np.linalg.svd(rows, full_matrices=False)
+    span: Array = Vh[is_significant(values, KINEMATIC_TOLERANCE)]
+    return span
+
+
+def _unit(x: Array) -> Array:
+    unit: Array = x / np.linalg.norm(x)
+    return unit
 
 
 def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:

@@ -111,7 +111,8 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, k
             possible = list(builder.contacts[contact].components)
             units = total.new_tensor(wrench_transform(T_joint_frame).T[possible])
             components = builder.recorded_wrench(samples, contact, kinematics)[:, possible].T
-            wrench = (wrenches_at_base(kinematics.states, body, units) * components).sum(1, keepdim=True)
+            at_base = wrenches_at_base(kinematics.states, body, units, kinematics.arms.get(contact))
+            wrench = (at_base * components).sum(1, keepdim=True)
             joints = builder.columns.joints_above(body)  # other rows must not become NaN by an unmeasured force
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
             total[rows] += generalized_forces(tree, kinematics.screw_axes, body, wrench, joints)[0]

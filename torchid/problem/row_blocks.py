@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
+import torch
 from scipy.sparse.csgraph import connected_components
+from torch import Tensor
 
 from torchid import parameters
 from torchid.regressor.columns import ColumnLayout
@@ -238,3 +240,37 @@ def _runs(layout: ColumnLayout, kept: Sequence[tuple[int, ...]], sources: Sequen
                 sources=range(first, (sources[end - 1] or 0) + 1),
             )
         start = end
+
+
+def turn_rows(W: Tensor) -> None:
+    """Turn bases so that all but the last three columns are zero in the base's moment, all but six in its force too.
+
+    By Householder reflections from the right, one per base row, in place.
+
+    Args:
+        W: (base rows + coupled joints, r, B).
+    """
+    last = W.shape[1]
+    for row in (5, 4, 3, 2, 1, 0)[: 3 if last <= 6 else 6]:
+        if last < 2:
+            return
+        turned = W[:, :last]
+        v = turned[row].clone()
+        norm = torch.linalg.vector_norm(v, dim=0)
+        v[-1] += torch.copysign(norm, v[-1])
+        length = (v * v).sum(0)
+        v_scaled = v * torch.where(length > 0.0, 2.0 / length, 0.0)
+        turned.addcmul_((turned * v).sum(1, keepdim=True), v_scaled, value=-1)
+        last -= 1
+
+
+def multiply_wrenches(wrenches: Tensor, path_sums: Tensor, n_with_force: int, out: Tensor) -> None:
+    """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `n_with_force` c have forces.
+
+    `path_sums`: (6, L', r, B), or (6, 1, r, B) if they are the same for all bodies.
+    """
+    torch.mul(wrenches[3].unsqueeze(2), path_sums[3].unsqueeze(1), out=out)
+    for k in (4, 5):
+        out.addcmul_(wrenches[k].unsqueeze(2), path_sums[k].unsqueeze(1))
+    for k in (0, 1, 2):
+        out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), path_sums[k].unsqueeze(1))

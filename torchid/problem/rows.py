@@ -17,11 +17,12 @@ from torchid.problem.contact_state import (
     ContactState,
     ContactStateLayout,
     ContactStateLayouts,
+    WrenchRows,
     dof_extra_column,
     extra_columns,
 )
 from torchid.problem.extras import ExtraTerms, list_extras
-from torchid.problem.row_blocks import RowBlock
+from torchid.problem.row_blocks import RowBlock, multiply_wrenches, turn_rows
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
@@ -117,16 +118,19 @@ class RowBuilder(nn.Module):
         """Where the rows are computed."""
         return self.tree.ancestors.device
 
-    def layout(self, state: ContactState) -> ContactStateLayout:
-        """Layout of a contact state: its columns, coupled joints and wrench directions."""
-        return self._layouts.layout(state)
+    def layout(self, state: ContactState, recorded_normals: bool = False) -> ContactStateLayout:
+        """Layout of a contact state: its columns, coupled joints and, with or without recorded normals, directions."""
+        return self._layouts.layout(state, recorded_normals)
 
     def kinematics(self, samples: Samples) -> ChunkKinematics:
         """Kinematics of some samples."""
         motion = samples.motion()
         joints = joint_motion(self.tree, motion)
-        states = body_states(self.tree, motion, joints)
-        return ChunkKinematics(joints, states, joint_screw_axes(self.tree, states), samples.base.rotation)
+        states, rotation, arms = body_states(self.tree, motion, joints), samples.base.rotation, {}
+        if self._layouts.rolling:
+            arms = self._layouts.arms(states, samples.contact_normal, rotation)
+        screw_axes, recorded_normals = joint_screw_axes(self.tree, states), samples.contact_normal is not None
+        return ChunkKinematics(joints, states, screw_axes, rotation, arms, recorded_normals)
 
     def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
         """Dynamics of some samples; with a workspace, valid until the next call with the same."""
@@ -155,8 +159,8 @@ class RowBuilder(nn.Module):
         Yields:
             (columns, stacked): (len(columns) + 1 + M, len(columns) + 1), columns contiguous.
         """
-        workspace = workspace or Workspace()
-        layout, dynamics = self.layout(state), self.dynamics(samples, workspace)
+        workspace, dynamics = workspace or Workspace(), self.dynamics(samples, workspace)
+        layout = self._layouts.layout(state, dynamics.recorded_normals)
         for _, _, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
             for rows in blocks:
                 yield rows.block.support, rows.stacked.T
@@ -170,7 +174,8 @@ class RowBuilder(nn.Module):
             (B, n_rows, width + 1), `W^T [K | f]` with rows of zeros where a sample has fewer than n_rows, and W,
             (B, n_rows, n_rows).
         """
-        layout, dynamics = self.layout(state), self.dynamics(samples)
+        dynamics = self.dynamics(samples)
+        layout = self._layouts.layout(state, dynamics.recorded_normals)
         base, coupled = self.tree.base_rows, self.tree.base_rows + len(layout.coupled_joints)
         n_rows = self.tree.n_rows
         rows = samples.time.new_zeros(len(samples), n_rows, self.width + 1)
@@ -193,15 +198,19 @@ class RowBuilder(nn.Module):
         self, state: ContactState, kinematics: ChunkKinematics
     ) -> Iterator[tuple[Tensor | slice, Tensor]]:
         """Orthonormal V_x, (B', base rows + coupled joints, r), with the samples it belongs to, grouped by rank."""
-        yield from null_space(self._contact_rows(self.layout(state), kinematics)[0])
+        layout = self._layouts.layout(state, kinematics.recorded_normals)
+        yield from null_space(self._contact_rows(layout, kinematics)[0])
 
     def contact_jacobian(self, samples: Samples) -> Tensor:
-        """Jacobians of all contact frames along their own axes, active or not, (B, C, 6, n_rows)."""
+        """Jacobians of all contacts along their frames' axes, active or not, (B, C, 6, n_rows).
+
+        Linear velocities are those of frames' origins, or of the material points where contacts roll.
+        """
         kinematics, joints = self.kinematics(samples), range(self.tree.n_dofs)
         J = kinematics.screw_axes.new_zeros(len(samples), len(self.frames), 6, self.tree.n_rows)
         for contact, (body, T_joint_frame) in enumerate(self.frames):
             units = J.new_tensor(wrench_transform(T_joint_frame).T.copy())
-            at_base = wrenches_at_base(kinematics.states, body, units)
+            at_base = wrenches_at_base(kinematics.states, body, units, kinematics.arms.get(contact))
             J[:, contact] = generalized_forces(self.tree, kinematics.screw_axes, body, at_base, joints).permute(2, 0, 1)
         return J
 
@@ -326,7 +335,7 @@ class RowBuilder(nn.Module):
         for run in block.nodes:
             end = start + len(run.nodes) * len(run.kept)
             columns = dynamics.wrenches[:, run.columns.start : run.columns.stop].unflatten(1, (-1, len(run.all_kept)))
-            _multiply_wrenches(
+            multiply_wrenches(
                 columns[:, :, : len(run.kept)],
                 path_sums[:, run.sources.start : run.sources.stop],
                 run.n_with_force,
@@ -337,19 +346,20 @@ class RowBuilder(nn.Module):
     def _contact_rows(self, layout: ContactStateLayout, kinematics: ChunkKinematics) -> tuple[Tensor, Tensor]:
         """Rows of J_C, unmeasured and measured, in base and coupled joints, (B, k, base rows + coupled joints)."""
         samples, base_rows = kinematics.screw_axes.shape[-1], self.tree.base_rows
-        sizes = [sum(len(getattr(body, kind)) for body in layout.contact_bodies) for kind in ("unmeasured", "measured")]
+        sizes = [sum(body.count for body in layout.contact_bodies), len(layout.wrench_std)]
         both = kinematics.screw_axes.new_zeros(sum(sizes), len(layout.row_std), samples)
         starts = [0, sizes[0]]
         for contact in layout.contact_bodies:
             joints = [layout.coupled_joints[index] for index in contact.joints]
             columns = [*range(base_rows), *(base_rows + index for index in contact.joints)]
-            for kind, wrenches in enumerate((contact.unmeasured, contact.measured)):
-                if len(wrenches):
-                    at_base = wrenches_at_base(kinematics.states, contact.body, wrenches)
+            counts = contact.count, len(contact.components)
+            for kind, parts in enumerate((contact.unmeasured, contact.measured)):
+                if parts:
+                    at_base = _at_ground(kinematics, contact.body, parts, counts[kind])
                     rows = generalized_forces(self.tree, kinematics.screw_axes, contact.body, at_base, joints)
-                    target = both[starts[kind] : starts[kind] + len(wrenches)]
+                    target = both[starts[kind] : starts[kind] + counts[kind]]
                     target.index_copy_(1, self.tree.index(columns), rows)
-                    starts[kind] += len(wrenches)
+                    starts[kind] += counts[kind]
         return tuple(both.permute(2, 0, 1).split(sizes, dim=1))
 
     def _measured_wrench(self, samples: Samples, layout: ContactStateLayout, kinematics: ChunkKinematics) -> Tensor:
@@ -362,35 +372,20 @@ class RowBuilder(nn.Module):
         return torch.stack([local[contact][:, k] for contact, k in components], dim=1)
 
 
-def turn_rows(W: Tensor) -> None:
-    """Turn bases so that all but the last three columns are zero in the base's moment, all but six in its force too.
+def _at_ground(kinematics: ChunkKinematics, body: int, parts: Sequence[WrenchRows], count: int) -> Tensor:
+    """Wrenches on a body at the base origin in base axes, (6, count, B); of more, a basis of what they span.
 
-    By Householder reflections from the right, one per base row, in place.
-
-    Args:
-        W: (base rows + coupled joints, r, B).
+    Where they span less at some sample, the basis has directions too many: it costs equations, but lets no unmeasured
+    force in.
     """
-    last = W.shape[1]
-    for row in (5, 4, 3, 2, 1, 0)[: 3 if last <= 6 else 6]:
-        if last < 2:
-            return
-        turned = W[:, :last]
-        v = turned[row].clone()
-        norm = torch.linalg.vector_norm(v, dim=0)
-        v[-1] += torch.copysign(norm, v[-1])
-        length = (v * v).sum(0)
-        v_scaled = v * torch.where(length > 0.0, 2.0 / length, 0.0)
-        turned.addcmul_((turned * v).sum(1, keepdim=True), v_scaled, value=-1)
-        last -= 1
-
-
-def _multiply_wrenches(wrenches: Tensor, path_sums: Tensor, n_with_force: int, out: Tensor) -> None:
-    """Write A^T w for wrench columns (6, L', c, B) into (L', c, r, B); the first `n_with_force` c have forces.
-
-    `path_sums`: (6, L', r, B), or (6, 1, r, B) if they are the same for all bodies.
-    """
-    torch.mul(wrenches[3].unsqueeze(2), path_sums[3].unsqueeze(1), out=out)
-    for k in (4, 5):
-        out.addcmul_(wrenches[k].unsqueeze(2), path_sums[k].unsqueeze(1))
-    for k in (0, 1, 2):
-        out[:, :n_with_force].addcmul_(wrenches[k, :, :n_with_force].unsqueeze(2), path_sums[k].unsqueeze(1))
+    rows = [
+        wrenches_at_base(
+            kinematics.states, body, part.rows, None if part.rolling is None else kinematics.arms[part.rolling]
+        )
+        for part in parts
+    ]
+    at_base = rows[0] if len(rows) == 1 else torch.cat(rows, dim=1)
+    if at_base.shape[1] == count:
+        return at_base
+    Vh: Tensor = torch.linalg.svd(at_base.permute(2, 1, 0), full_matrices=False).Vh
+    return Vh[:, :count].permute(2, 1, 0)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError, about_file
 from torchid.logs import Log
-from torchid.logs.log import FloatArray
+from torchid.logs.log import FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem.base_motion import BaseMotion, base_motion
@@ -41,6 +41,8 @@ class Samples:
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
+        contact_normal: (N, C, 3), unit vectors in the world that point away from the ground; None for those that the
+            contacts state.
         share: (N, C), share of a constant contact reading that the filter leaves, as `Log.contact_share`; None if it is
             `active`.
         unloaded: (N, C, 6), readings of contact sensors while the contact is in the air, NaN elsewhere, as
@@ -62,6 +64,7 @@ class Samples:
     wrench_in_world: bool
     active: Tensor
     oversampling: float = 1.0
+    contact_normal: Tensor | None = None
     share: Tensor | None = None
     unloaded: Tensor | None = None
     direction: Tensor | None = None
@@ -164,6 +167,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
     if log.contact_wrench_world is not None and contacts and base.quat_xyzw is None and not robot.fixed_base:
         accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
         raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
+    normals = _contact_normals(log, robot, contacts, base, chosen, active)
     wrench = log.contact_wrench
     unloaded = unloaded_readings(log) if contacts else None
     samples = Samples(
@@ -178,6 +182,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         log.contact_wrench_world is not None,
         torch.from_numpy(active),
         oversampling(log.time, log.noise_bandwidth_hz),
+        normals,
         None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
         None if unloaded is None else torch.from_numpy(_columns(unloaded, chosen)),
         None if log.joint_direction is None else torch.from_numpy(_columns(log.joint_direction, order)),
@@ -186,6 +191,25 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         _require_limb_sensors(log, robot, required)
         require_forces(samples, robot, contacts, required)
     return samples
+
+
+def _contact_normals(
+    log: Log, robot: Robot, contacts: Sequence[Contact], base: BaseMotion, order: list[int], active: np.ndarray
+) -> Tensor | None:
+    """Normals of the ground under the contacts as recorded, (N, C, 3); None without, or if no contact rolls."""
+    rolling = [contact for contact in contacts if contact.radius]
+    if not rolling:
+        return None
+    if base.quat_xyzw is None and not robot.fixed_base:
+        first = rolling[0]
+        found = f"missing, though {first.frame} (radius {first.radius:g} m) rolls on ground that is known in the world"
+        accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or radius: 0 for this contact"
+        raise LogError(log.source, "base_quat_xyzw", found, accepted)
+    if log.contact_normal_world is None:
+        return None
+    with about_file(log.source):
+        labels = tuple(contact.frame for contact in contacts)
+        return torch.from_numpy(normalize_normals(_columns(log.contact_normal_world, order), active, labels))
 
 
 def oversampling(time: FloatArray, noise_bandwidth_hz: float | None) -> float:

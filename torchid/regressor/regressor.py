@@ -23,6 +23,7 @@ from torchid.regressor.kinematics import (
     joint_screw_axes,
     link_states,
     motion_from_state,
+    rotation_matrix,
 )
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
@@ -151,11 +152,40 @@ def _torque(screw_axis: Tensor, wrenches: Tensor) -> Tensor:
     return total
 
 
-def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor) -> Tensor:
-    """Wrenches, (k, 6) in a node's joint frame, at the base origin in base axes, (6, k, B) [N, N m]."""
+def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor, arms: Tensor | None = None) -> Tensor:
+    """Wrenches, (k, 6) in a node's joint frame, at the base origin in base axes, (6, k, B) [N, N m].
+
+    `arms`: (3, 3, B), of `rolling_arms`, if their forces act where a contact rolls rather than in its frame's origin.
+    """
     rotation, position = states.rotation[:, :, body], states.position[:, body]
     force = wrenches[:, :3] @ rotation
-    return torch.cat([force, wrenches[:, 3:] @ rotation + cross_product(position[:, None].expand_as(force), force)])
+    moment = wrenches[:, 3:] @ rotation + cross_product(position[:, None].expand_as(force), force)
+    if arms is not None:
+        moment = moment + (arms[:, :, None] * force).sum(1)
+    return torch.cat([force, moment])
+
+
+def rolling_arms(radius: float, normal: Tensor, axis: Tensor | None = None) -> Tensor:
+    """Moments about a contact frame's origin of unit forces of the ground on a sphere or cylinder about it.
+
+    A force f at -r n has the moment -r n x f. On a cylinder n is taken across the axis a, and only the moment about a
+    counts: those across it are free, so that the part of f along a may act anywhere in the plane of a and n.
+
+    Args:
+        radius: r [m].
+        normal: n, (3, B), unit vectors away from the ground.
+        axis: a, (3, B), unit vectors along a cylinder; None for a sphere.
+
+    Returns:
+        (3, 3, B) [m]: moment by force, in the axes of the arguments.
+    """
+    if axis is None:
+        x, y, z = (radius * normal).unbind()
+        zero = torch.zeros_like(x)
+        return torch.stack([zero, z, -y, -z, zero, x, y, -x, zero]).unflatten(0, (3, 3))
+    across = cross_product(axis, normal)
+    length = torch.linalg.vector_norm(across, dim=0).clamp_min(torch.finfo(across.dtype).tiny)
+    return axis[:, None] * (-radius / length * across)
 
 
 def generalized_forces(
@@ -185,15 +215,40 @@ def wrench_transform(T: Array) -> Array:
     return np.block([[R, np.zeros((3, 3))], [np.cross(np.eye(3), p) @ R, R]])
 
 
-class FrameJacobian(nn.Module):
-    """Jacobian of a URDF frame: `J(q) v` is the twist of its origin in its own axes, linear velocity first."""
+def contact_arms(
+    states: BodyStates, body: int, axes: Tensor, radius: float, normal: Tensor, axis: str | None
+) -> Tensor:
+    """`rolling_arms` of a frame on a body in base axes.
 
-    def __init__(self, robot: Robot, frame: str) -> None:
+    Args:
+        states: of the joint frames.
+        body: the node that carries the frame.
+        axes: of the frame, (3, 3), in the node's joint frame, as columns.
+        radius: [m].
+        normal: of the ground, (3, B), in base axes.
+        axis: x, y or z of the frame, along which a cylinder is; None for a sphere.
+    """
+    along = None if axis is None else axes[:, "xyz".index(axis)] @ states.rotation[:, :, body]
+    return rolling_arms(radius, normal, along)
+
+
+class FrameJacobian(nn.Module):
+    """Jacobian of a URDF frame: `J(q) v` is the twist of its origin in its own axes, linear velocity first.
+
+    With a radius the linear velocity is that of the material point at c - radius n of a sphere about the origin c, or,
+    with `axis`, of a cylinder about that axis of the frame, whose velocity along the axis is that of c (see
+    `torchid.Contact`): what the ground does not let move where the foot rolls. `J^T` takes the ground's wrench as read
+    at c.
+    """
+
+    def __init__(self, robot: Robot, frame: str, radius: float = 0.0, axis: str | None = None) -> None:
         """Build the constants.
 
         Args:
             robot: the robot.
             frame: name of a URDF link.
+            radius: of the sphere or cylinder [m].
+            axis: x, y or z, along which the cylinder is; None for a sphere.
 
         Raises:
             UnknownNameError: the URDF has no such link.
@@ -204,16 +259,31 @@ class FrameJacobian(nn.Module):
         unit_wrenches = wrench_transform(T_joint_frame).T
         self.register_buffer("unit_wrenches", torch.tensor(unit_wrenches.copy()), persistent=False)
         self._joints = range(robot.n_dofs)
+        self.radius, self.axis = radius, axis
 
-    def forward(self, q: Tensor) -> Tensor:
-        """Jacobian (B, 6, n_rows) at coordinates `q`, (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
+    def forward(self, q: Tensor, normal: Tensor | None = None) -> Tensor:
+        """Jacobian at coordinates.
 
-        n_rows = nv + 6 F: force/torque sensors in limbs add six columns each, after those of the joints.
+        Args:
+            q: (B, n + 7) or (B, n) for a fixed base (see `Regressor`).
+            normal: of the ground where the frame rolls, (B, 3) or (3,), unit vectors in the world (a fixed base's
+                frame); None for z.
+
+        Returns:
+            (B, 6, n_rows). n_rows = nv + 6 F: force/torque sensors in limbs add six columns each, after those of the
+            joints.
         """
         tree = self.tree
         zero = q.new_zeros(q.shape[0], tree.n + tree.base_rows)
         motion = motion_from_state(q, zero, zero, tree.n, not tree.base_rows, GRAVITY_WORLD)
         states = body_states(tree, motion, joint_motion(tree, motion))
-        wrenches = wrenches_at_base(states, self._body, self.get_buffer("unit_wrenches"))
+        units, arms = self.get_buffer("unit_wrenches"), None
+        if self.radius:
+            up = q.new_tensor([0.0, 0.0, 1.0]) if normal is None else normal
+            up = up.expand(len(q), 3)
+            if tree.base_rows:
+                up = (rotation_matrix(q[:, 3:7]).mT @ up[..., None])[..., 0]
+            arms = contact_arms(states, self._body, units[:3, :3].T, self.radius, up.T, self.axis)
+        wrenches = wrenches_at_base(states, self._body, units, arms)
         J = generalized_forces(tree, joint_screw_axes(tree, states), self._body, wrenches, self._joints)
         return J.permute(2, 0, 1)

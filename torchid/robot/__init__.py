@@ -1,7 +1,18 @@
 """From a URDF to a tree of bodies with nominal parameters."""
 
 from torchid.robot.robot import Body, Robot, load_robot
+from torchid.robot.rolling import CollisionShapes, RollingShape
 from torchid.robot.shapes import Extent, body_extents
 from torchid.robot.symmetry import MirrorPair, mirror_pairs
 
-__all__ = ["Body", "Extent", "MirrorPair", "Robot", "body_extents", "load_robot", "mirror_pairs"]
+__all__ = [
+    "Body",
+    "CollisionShapes",
+    "Extent",
+    "MirrorPair",
+    "Robot",
+    "RollingShape",
+    "body_extents",
+    "load_robot",
+    "mirror_pairs",
+]

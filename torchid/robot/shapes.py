@@ -143,7 +143,7 @@ def _shape(meshes: _Meshes, field: str, element: etree._Element) -> _Shape:
     points, spread = _points_and_spread(meshes, f"{field} <{tags[0].tag!s}", tags[0])
     origin, T = element.find("origin"), np.eye(4)
     if origin is not None:
-        rpy, xyz = (_numbers(path, f"{field} <origin", origin, name, 3, "0 0 0") for name in ("rpy", "xyz"))
+        rpy, xyz = (read_numbers(path, f"{field} <origin", origin, name, 3, "0 0 0") for name in ("rpy", "xyz"))
         T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz
     return _Shape(points, spread, np.eye(3)).moved(T)
 
@@ -152,19 +152,20 @@ def _points_and_spread(meshes: _Meshes, field: str, shape: etree._Element) -> tu
     """Points (N, 3) and spread (3, 3) of a shape in its own frame."""
     path = meshes.urdf
     if shape.tag == "box":
-        return _CORNERS * _numbers(path, field, shape, "size", 3) / 2.0, np.zeros((3, 3))
+        return _CORNERS * read_numbers(path, field, shape, "size", 3) / 2.0, np.zeros((3, 3))
     if shape.tag == "mesh":
-        scale = _numbers(path, field, shape, "scale", 3, "1 1 1")
+        scale = read_numbers(path, field, shape, "scale", 3, "1 1 1")
         return meshes.vertices(str(shape.get("filename", ""))) * scale, np.zeros((3, 3))
-    (radius,) = _numbers(path, field, shape, "radius", 1)
+    (radius,) = read_numbers(path, field, shape, "radius", 1)
     if shape.tag == "sphere":
         return np.zeros((1, 3)), radius * np.eye(3)
-    (length,) = _numbers(path, field, shape, "length", 1)  # a capsule's is that of its straight part
+    (length,) = read_numbers(path, field, shape, "length", 1)  # a capsule's is that of its straight part
     ends = np.array([[0.0, 0.0, length / 2.0], [0.0, 0.0, -length / 2.0]])
     return ends, np.diag([radius, radius, radius if shape.tag == "capsule" else 0.0])
 
 
-def _numbers(path: Path, field: str, element: etree._Element, name: str, count: int, default: str = "") -> Array:
+def read_numbers(path: Path, field: str, element: etree._Element, name: str, count: int, default: str = "") -> Array:
+    """Numbers (count,) of an attribute; UrdfError unless they are as many, finite and, of a size, not negative."""
     text = str(element.get(name, default))
     try:
         values = np.array([float(word) for word in text.split()])

@@ -16,28 +16,57 @@ _FORCES, _MOMENTS = (0, 1, 2), (3, 4, 5)
 CONTACT_TYPES = ("point", "line", "flat")
 
 
+UP = (0.0, 0.0, 1.0)
+
+
+def join_numbers(numbers: Iterable[float]) -> str:
+    """Numbers as a list of a settings file."""
+    return f"[{', '.join(f'{x:g}' for x in numbers)}]"
+
+
 @dataclass(frozen=True)
 class Contact:
     """A contact at a URDF frame.
 
     `kind`: "point" exerts three force components; "flat" all six; "line" all but the moment about the line, which runs
     along the frame's `line_axis`.
+
+    With a `radius` [m] a point is a sphere about the frame's origin c that rolls on the ground, a line a cylinder about
+    `line_axis`: the ground acts at c - radius n, n being `normal`, (3,), a unit vector in the world that points away
+    from the ground (of a cylinder its part across the axis). Readings are wrenches at c all the same; of a line's
+    force, the part along the axis then counts as acting at c, since moments across the axis are free.
     """
 
     frame: str
     kind: str
     line_axis: str = "y"
+    radius: float = 0.0
+    normal: tuple[float, float, float] = UP
 
     def __post_init__(self) -> None:
-        """Validate kind and line axis.
+        """Validate all, and give the normal unit length.
 
         Raises:
-            SensorError: an unknown kind or line axis.
+            SensorError: an unknown kind or line axis, a radius that is negative or a flat contact's, a normal of no
+                length.
         """
         if self.kind not in CONTACT_TYPES:
             raise SensorError(f"contact '{self.frame}'", "type", f"'{self.kind}'", ", ".join(CONTACT_TYPES))
         if self.line_axis not in ("x", "y", "z"):
             raise SensorError(f"contact '{self.frame}'", "line_axis", f"'{self.line_axis}'", "x, y, z")
+        if not 0.0 <= self.radius < np.inf:
+            raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g}", "a number of at least 0 [m]")
+        if self.radius and self.kind == "flat":
+            accepted = "type point (a sphere) or line (a cylinder), or radius 0"
+            raise SensorError(f"contact '{self.frame}'", "radius", f"{self.radius:g} of a flat contact", accepted)
+        length = float(np.linalg.norm(self.normal))
+        if len(self.normal) != 3 or not 0.0 < length < np.inf:
+            raise SensorError(
+                f"contact '{self.frame}'", "normal", join_numbers(self.normal), "three numbers, not all 0, in the world"
+            )
+        if length != 1.0:
+            x, y, z = (float(component) / length for component in self.normal)
+            object.__setattr__(self, "normal", (x, y, z))
 
     @property
     def components(self) -> tuple[int, ...]:
@@ -47,6 +76,11 @@ class Contact:
         if self.kind == "flat":
             return _FORCES + _MOMENTS
         return _FORCES + tuple(m for m in _MOMENTS if m != _MOMENTS["xyz".index(self.line_axis)])
+
+    @property
+    def rolling_axis(self) -> str | None:
+        """Axis of the frame about which a line rolls; None for a point, whose sphere has none."""
+        return self.line_axis if self.kind == "line" else None
 
     @property
     def component_names(self) -> tuple[str, ...]:

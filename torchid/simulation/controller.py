@@ -146,6 +146,7 @@ class Controller:
         self._coulomb, self._viscous = friction
         self._feet = feet
         self._rotations = rotations
+        self._landed: list[tuple[Array, Array] | None] = [None] * len(feet)
 
     def torque(self, goal: Goal) -> Array:
         """Torques (n,) [N m] for the plant as last observed."""
@@ -178,9 +179,13 @@ class Controller:
             p, v, a = goal.feet[i]
             off = np.concatenate([p - foot.position, rotation_error(foot.rotation, self._rotations[i])])
             if goal.load[i] > ALOFT:
+                if radius := self._feet[i].rolling_radius:
+                    off[:3] = self._rolled_position(i, foot) - foot.position
+                    foot = foot.rolling(radius)
                 off[2] = 0.0  # the floor gives way
                 weight, target = _STANDING, _CREEP * off - _FOOT_DAMPING * foot.velocity
             else:
+                self._landed[i] = None
                 rate = np.concatenate([v, np.zeros(3)]) - foot.velocity
                 weight, target = _SWING, _servo(off, rate, np.concatenate([a, np.zeros(3)]))
             rows = slice(self._feet[i].constrained)
@@ -195,6 +200,15 @@ class Controller:
         b = np.concatenate([weight * target for weight, _, target in tasks])
         return np.linalg.solve(A.T @ A + 1e-9 * np.eye(nv), A.T @ b)
 
+    def _rolled_position(self, index: int, foot: FootMotion) -> Array:
+        """Where the middle of a sphere is that has rolled from where it began to stand, (3,) [m], by its rotation."""
+        if self._landed[index] is None:
+            self._landed[index] = foot.position.copy(), foot.rotation.copy()
+        position, rotation = self._landed[index] or (foot.position, foot.rotation)
+        turned = rotation_error(rotation, foot.rotation)
+        radius = self._feet[index].rolling_radius
+        return np.asarray(position + radius * np.cross(turned, [0.0, 0.0, 1.0]))
+
     def _contact_forces(self, base: Array, load: Array, feet: list[FootMotion]) -> Array:
         """Generalized force (nv,) of the smallest point forces that give the base what it needs, (6,).
 
@@ -204,7 +218,7 @@ class Controller:
         for foot, share, motion in zip(self._feet, load, feet, strict=True):
             if share <= ALOFT:
                 continue
-            for arm in foot.arms @ motion.rotation.T:
+            for arm in foot.arms @ motion.rotation.T - [0.0, 0.0, foot.rolling_radius]:
                 maps.append(motion.J[:3] - _cross(arm) @ motion.J[3:])
                 shares.append(share)
         J, S = np.vstack(maps), np.array(shares)

@@ -49,6 +49,11 @@ class Foot:
         return np.array(self.points) - self.middle
 
     @property
+    def rolling_radius(self) -> float:
+        """Radius of a foot that is one sphere of the URDF [m], 0 of others: they stand on points."""
+        return self.radii[0] if len(self.radii) == 1 and self.radii[0] > _RADIUS else 0.0
+
+    @property
     def constrained(self) -> int:
         """Number of its six velocities that the floor constrains: three, or all six if it stands flat."""
         return 6 if form_polygon(np.array(self.points)) else 3
@@ -120,6 +125,18 @@ class FootMotion:
     velocity: Array
     J: Array
     bias: Array
+
+    def rolling(self, radius: float) -> FootMotion:
+        """The motion of the material point below the middle of a sphere that rolls on the floor.
+
+        Its linear bias is that of v + omega x l with l fixed in the world, as the floor's next material point needs.
+        """
+        J, bias = self.J.copy(), self.bias.copy()
+        J[:3] += radius * np.cross([0.0, 0.0, 1.0], self.J[3:], axisb=0, axisc=0)
+        bias[:3] += radius * np.cross([0.0, 0.0, 1.0], self.bias[3:])
+        linear, angular = self.velocity[:3], self.velocity[3:]
+        velocity = np.append(linear + radius * np.cross([0.0, 0.0, 1.0], angular), angular)
+        return FootMotion(self.position, self.rotation, velocity, J, bias)
 
 
 class Plant:

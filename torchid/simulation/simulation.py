@@ -15,6 +15,7 @@ from torchid.errors import InputError, LogError
 from torchid.logs import Log
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
+from torchid.robot.rolling import rolled_distance
 from torchid.simulation.controller import Controller, ReferenceMotion, Stance, find_stance
 from torchid.simulation.plant import Foot, Plant, find_feet, form_polygon
 
@@ -169,7 +170,7 @@ class Stability:
     Attributes:
         base_height: least and greatest height of the base's origin [m].
         height_change: most that it differed from the stance's [m].
-        slip: most that a foot moved along the floor between touching it and leaving it [m].
+        slip: most that a foot moved along the floor, beyond rolling, between touching it and leaving it [m].
         zmp_margin: least distance from the zero-moment point to the border of the support polygon [m].
         beyond_limits: most that a joint was outside its range [rad or m].
         effort: greatest torque as a share of what the URDF allows, 0 if it sets no limit.
@@ -214,6 +215,9 @@ def measure_stability(simulation: Simulation, recording: Recording) -> Stability
     R = recording.rotations
     force, moment = ((R @ part[..., None])[..., 0] for part in (wrench[..., :3], wrench[..., 3:]))
     middles = recording.feet + np.einsum("nfij,fj->nfi", R, np.array([foot.middle for foot in feet]))
+    for i, foot in enumerate(feet):
+        if foot.rolling_radius:
+            middles[:, i] -= rolled_distance(R[:, i], foot.rolling_radius, np.array([0.0, 0.0, 1.0]))
     standing = force[..., 2] > load
     bearing = np.linalg.norm(force, axis=2).max(axis=0)
     for foot, most in zip(feet, bearing, strict=True):

@@ -1,0 +1,113 @@
+"""Radii that the URDF's collision shapes give to contacts, and how far what rolls on them goes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import ANYMAL, ROBOTS, SOLO12, load
+from urdfs import joint, link, write
+
+from torchid.config.sensors import ContactConfig
+from torchid.errors import ConfigError, UrdfError
+from torchid.fitting.contacts import resolve_contacts
+from torchid.robot.rolling import rolled_distance
+
+
+def shape(geometry: str, origin: str = "") -> str:
+    return f"<collision>{origin}<geometry>{geometry}</geometry></collision>"
+
+
+def foot_on(folder: Path, *shapes: str, welded: str = "") -> Any:
+    """A robot whose foot has these collision shapes, and a toe welded to it askew that has others."""
+    with_shapes = link("foot").replace("</link>", "".join(shapes) + "</link>")
+    toe = link("toe").replace("</link>", welded + "</link>")
+    weld = joint("weld", "foot", "toe", "fixed", '<origin xyz="0.1 0 0" rpy="0 0 1.5707963267948966"/>')
+    return load(write(folder, link("base"), with_shapes, toe, joint("ankle", "base", "foot"), weld))
+
+
+@pytest.mark.parametrize(("frame", "radius"), [("FR_foot", 0.02), ("RL_foot", 0.02)])
+def test_the_feet_of_a_real_quadruped_roll_on_their_spheres(frame: str, radius: float) -> None:
+    urdf = next(path for path in ROBOTS.rglob("go1.urdf"))
+    contacts, text = resolve_contacts([ContactConfig(frame, "point")], load(urdf))
+    assert contacts[0].radius == radius
+    assert text == f"{frame}: radius 0.02 m (collision sphere)"
+
+
+def test_feet_without_a_sphere_about_their_frame_are_points() -> None:
+    """ANYmal's spheres are about another point than the frames of its feet; Solo's feet are meshes."""
+    for urdf, frame in ((ANYMAL, "LF_FOOT"), (SOLO12, "FL_FOOT")):
+        contacts, text = resolve_contacts([ContactConfig(frame, "point")], load(urdf))
+        assert (contacts[0].radius, text) == (0.0, "")
+
+
+@pytest.mark.parametrize(
+    ("shapes", "kind", "radius"),
+    [
+        ([shape('<sphere radius="0.03"/>')], "point", 0.03),
+        ([shape('<sphere radius="0.03"/>', '<origin xyz="0.0025 0 0"/>')], "point", 0.03),
+        ([shape('<sphere radius="0.03"/>', '<origin xyz="0.0035 0 0"/>')], "point", 0.0),
+        ([shape('<sphere radius="0.005"/>', '<origin xyz="0 0 0.0009"/>')], "point", 0.005),
+        ([shape('<sphere radius="0.02"/>'), shape('<sphere radius="0.03"/>')], "point", 0.03),
+        ([shape('<box size="1 1 1"/>')], "point", 0.0),
+        ([shape('<cylinder radius="0.03" length="0.1"/>')], "point", 0.0),
+        ([shape('<sphere radius="0.03"/>')], "line", 0.0),
+        ([shape('<cylinder radius="0.2" length="0.1"/>', '<origin rpy="1.5707963 0 0" xyz="0 1 0.01"/>')], "line", 0.2),
+        ([shape('<cylinder radius="0.2" length="0.1"/>', '<origin rpy="1.5707963 0 0" xyz="0 0 0.03"/>')], "line", 0.0),
+        ([shape('<cylinder radius="0.2" length="0.1"/>', '<origin rpy="1.5 0 0"/>')], "line", 0.0),
+        ([shape('<cylinder radius="0.2" length="0.1"/>')], "line", 0.0),
+        ([shape('<sphere radius="0.03"/>')], "flat", 0.0),
+    ],
+)  # fmt: skip
+def test_a_shape_about_the_origin_is_taken_and_no_other(
+    tmp_path: Path, shapes: list[str], kind: Any, radius: float
+) -> None:
+    contacts, text = resolve_contacts([ContactConfig("foot", kind)], foot_on(tmp_path, *shapes))
+    assert contacts[0].radius == radius
+    assert bool(text) == bool(radius)
+
+
+def test_a_link_that_is_welded_to_the_frame_s_lends_its_shape(tmp_path: Path) -> None:
+    robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>', '<origin xyz="0.1 0 0"/>'))
+    contacts, text = resolve_contacts([ContactConfig("toe", "point")], robot)
+    assert (contacts[0].radius, text) == (0.04, "toe: radius 0.04 m (collision sphere of foot)")
+
+
+def test_what_the_file_states_counts_more_than_the_urdf(tmp_path: Path) -> None:
+    robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>'))
+    contacts, text = resolve_contacts([ContactConfig("foot", "point", radius=0)], robot)
+    assert (contacts[0].radius, text) == (0.0, "")
+    contacts, text = resolve_contacts([ContactConfig("foot", "point", radius=0.05, normal=[0.0, 3.0, 4.0])], robot)
+    assert contacts[0].normal == (0.0, 0.6, 0.8)
+    assert text == "foot: radius 0.05 m (contacts, normal [0, 0.6, 0.8])"
+
+
+def test_what_no_contact_can_have_is_refused_in_one_line(tmp_path: Path) -> None:
+    robot = foot_on(tmp_path, shape('<sphere radius="0.04"/>'))
+    with pytest.raises(ConfigError, match=r"contacts\[0\].radius: 0.1 of a flat contact; accepted: type point \(a sph"):
+        resolve_contacts([ContactConfig("foot", "flat", radius=0.1)], robot)
+    for radius in ("no number", "-0.1"):
+        robot = foot_on(tmp_path, shape(f'<sphere radius="{radius}"/>'))
+        with pytest.raises(UrdfError, match=f"<sphere radius>: '{radius}'; accepted: 1 decimal number of at least 0"):
+            resolve_contacts([ContactConfig("foot", "point")], robot)
+
+
+def test_a_sphere_goes_as_far_as_its_circumference() -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    turned = Rotation.from_rotvec(angle[:, None] * [0.0, 1.0, 0.0]).as_matrix()
+    went = rolled_distance(turned, 0.5, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(went, angle[:, None] * [0.5, 0.0, 0.0], atol=1e-12)
+    spun = Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    np.testing.assert_allclose(rolled_distance(spun, 0.5, np.array([0.0, 0.0, 1.0])), 0.0, atol=1e-12)
+
+
+def test_a_cylinder_rolls_across_its_axis() -> None:
+    angle = np.linspace(0.0, 1.0, 200)
+    axis = np.array([0.0, 0.8, 0.6])
+    level = Rotation.align_vectors([axis], [[0.0, 1.0, 0.0]])[0]
+    turned = (Rotation.from_rotvec(angle[:, None] * axis) * level).as_matrix()
+    went = rolled_distance(turned, 0.5, np.array([0.0, 0.0, 1.0]), "y")
+    np.testing.assert_allclose(went, angle[:, None] * np.cross(axis, [0.0, -0.6, 0.8]) * 0.5, atol=1e-12)

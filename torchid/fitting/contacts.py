@@ -1,0 +1,61 @@
+"""Contacts of an experiment file, with the radii on which they roll and where these are stated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from torchid.config.sensors import ContactConfig
+from torchid.errors import ConfigError, SensorError
+from torchid.robot import CollisionShapes, Robot, RollingShape
+from torchid.sensing import Contact, validate_contacts
+from torchid.sensing.sensors import UP, join_numbers
+
+
+def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[tuple[Contact, ...], str]:
+    """The contacts of a robot, and which of them roll on what, "" if none does.
+
+    Raises:
+        UnknownNameError: a frame that the URDF does not have.
+        SensorError: a frame named twice.
+        ConfigError: a radius of a flat contact, a normal of no length.
+        UrdfError: a collision shape that is not described by numbers.
+    """
+    contacts = validate_contacts(robot, [Contact(c.frame, c.type, c.line_axis) for c in settings])
+    out: list[Contact] = []
+    sources: list[str] = []
+    shapes: CollisionShapes | None = None
+    for index, (contact, given) in enumerate(zip(contacts, settings, strict=True)):
+        x, y, z = UP if given.normal is None else given.normal
+        try:
+            contact = replace(contact, normal=(x, y, z), radius=0.0 if given.radius == "auto" else given.radius)
+        except SensorError as error:
+            raise ConfigError.at_field(f"contacts[{index}].{error.field}", error.found, error.accepted) from error
+        source = f"contacts[{index}].radius"
+        if given.radius == "auto" and contact.kind != "flat":
+            shapes = shapes or CollisionShapes(robot)
+            shape = rolling_shape(shapes, contact)
+            if shape is not None:
+                contact = replace(contact, radius=shape.radius)
+                source = f"collision {shape.kind}" + (f" of {shape.link}" if shape.link != contact.frame else "")
+        out.append(contact)
+        sources.append(source)
+    return tuple(out), _describe(out, sources)
+
+
+def rolling_shape(shapes: CollisionShapes, contact: Contact) -> RollingShape | None:
+    """The collision sphere of a point, or cylinder of a line, on which the URDF lets a contact roll; None without."""
+    if contact.kind == "flat":
+        return None
+    return shapes.about(contact.frame, contact.line_axis if contact.kind == "line" else None)
+
+
+def _describe(contacts: Sequence[Contact], sources: Sequence[str]) -> str:
+    """The contacts that roll by radius and normal, with where the radius is stated."""
+    frames: dict[str, list[str]] = {}
+    for contact, source in zip(contacts, sources, strict=True):
+        if contact.radius:
+            tilted = "" if contact.normal == UP else f", normal {join_numbers(contact.normal)}"
+            text = f"{contact.radius:g} m ({source.partition('[')[0]}{tilted})"
+            frames.setdefault(text, []).append(contact.frame)
+    return "; ".join(f"{', '.join(names)}: radius {text}" for text, names in frames.items())
