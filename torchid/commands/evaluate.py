@@ -16,6 +16,7 @@ from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, set_up
 from torchid.guards import MAX_YAML, read_bytes
+from torchid.logs.time_range import split_range
 from torchid.problem import Metrics, RowBuilder
 from torchid.report.figures import error_figure, save_figure
 from torchid.report.parameter_files import read_parameters, read_shared_extras
@@ -37,7 +38,7 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
 
     Args:
         run: folder that `identify` wrote.
-        logs: log files, preprocessed as the run's own were.
+        logs: log files, or parts of them (`walk.npz[30:]`), preprocessed as the run's own were.
         device: where to compute; None: where the run did.
 
     Raises:
@@ -59,7 +60,7 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
         metrics = {}
         for log in samples:
             pair = scorer.score_logs([log], compared, lambda n: bars.advance(evaluating, n))
-            metrics[Path(log.source).stem] = pair
+            metrics[split_range(log.source).name] = pair
             if not any(x is not None for x in pair.identified.rms.values()):
                 warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
         document = _document(metrics, reader.excluded)
@@ -83,7 +84,8 @@ def _output(run: Path, logs: Sequence[str | Path]) -> Path:
     """
     if not (run / "config.yaml").is_file():
         raise ConfigError(run, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
-    names = [Path(log).stem for log in logs]
+    parts = [split_range(log) for log in logs]
+    names = [part.name for part in parts]
     again = [name for name in names if names.count(name) > 1]
     if again:
         raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
@@ -91,7 +93,7 @@ def _output(run: Path, logs: Sequence[str | Path]) -> Path:
 
     def check() -> None:
         refuse_link(output.parent)
-        check_free(output, True, EVALUATION, logs)
+        check_free(output, True, EVALUATION, [part.file for part in parts])
 
     ranks.from_first(check, "output")
     return output
@@ -104,7 +106,7 @@ def _document(metrics: Mapping[str, Comparison[Metrics]], excluded: Mapping[str,
         for name, pair in metrics.items()
     }
     for path, count in excluded.items():
-        document[Path(path).stem]["excluded_samples"] = count
+        document[split_range(path).name]["excluded_samples"] = count
     return document
 
 

@@ -16,7 +16,7 @@ from torchid.commands.cached_factors import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
-from torchid.commands.reading import LogReader
+from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.results import Identification, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
@@ -247,10 +247,12 @@ def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str
     if settings.compressed:
         files["train"] = []
     reading = bars.add_task("reading logs", total=sum(map(len, files.values())))
-    return {
+    logs = {
         name: reader.read(paths, None if name == "test" else experiment.sensors, lambda _: bars.advance(reading))
         for name, paths in files.items()
     }
+    check_parts(logs)
+    return logs
 
 
 def _reader(experiment: Experiment) -> LogReader:
