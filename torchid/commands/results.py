@@ -39,6 +39,7 @@ from torchid.report.figures import (
     parameter_figure,
     save_figure,
 )
+from torchid.report.ridge import ridge_figure
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.report.tensorboard import RunEvents
 
@@ -146,6 +147,8 @@ def write_run(
     }
     if run.extras:
         figures["extras"] = extra_figure(run.extras)
+    if run.ridge is not None:
+        figures["ridge"] = ridge_figure(run.ridge)
     with during("writing", config.output), new_folder(config.output, config.overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
@@ -279,6 +282,8 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
         if run.validation is not None:
             events.write_errors(0, {"left_out": run.validation.nominal})
             events.write_errors(last, {"left_out": run.validation.identified})
+        if run.ridge is not None:
+            events.write_ridges(run.ridge)
         events.write_verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
         events.write_fit(last, estimate)
         events.write_identifiability(
