@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +10,13 @@ from pathlib import Path
 from torchid import ranks
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
-from torchid.commands.results import draw_forces
+from torchid.commands.results import draw_forces, noise_of_readings
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, set_up
-from torchid.guards import MAX_YAML, read_bytes
+from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import split_range
 from torchid.problem import Metrics, RowBuilder
 from torchid.report.figures import error_figure, save_figure
@@ -50,7 +51,8 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
     with progress_bars() as bars:
         with about_file(folder / "config.yaml"):
             experiment = set_up(config)
-        builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
+        builder = experiment.builder(experiment.sensors)
+        evaluation = experiment.evaluation(noise_of_readings(config, _states_noise(folder / "metrics.json")))
         compared = _calibrations(experiment, builder, folder / "parameters.json")
         reading = bars.add_task("reading logs", total=len(logs))
         reader = LogReader(experiment, folder)
@@ -99,10 +101,23 @@ def _output(run: Path, logs: Sequence[str | Path]) -> Path:
     return output
 
 
+def _states_noise(path: Path) -> bool:
+    """Whether the settings of a run stated the noise of any sensor; its settings have the estimated one as well."""
+    try:
+        groups = json.loads(read_bytes(path, MAX_JSON))["noise"]["groups"]
+        return any(group["origin"] == "stated" for group in groups)
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
+
+
 def _document(metrics: Mapping[str, Comparison[Metrics]], excluded: Mapping[str, int]) -> dict[str, dict[str, object]]:
     """What `metrics.json` has, by name of a log."""
     document: dict[str, dict[str, object]] = {
-        name: {"identified": pair.identified.as_dict(), "nominal": pair.nominal.as_dict()}
+        name: {
+            "identified": pair.identified.as_dict(),
+            "nominal": pair.nominal.as_dict(),
+            "noise_floor": pair.identified.noise,
+        }
         for name, pair in metrics.items()
     }
     for path, count in excluded.items():

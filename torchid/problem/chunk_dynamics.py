@@ -41,6 +41,15 @@ class ChunkKinematics:
     screw_axes: Tensor
     rotation_world_base: Tensor | None
 
+    def every(self, step: int) -> ChunkKinematics:
+        """The kinematics of every `step`-th sample from the first on, views."""
+        return ChunkKinematics(
+            JointMotion(*(x[..., ::step] for x in vars(self.joints).values())),
+            BodyStates(*(x[..., ::step] for x in vars(self.states).values())),
+            self.screw_axes[..., ::step],
+            None if self.rotation_world_base is None else self.rotation_world_base[::step],
+        )
+
 
 @dataclass(frozen=True)
 class ChunkDynamics(ChunkKinematics):
