@@ -74,6 +74,7 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
         "broken, without": [broken, f"output={folder / 'broken' / 'run'}", "preprocessing.cache_gb=0"],
         "broken": [broken, f"output={folder / 'broken' / 'run'}"],
         "apart": [three, f"output={folder / 'machineRANK' / 'run'}"],
+        "parts": [f'logs.train=["{demo}/gaps.npz[:50%]", "{demo}/gaps.npz[50%:]"]', f"output={folder}/parts/run"],
         "little room": [three, f"output={folder / 'little' / 'run'}", "preprocessing.cache_gb=0.001"],
     }
     common = ["logs.test=[]", "preprocessing.cutoff_hz=8"]
@@ -100,6 +101,13 @@ def test_samples_and_warnings_are_those_without_a_cache(read: dict[str, list[Any
     for one in read[name]:
         assert (one["logs"], one["said"], one["error"]) == (expected["logs"], expected["said"], "")
         assert one["sources"] == expected["sources"]
+
+
+def test_parts_of_one_log_are_shared_like_logs(read: dict[str, list[Any]]) -> None:
+    parts = ["gaps.npz[50%:]", "gaps.npz[:50%]"]
+    assert sorted(sum((x["opened"] for x in read["parts"]), [])) == parts
+    assert all(len(x["opened"]) == 1 for x in read["parts"])
+    assert read["parts"][0]["logs"] == read["parts"][1]["logs"]
 
 
 def test_a_log_that_cannot_be_read_fails_as_without_a_cache(read: dict[str, list[Any]]) -> None:

@@ -18,7 +18,7 @@ import torchid
 from torchid.cli import main
 from torchid.config import load_config
 from torchid.errors import BaseLostError
-from torchid.fitting.cross_validation import Scorer, TrainingScore, with_all_readings
+from torchid.fitting.cross_validation import RidgeChoice, Scorer, TrainingScore, with_all_readings
 from torchid.fitting.experiment import set_up
 from torchid.identifiability.base_parameters import StateReport, _base_statistics, require_base
 from torchid.logs import read_log
@@ -34,6 +34,7 @@ from torchid.problem import (
 )
 from torchid.problem.compression import FOLDS, merge_folds, merge_states, split_into_folds
 from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
+from torchid.report.ridge import ridge_figure
 from torchid.sensing import Contact, SensorNoise, named_sensors
 
 FEET = [f"{place}_foot" for place in ("front_left", "front_right", "rear_left", "rear_right")]
@@ -189,6 +190,35 @@ def test_the_chosen_ridge_is_the_largest_within_a_standard_error_of_the_best(run
     assert found["ridge"] == max(good)
     assert yaml.safe_load((run / "config.yaml").read_text())["estimator"]["ridge"] == found["ridge"]
     assert min(found["tried"]) < found["ridge"] < max(found["tried"]), "the grid holds the best"
+
+
+def test_tensorboard_and_a_figure_have_the_error_of_every_ridge(run: Path) -> None:
+    found = json.loads((run / "metrics.json").read_text())["ridge_selection"]
+    events = EventAccumulator(str(run))
+    events.Reload()
+    for tag, values in (("mean_square", found["mean_square"]), ("standard_error", found["standard_error"])):
+        curve = {one.step: one.value for one in events.Scalars(f"ridge/held_out_{tag}")}
+        assert curve == pytest.approx(dict(zip(range(-7, 2), values, strict=True)), rel=1e-6)
+    assert "ridge" in events.Tags()["images"]
+    assert (run / "ridge.png").is_file()
+
+
+def test_the_figure_marks_the_chosen_ridge_and_those_as_good_as_the_best() -> None:
+    tried = (0.0, 0.001, 0.01, 0.1, 1.0)
+    choice = RidgeChoice(0.1, tried, (2.2, 2.0, 2.1, 2.3, 3.0), (0.1, 0.0, 0.2, 0.3, 0.4))
+    axes = ridge_figure(choice).axes[0]
+    curve, least, chosen = axes.get_lines()
+    np.testing.assert_array_equal(curve.get_xdata(), tried[1:])
+    np.testing.assert_array_equal(curve.get_ydata(), choice.mean_square[1:])
+    assert np.ravel(least.get_ydata())[0] == 2.0
+    assert (float(np.ravel(chosen.get_xdata())[0]), float(np.ravel(chosen.get_ydata())[0])) == (0.1, 2.3)
+    (shaded,) = [patch for patch in axes.patches if patch.get_zorder() == 0]
+    x = shaded.get_window_extent().transformed(axes.transData.inverted())
+    assert 1e-4 < x.x0 < 1e-3
+    assert 0.1 < x.x1 < 1.0
+    assert axes.get_xscale() == "log"
+    assert "[" in axes.get_xlabel()
+    assert "[" in axes.get_ylabel()
 
 
 def test_evaluate_and_tensorboard_have_the_whitened_projected_residual(run: Path) -> None:

@@ -15,7 +15,7 @@ from rich.progress import Progress
 
 from torchid import ranks
 from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
-from torchid.commands.reading import LogReader
+from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
 from torchid.errors import ConfigError, SensorError, UnknownNameError, during
@@ -168,7 +168,9 @@ def _read(request: AnalysisRequest, bars: Progress) -> tuple[list[Samples], list
     def done(_: Path) -> None:
         bars.advance(reading)
 
-    return reader.read(files.train, request.proposed, done), reader.read(files.test, None, done)
+    train, test = reader.read(files.train, request.proposed, done), reader.read(files.test, None, done)
+    check_parts({"train": train, "test": test})
+    return train, test
 
 
 def scenarios(scene: Scene, train: Sequence[Samples]) -> dict[str, tuple[ContactState, ...]]:

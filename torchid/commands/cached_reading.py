@@ -17,7 +17,8 @@ from torchid.errors import TorchidWarning, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.noise import recorded_sensors
 from torchid.logs.blocks import GIGABYTE, log_bytes
-from torchid.logs.containers import LogKind, existing_log_kind, list_bag_files
+from torchid.logs.containers import LogKind, existing_log_kind, log_files
+from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.problem.extras import recorded_components
 from torchid.sensing import SensorSet
@@ -106,13 +107,13 @@ class CachedReader(LogReader):
 
     def _together(self, path: Path) -> float:
         room = self.scene.config.preprocessing.memory_gb - self._held
-        bound = room if path.suffix.lower() == ".csv" else 0.0  # for others, `log_bytes` does not depend on it
-        content = self._content(path)
-        size = None if content is None else self.cache.array_bytes(path, content.checksum, bound)
+        content, file = self._content(path), split_range(path).file
+        bound = room if file.suffix.lower() == ".csv" else 0.0  # for others, `log_bytes` does not depend on it
+        size = None if content is None else self.cache.array_bytes(file, content.checksum, bound)
         if size is None:
             size = log_bytes(path, GIGABYTE * room)
             if content is not None:
-                self.cache.note_array_bytes(path, content.checksum, bound, size)
+                self.cache.note_array_bytes(file, content.checksum, bound, size)
         return self._held + size / GIGABYTE
 
     def _samples(self, path: Path, required: SensorSet | None, together: float | None) -> Samples:
@@ -152,10 +153,11 @@ class CachedReader(LogReader):
         """What is in a log; None where it cannot be read, which reading then says."""
         if path not in self._contents:
             existing_log_kind(path)
-            files = list_bag_files(path) or [path]
+            files = log_files(path)
             try:
                 states = file_states(files)
-                self._contents[path] = _Content(self.cache.checksum(path, files), files, states)
+                checksum = self.cache.checksum(split_range(path).file, files)
+                self._contents[path] = _Content(checksum, files, states)
             except OSError:
                 return None
         return self._contents[path]
@@ -173,7 +175,9 @@ class CachedReader(LogReader):
         drops = settings.exclude_condemned or settings.contact_margin_s is not None
         masks = None if required is None or not drops else [required.torque.tolist(), required.wrench.tolist()]
         blocks = None if together is None else settings.memory_gb
-        return content_key([self._scene_content, content.checksum, path.suffix.lower(), blocks, masks])
+        part = split_range(path)
+        log = [content.checksum, part.file.suffix.lower(), None if part.range is None else part.range.text]
+        return content_key([self._scene_content, log, blocks, masks])
 
     def _store(self, key: str, path: Path, read: ReadLog) -> bool:
         """Whether an entry is there now; none is written of a log that has changed since its key was made."""

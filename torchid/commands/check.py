@@ -23,6 +23,7 @@ from torchid.log_checks.check import check
 from torchid.logs import Log, Topics, read_log, write_log
 from torchid.logs.blocks import open_log_blocks
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, new_log_kind
+from torchid.logs.time_range import split_range
 from torchid.report.figures import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
@@ -224,7 +225,7 @@ def convert(source: str | Path, target: str | Path, topics: str | Path | None = 
     """
     path = Path(target)
     new_log_kind(path)
-    check_free_file(path, "OUT", overwrite, (source, *([] if topics is None else [topics])))
+    check_free_file(path, "OUT", overwrite, (split_range(source).file, *([] if topics is None else [topics])))
     mapped = None if topics is None else load_topics(topics)
     with progress_bars() as bars:
         reading = bars.add_task("reading", total=None)

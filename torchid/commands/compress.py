@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -23,8 +24,9 @@ from torchid.fitting.factor_files import FactorFile, write_factors
 from torchid.fitting.fleet import row_model
 from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports, require_base, state_reports
-from torchid.logs.containers import FACTORS, list_bag_files
+from torchid.logs.containers import FACTORS, log_files
 from torchid.logs.remote import is_url
+from torchid.logs.time_range import split_range
 from torchid.problem import Samples
 from torchid.problem.compressed_log import compress_log
 from torchid.problem.sampled_rows import LogElsewhere
@@ -99,7 +101,7 @@ def compress(config: ExperimentConfig, output: str | Path) -> Compression:
 
 
 def _file_names(logs: Sequence[Path]) -> list[str]:
-    names = [f"{log.stem}{FACTORS}" for log in logs]
+    names = [f"{split_range(log).name}{FACTORS}" for log in logs]
     again = [name for name in names if names.count(name) > 1]
     if again:
         found = f"several logs that would become {excerpt(again[0])}"
@@ -110,7 +112,7 @@ def _file_names(logs: Sequence[Path]) -> list[str]:
 def _size(path: Path) -> int:
     """Bytes of a log's files; 1 if they are not here, which reading will say."""
     with suppress(OSError):
-        return sum(file.stat().st_size for file in list_bag_files(path) or [path])
+        return sum(file.stat().st_size for file in log_files(path))
     return 1
 
 
@@ -160,11 +162,17 @@ def _compressed(
             compress_log(log, builder, lambda n: bars.advance(streaming, n)),
             model,
             path.name,
-            file_checksum(*(list_bag_files(path) or [path])),
+            _checksum(path),
             float(log.time[-1] - log.time[0]),
             left_out,
             own,
         )
+
+
+def _checksum(path: Path) -> str:
+    """SHA-256 of a log's files, and for a part of one of that with the range: parts of a log are different logs."""
+    whole, part = file_checksum(*log_files(path)), split_range(path)
+    return whole if part.range is None else hashlib.sha256(f"{whole}{part.range.text}".encode()).hexdigest()
 
 
 def _write_all(

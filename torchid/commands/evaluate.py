@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +10,14 @@ from pathlib import Path
 from torchid import ranks
 from torchid.commands.folder import EVALUATION, RUN, check_free, new_folder, refuse_link, write_json
 from torchid.commands.reading import LogReader
-from torchid.commands.results import draw_forces
+from torchid.commands.results import draw_forces, noise_of_readings
 from torchid.config import load_config
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
 from torchid.fitting.experiment import Experiment, set_up
-from torchid.guards import MAX_YAML, read_bytes
+from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
+from torchid.logs.time_range import split_range
 from torchid.problem import Metrics, RowBuilder
 from torchid.report.figures import error_figure, save_figure
 from torchid.report.parameter_files import read_parameters, read_shared_extras
@@ -37,7 +39,7 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
 
     Args:
         run: folder that `identify` wrote.
-        logs: log files, preprocessed as the run's own were.
+        logs: log files, or parts of them (`walk.npz[30:]`), preprocessed as the run's own were.
         device: where to compute; None: where the run did.
 
     Raises:
@@ -49,7 +51,8 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
     with progress_bars() as bars:
         with about_file(folder / "config.yaml"):
             experiment = set_up(config)
-        builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
+        builder = experiment.builder(experiment.sensors)
+        evaluation = experiment.evaluation(noise_of_readings(config, _states_noise(folder / "metrics.json")))
         compared = _calibrations(experiment, builder, folder / "parameters.json")
         reading = bars.add_task("reading logs", total=len(logs))
         reader = LogReader(experiment, folder)
@@ -59,7 +62,7 @@ def evaluate(run: str | Path, logs: Sequence[str | Path], device: str | None = N
         metrics = {}
         for log in samples:
             pair = scorer.score_logs([log], compared, lambda n: bars.advance(evaluating, n))
-            metrics[Path(log.source).stem] = pair
+            metrics[split_range(log.source).name] = pair
             if not any(x is not None for x in pair.identified.rms.values()):
                 warn(f"{log.source}: neither joint torques nor contact wrenches to compare predictions with")
         document = _document(metrics, reader.excluded)
@@ -83,7 +86,8 @@ def _output(run: Path, logs: Sequence[str | Path]) -> Path:
     """
     if not (run / "config.yaml").is_file():
         raise ConfigError(run, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
-    names = [Path(log).stem for log in logs]
+    parts = [split_range(log) for log in logs]
+    names = [part.name for part in parts]
     again = [name for name in names if names.count(name) > 1]
     if again:
         raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
@@ -91,20 +95,33 @@ def _output(run: Path, logs: Sequence[str | Path]) -> Path:
 
     def check() -> None:
         refuse_link(output.parent)
-        check_free(output, True, EVALUATION, logs)
+        check_free(output, True, EVALUATION, [part.file for part in parts])
 
     ranks.from_first(check, "output")
     return output
 
 
+def _states_noise(path: Path) -> bool:
+    """Whether the settings of a run stated the noise of any sensor; its settings have the estimated one as well."""
+    try:
+        groups = json.loads(read_bytes(path, MAX_JSON))["noise"]["groups"]
+        return any(group["origin"] == "stated" for group in groups)
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
+
+
 def _document(metrics: Mapping[str, Comparison[Metrics]], excluded: Mapping[str, int]) -> dict[str, dict[str, object]]:
     """What `metrics.json` has, by name of a log."""
     document: dict[str, dict[str, object]] = {
-        name: {"identified": pair.identified.as_dict(), "nominal": pair.nominal.as_dict()}
+        name: {
+            "identified": pair.identified.as_dict(),
+            "nominal": pair.nominal.as_dict(),
+            "noise_floor": pair.identified.noise,
+        }
         for name, pair in metrics.items()
     }
     for path, count in excluded.items():
-        document[Path(path).stem]["excluded_samples"] = count
+        document[split_range(path).name]["excluded_samples"] = count
     return document
 
 

@@ -16,15 +16,15 @@ from torchid.commands.cached_factors import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
-from torchid.commands.reading import LogReader
-from torchid.commands.results import Identification, write_run
+from torchid.commands.reading import LogReader, check_parts
+from torchid.commands.results import Identification, noise_of_readings, write_run
 from torchid.commands.training import Training, descent_settings, require_trainable, training_folder
 from torchid.config import ExperimentConfig, inputs_of
 from torchid.errors import NumericalWarning, format_count, warn_about_file
 from torchid.estimators import Conditions, Estimate, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
-from torchid.fitting.experiment import Experiment, set_up, with_noise
+from torchid.fitting.experiment import Experiment, set_up, stated_noise, with_noise
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.fleet import read_fleet
@@ -161,7 +161,8 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
     with progress_bars() as bars:
         ready = _prepare(config, clock, bars)
         experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
-        evaluation, builder = experiment.evaluation(), fitter.builder
+        builder, stated = fitter.builder, bool(stated_noise(config.sensors.noise))
+        evaluation = experiment.evaluation(noise_of_readings(experiment.config, stated))
         training, solve = None, None
         with clock("solve"):
             if experiment.config.estimator.name == "sgd":
@@ -249,10 +250,12 @@ def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str
     if settings.compressed:
         files["train"] = []
     reading = bars.add_task("reading logs", total=sum(map(len, files.values())))
-    return {
+    logs = {
         name: reader.read(paths, None if name == "test" else experiment.sensors, lambda _: bars.advance(reading))
         for name, paths in files.items()
     }
+    check_parts(logs)
+    return logs
 
 
 def _reader(experiment: Experiment) -> LogReader:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchid import ranks
 from torchid.config.experiment import PreprocessingConfig
+from torchid.config.logs import require_apart
 from torchid.errors import LogError, about_file
 from torchid.fitting.experiment import Scene
 from torchid.log_checks import Checked, drop_condemned
@@ -39,6 +40,7 @@ from torchid.logs.preprocess import (
     warn_of_gaps,
 )
 from torchid.logs.spill import Filled, Spill
+from torchid.logs.time_range import LogPart, share_samples, split_range
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
@@ -147,6 +149,28 @@ class LogReader:
         if not settings.exclude_condemned:
             return None
         return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz)
+
+
+def check_parts(logs: Mapping[str, Sequence[Samples]]) -> None:
+    """Make sure that no sample has two uses, of parts of logs of which the experiment file alone does not say.
+
+    Args:
+        logs: by their key in `logs`.
+
+    Raises:
+        ConfigError: as `require_apart`.
+
+    Warns:
+        TorchidWarning: likewise.
+    """
+    parts = {key: [split_range(log.source) for log in of_key] for key, of_key in logs.items()}
+    spans = {split_range(log.source): log.time[[0, -1]].tolist() for of_key in logs.values() for log in of_key}
+
+    def share(one: LogPart, other: LogPart) -> bool:
+        (start, stop), (of_other, until) = spans[one], spans[other]
+        return share_samples(one.range, other.range) is None and start <= until and of_other <= stop
+
+    require_apart(parts, share)
 
 
 def fits_contact_offsets(scene: Scene) -> bool:

@@ -17,7 +17,7 @@ from torchid.errors import during
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate, Violation
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
-from torchid.fitting.experiment import Experiment
+from torchid.fitting.experiment import Experiment, stated_noise
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import NoiseSummary
@@ -28,20 +28,21 @@ from torchid.identifiability.contributions import Contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, Metrics, Samples
 from torchid.problem.metrics import SETS, WHITENED, WorseThanNominal, describe_worse, worse_than_nominal
-from torchid.problem.predict import force_series
+from torchid.problem.predict import force_series, noise_series
 from torchid.report import identified_urdf, parameters_document
 from torchid.report.figures import (
-    ForceSeries,
     contribution_figure,
     error_figure,
     extra_figure,
-    force_figure,
     identifiability_figure,
     parameter_figure,
     save_figure,
 )
+from torchid.report.forces import ForceSeries, force_figure
+from torchid.report.ridge import ridge_figure
 from torchid.report.tables import table_text, verdict_counts_table
 from torchid.report.tensorboard import RunEvents
+from torchid.sensing import SensorNoise
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -149,6 +150,8 @@ def write_run(
     }
     if run.extras:
         figures["extras"] = extra_figure(run.extras)
+    if run.ridge is not None:
+        figures["ridge"] = ridge_figure(run.ridge)
     with during("writing", config.output), new_folder(config.output, config.overwrite) as folder:
         (folder / "config.yaml").write_text(dump_config(config))
         write_json(folder / "parameters.json", parameters_document(robot, run.estimate, run.by_state, run.extras))
@@ -161,6 +164,15 @@ def write_run(
         _write_curves(run, folder, {name: folder / f"{name}.png" for name in figures})
     if training is not None:
         training.remove_checkpoint()
+
+
+def noise_of_readings(config: ExperimentConfig, stated: bool) -> SensorNoise | None:
+    """The noise of readings as recorded, NaN where it is unknown; None where it is not `stated` of any sensor.
+
+    Noise that was estimated beside a stated one is in proportion to it. Without any, it comes from the residuals
+    themselves, which it could not judge.
+    """
+    return SensorNoise.of_known(stated_noise(config.sensors.noise)) if stated else None
 
 
 def draw_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> Figure:
@@ -176,7 +188,8 @@ def draw_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[C
         measured.append(readings)
         predicted.append(forces)
     robot, nominal = evaluation.robot, predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured
-    series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured[1], nominal, predicted[1])
+    noise = None if evaluation.noise is None else noise_series(evaluation.builder, part, evaluation.noise)
+    series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured[1], nominal, predicted[1], noise)
     return force_figure(series, robot.dof_names, robot.base_rows)
 
 
@@ -190,6 +203,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         document[f"{name}_nominal"] = None if pair is None else pair.nominal.as_dict()
     variation = {name: pair.identified.base_force_of_variation for name, pair in run.metrics.items()}
     return document | {
+        "noise_floor": {name: pair.identified.noise for name, pair in run.metrics.items()},
         "base_force_rms_of_variation": variation,
         "rank": estimate.rank,
         "parameters": int(estimate.phi.size),
@@ -294,6 +308,8 @@ def _write_curves(run: Identification, folder: Path, figures: Mapping[str, Path]
         if run.validation is not None:
             events.write_errors(0, {"left_out": run.validation.nominal})
             events.write_errors(last, {"left_out": run.validation.identified})
+        if run.ridge is not None:
+            events.write_ridges(run.ridge)
         events.write_verdict(last, describe_worse(run.worse) or "nowhere worse than the URDF's parameters")
         events.write_fit(last, estimate)
         events.write_identifiability(

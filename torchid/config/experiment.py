@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, validate_keys
+from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
@@ -25,10 +26,9 @@ from torchid.config.sensors import (
     spelled_out,
     validate_choice,
 )
-from torchid.errors import ConfigError, about_file, warn_about_file
+from torchid.errors import ConfigError, about_file
 from torchid.logs import Topics
-from torchid.logs.containers import FACTORS, READABLE, list_bag_files
-from torchid.logs.remote import RemoteFile, as_path, list_matching
+from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
 from torchid.settings import NotNegative, Positive, Seed
 
@@ -99,35 +99,6 @@ class ActuatorsConfig:
 
 
 @dataclass(config=STRICT, frozen=True)
-class LogsConfig:
-    """Logs to fit on, held-out logs for the early stopping of a descent, and logs for tests alone.
-
-    A name with `*` or `?` is a pattern for all files that match. `topics` describes the topics of bags. The logs to fit
-    on may be factors of logs, from `torchid compress`, which may lie elsewhere: `s3://...`.
-    """
-
-    train: Annotated[list[Annotated[Path, BeforeValidator(as_path)]], Field(min_length=1)]
-    test: list[Path] = dataclasses.field(default_factory=list)
-    validation: list[Path] = dataclasses.field(default_factory=list)
-    topics: Topics | None = None
-
-    @property
-    def compressed(self) -> bool:
-        """Whether the logs to fit on are factors."""
-        return any(path.suffix == FACTORS for path in self.train)
-
-    def require_samples(self, command: str) -> None:
-        """Refuse factors where samples are needed.
-
-        Raises:
-            ConfigError: names the file.
-        """
-        if self.compressed:
-            found = f"{self.train[0]}, factors of a log, where torchid {command} needs its samples"
-            raise ConfigError.at_field("logs.train", found, f"logs ({', '.join(READABLE)})")
-
-
-@dataclass(config=STRICT, frozen=True)
 class PreprocessingConfig:
     """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
 
@@ -176,8 +147,12 @@ class AnalyzeConfig(_Common):
     logs: LogsConfig | None = None
 
 
-def _with_sensors_spelled_out(settings: Settings, overriding: Settings) -> Settings:
-    """Sensors as a mapping, so that an override of one of its keys joins it; a named set replaces sensors by name."""
+def _spelled_out(settings: Settings, overriding: Settings) -> Settings:
+    """Parts of logs by name, and sensors as a mapping.
+
+    An override of one key of sensors joins the others; a named set replaces sensors by name.
+    """
+    settings = entries_spelled_out(settings)
     if "sensors" not in settings:
         return settings
     sensors = settings["sensors"]
@@ -191,10 +166,10 @@ _EXPERIMENT = FileKind(
     name="experiment",
     keys="robot, logs, sensors, output",
     list_example="contacts=[{frame: l_sole, type: flat}]",
-    paths=("robot.urdf", "logs.train.*", "logs.test.*", "logs.validation.*"),
+    paths=("robot.urdf", *(f"logs.{name}.*{of}" for name in SETS for of in ("", ".file"))),
     urls=("logs.train.*",),
     outputs=("output",),
-    prepare=_with_sensors_spelled_out,
+    prepare=_spelled_out,
     accepted={
         "sensors": CHOICE_ACCEPTED,
         "sensors.offsets": SCOPES_ACCEPTED,
@@ -251,7 +226,7 @@ def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeCon
 def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
     """URDF and logs; a bag may be a folder."""
     logs = config.logs
-    return [config.robot.urdf, *([*logs.train, *logs.validation, *logs.test] if logs else [])]
+    return [config.robot.urdf, *(logs.files if logs else [])]
 
 
 def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
@@ -314,17 +289,9 @@ def _check_extras(config: _Common) -> None:
 def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:
     """The logs with patterns resolved; refuses logs that an estimator has no use for, or with two uses."""
     _check_held_out(config.estimator, logs)
-    files = {key: _matching(f"logs.{key}", getattr(logs, key)) for key in ("train", "test", "validation")}
-    for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
-        both = sorted({*files[key]} & {*files["test"]})
-        if both:
-            warn_about_file(f"logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion")
-    both = sorted({*files["train"]} & {*files["validation"]})
-    if both:
-        raise ConfigError.at_field("logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
+    checked = resolve_logs(logs)
     if logs.topics is not None:
         check_topics(logs.topics)
-    checked = LogsConfig(**files, topics=logs.topics)
     _check_factors(config, checked)
     return checked
 
@@ -349,30 +316,6 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
     if config.preprocessing.exclude_condemned:
         accepted = f"false, as torchid compress has left them out if it was told so{logs_too}"
         raise ConfigError.at_field("preprocessing.exclude_condemned", f"true, {reason}", accepted)
-
-
-def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
-    """The paths, with every file that matches in place of a name with * or ? in it."""
-    out: list[Path] = []
-    for path in paths:
-        if isinstance(path, RemoteFile) and path.suffix != FACTORS:
-            raise ConfigError.at_field(field, f"{path}, by URL", f"{FACTORS} files by URL; logs on this machine")
-        if not {"*", "?"} & set(path.name) or path.exists():
-            out.append(path)
-            continue
-        files: Sequence[Path]
-        if isinstance(path, RemoteFile):
-            files = list_matching(path)
-        else:
-            matching = path.parent.glob(path.name.replace("[", "[[]"))
-            files = sorted(file for file in matching if file.is_file() or list_bag_files(file))
-        if not files:
-            raise ConfigError.at_field(field, f"no file matches {path}", "a log, or a pattern of several")
-        out += files
-    again = [path for path in out if out.count(path) > 1]
-    if again:
-        raise ConfigError.at_field(field, f"{again[0]} is given twice", "every log once")
-    return out
 
 
 def _check_held_out(estimator: EstimatorConfig, logs: LogsConfig) -> None:

@@ -110,6 +110,7 @@ _NO_YAML = (
     ArithmeticError, RecursionError,
 )  # fmt: skip
 _LONGEST = 300  # characters of another package's message that a message of ours repeats
+_BRACKETS = '; names with brackets take quotes in a list: ["walk.npz[0:30]"]'
 _LONGEST_NAME, _LONGEST_PATH = 255, 4095  # bytes, of file systems
 
 T = TypeVar("T")
@@ -223,7 +224,8 @@ def _why(error: Exception) -> str:
     if isinstance(error, UnicodeDecodeError):
         return "no text"
     spoken = isinstance(error, (OmegaConfBaseException, yaml.YAMLError, ValueError))
-    return excerpt(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
+    why = excerpt(str(error) if spoken else f"{type(error).__name__}: {error}", _LONGEST)
+    return why + _BRACKETS * ("flow sequence" in why)
 
 
 def _parsed(text: str) -> Settings:

@@ -262,6 +262,7 @@ class Scorer:
         for (measured, error), own in zip(pairs, squares, strict=True):
             for sums, square in ((measured, own.measured), (error, own.error)):
                 sums.whitened.add_squares(square, own.rows)
+            measured.whitened_noise.add_squares(own.noise, own.rows)
         return pairs
 
     def _force_sums(
@@ -302,10 +303,11 @@ class Scorer:
 
 @dataclass
 class ResidualSquares:
-    """Sums of squares of whitened rows: of their residuals, and of what was measured."""
+    """Sums of squares of whitened rows: of their residuals, of what was measured, and of the noise a filter leaves."""
 
     error: float = 0.0
     measured: float = 0.0
+    noise: float = 0.0
     rows: int = 0
 
 
@@ -329,6 +331,7 @@ def sum_residuals(
             residual = R[:, :-1] @ one.columns(builder, by_source[part.source]).cpu() - R[:, -1]
             squares.error += float(residual @ residual)
             squares.measured += float(R[:, -1] @ R[:, -1])
+            squares.noise += part.factor.independent_rows
             squares.rows += part.factor.rows
     return out
 

@@ -94,9 +94,9 @@ class Scene:
         """Builder of the rows of some sensors, on the device of the settings."""
         return RowBuilder(self.robot, self.contacts, sensors, self.terms).to(self.config.device)
 
-    def evaluation(self) -> Evaluation:
-        """Evaluation of predicted forces, on the device of the settings."""
-        return Evaluation(self.robot, self.contacts, self.config.device, self.terms)
+    def evaluation(self, noise: SensorNoise | None = None) -> Evaluation:
+        """Evaluation of predicted forces, on the device of the settings; `noise` to compare their errors with."""
+        return Evaluation(self.robot, self.contacts, self.config.device, self.terms, noise)
 
     def conditions(self) -> Conditions:
         """Conditions on the parameters.

@@ -30,6 +30,7 @@ from torchid.logs.log import (
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
 from torchid.logs.tables import read_table, table_blocks, table_size
+from torchid.logs.time_range import split_range
 
 GIGABYTE = 1e9
 _ACCEPTED = "a plain array of numbers, truth values or text"
@@ -40,6 +41,8 @@ _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a numbe
 def log_bytes(path: Path, limit: float) -> int:
     """Bytes of a log's arrays: an upper bound for CSV files below a limit, 0 for bags, which are read whole.
 
+    A part of a log counts as all of it.
+
     Raises:
         LogError: the file cannot be read.
     """
@@ -47,6 +50,7 @@ def log_bytes(path: Path, limit: float) -> int:
     if kind is LogKind.BAG:
         return 0
     with about_file(path):
+        path = split_range(path).file
         if kind is LogKind.TABLE:
             most = _BYTES_PER_LETTER * path.stat().st_size
             return most if path.suffix.lower() == ".csv" and most <= limit else table_size(path)
@@ -58,6 +62,30 @@ def count_samples_from(start: int, error: LogError) -> LogError:
     """An error in a part of a log, with samples counted from the start of the log."""
     found = _SAMPLE.sub(lambda match: f"sample {int(match[1]) + start}", error.found)
     return LogError(error.source, error.field, found.replace(" in all)", " near it)"), error.accepted)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Successive rows, from `start` to before `stop`, of an array that is read where it is sliced."""
+
+    array: LazyArray
+    start: int
+    stop: int
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of these rows."""
+        return (self.stop - self.start, *self.array.shape[1:])
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the elements."""
+        return self.array.dtype
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        """Some of these rows."""
+        start, stop, _ = rows.indices(self.stop - self.start)
+        return self.array[self.start + start : self.start + stop]
 
 
 @dataclass
@@ -84,6 +112,11 @@ class LogBlocks:
     def row_bytes(self) -> int:
         """Bytes of a sample."""
         return 8 + sum(int(np.prod(x.shape[1:])) * x.dtype.itemsize for x in self.fields.values())
+
+    def part(self, samples: slice) -> LogBlocks:
+        """The log as if nothing but some successive samples had been recorded."""
+        fields = {name: _Rows(array, samples.start, samples.stop) for name, array in self.fields.items()}
+        return LogBlocks(self.source, self.names, self.time[samples], fields)
 
     def read(self, samples: slice, only: tuple[str, ...] | None = None, allow_gaps: bool = False) -> Log:
         """Some samples as a log, or only the fields `only` of them with positions of 0; `allow_gaps` as of `read_log`.
@@ -129,7 +162,7 @@ def open_log_blocks(path: Path, folder: Path | None) -> Iterator[LogBlocks]:
     """Open a log (.h5, .npz, .csv or .parquet).
 
     Arrays of .h5 and .npz files are read in place unless these are compressed; others are unpacked to temporary files
-    in `folder`, or to memory without one.
+    in `folder`, or to memory without one. Of a part of a log no other samples are there.
 
     Raises:
         LogError: the file is invalid.
@@ -137,11 +170,14 @@ def open_log_blocks(path: Path, folder: Path | None) -> Iterator[LogBlocks]:
     """
     with ExitStack() as stack:
         with about_file(path):
-            if existing_log_kind(path) is LogKind.TABLE:
-                names, fields = _open_table(path, folder)
+            part = split_range(path)
+            if existing_log_kind(part.file) is LogKind.TABLE:
+                names, fields = _open_table(part.file, folder)
             else:
-                names, fields = _open_arrays(stack.enter_context(open_container(path, whole=False)), folder)
+                names, fields = _open_arrays(stack.enter_context(open_container(part.file, whole=False)), folder)
             blocks = _check_blocks(str(path), names, fields)
+            if part.range is not None:
+                blocks = blocks.part(part.range.select(blocks.time))
         yield blocks
 
 

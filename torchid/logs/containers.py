@@ -20,6 +20,7 @@ from torchid.errors import LogError, TorchidError, during, excerpt
 from torchid.guards import MAX_ARRAYS, check_fields, check_names, check_unpacked_size
 from torchid.logs.hdf5 import Hdf5, import_h5py, save_hdf5
 from torchid.logs.spill import LazyArray, Spill
+from torchid.logs.time_range import split_range
 from torchid.staging import atomic_file
 
 # --------------------------------------------------------------------------------------------------- kinds of log files
@@ -44,11 +45,12 @@ class LogKind(Enum):
 
 
 def existing_log_kind(path: Path) -> LogKind:
-    """The kind of an existing log.
+    """The kind of an existing log, or of the file that it is a part of.
 
     Raises:
         LogError: the file does not exist, or its extension is unknown.
     """
+    path = split_range(path).file
     if os.path.isdir(path):  # Path.is_dir raises where a name is too long
         if list_bag_files(path):
             return LogKind.BAG
@@ -74,6 +76,12 @@ def list_bag_files(path: Path) -> list[Path]:
     if not os.path.isdir(path):
         return [path] if path.suffix.lower() in BAGS else []
     return sorted(file for file in path.iterdir() if file.suffix.lower() in BAGS[1:] and file.is_file())
+
+
+def log_files(path: Path) -> list[Path]:
+    """The files of a log, or of the one that it is a part of: several of a bag in a folder."""
+    file = split_range(path).file
+    return list_bag_files(file) or [file]
 
 
 def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:

@@ -48,6 +48,7 @@ from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate
 from torchid.logs.ros_read import read_bag
 from torchid.logs.ros_topics import Topics
 from torchid.logs.tables import read_table, save_table
+from torchid.logs.time_range import TimeRange, split_range
 
 
 def read_log(
@@ -63,7 +64,8 @@ def read_log(
     the derivative of the world velocity whichever frame it is expressed in.
 
     Args:
-        path: the file; of a ROS 2 bag also its folder.
+        path: the file; of a ROS 2 bag also its folder. A range of time behind it takes a part of the log, as if nothing
+            else had been recorded: `walk.npz[0:30]`, see `TimeRange`.
         topics: topics of a bag (.bag, .mcap, .db3).
         progress: called with the share of a bag that has been read.
         allow_gaps: accept NaN in poses and their derivatives, which `torchid.check` reports.
@@ -75,18 +77,33 @@ def read_log(
         TorchidWarning: messages of a bag without time stamps, duplicate messages, or channels that are NaN in some.
     """
     with during("reading", os.fspath(path)):
-        kind = existing_log_kind(Path(path))
+        part = split_range(path)
+        kind = existing_log_kind(part.file)
         if kind is LogKind.ARRAYS:
-            raw = _read_arrays(Path(path))
+            raw = _read_arrays(part.file)
         else:
-            raw = read_table(Path(path)) if kind is LogKind.TABLE else read_bag(Path(path), topics, progress)
+            raw = read_table(part.file) if kind is LogKind.TABLE else read_bag(part.file, topics, progress)
             check_fields_given(raw)
-        return build_log(raw, allow_gaps)
+        return build_log(raw if part.range is None else _cut(raw, part.range), allow_gaps)
 
 
 def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
     """The log of the fields of a file, in canonical frames and orders; LogError for invalid fields."""
     return _to_canonical(_check_values(raw, allow_gaps))
+
+
+def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange) -> dict[str, NDArray[Any]]:
+    """The fields of a file with the samples of a part alone; LogError where their numbers differ."""
+    check_shape("time", raw["time"], SHAPES["time"], {})
+    time = to_float64("time", raw["time"])
+    check_time(time)
+    samples, out = range_.select(time), dict(raw)
+    for name, array in raw.items():
+        if field_shape(name)[:1] == ("N",):
+            if array.shape[:1] != time.shape:
+                raise LogError.at_field(name, f"shape {array.shape}", f"{len(time)} samples, as time has")
+            out[name] = array[samples]
+    return out
 
 
 def check_fields_given(names: Collection[str]) -> None:

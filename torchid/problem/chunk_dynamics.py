@@ -46,6 +46,15 @@ class ChunkKinematics:
     arms: Mapping[int, Tensor]
     recorded_normals: bool
 
+    def every(self, step: int) -> ChunkKinematics:
+        """The kinematics of every `step`-th sample from the first on, views."""
+        return ChunkKinematics(
+            JointMotion(*(x[..., ::step] for x in vars(self.joints).values())),
+            BodyStates(*(x[..., ::step] for x in vars(self.states).values())),
+            self.screw_axes[..., ::step],
+            None if self.rotation_world_base is None else self.rotation_world_base[::step],
+        )
+
 
 @dataclass(frozen=True)
 class ChunkDynamics(ChunkKinematics):

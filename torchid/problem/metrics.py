@@ -14,11 +14,11 @@ from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import ProgressCallback, map_chunks
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import ExtraTerms
-from torchid.problem.predict import measured_and_predicted_forces
+from torchid.problem.predict import measured_and_predicted_forces, reading_variance
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.robot import Robot
-from torchid.sensing import Contact, named_sensors
+from torchid.sensing import Contact, SensorNoise, named_sensors
 
 WHITENED = "projected_residual"
 """The group of the rows of a fit: whitened, and projected so that nothing unmeasured is in them."""
@@ -52,6 +52,7 @@ ADVICE = (
 )
 """Advice for parameters that predict worse than the nominal ones."""
 
+_NOISE_SAMPLES = 64  # of a chunk, for the noise of its measured forces
 _CLEARLY = 1.05  # ratio of errors above which one is worse
 _MATTERS = 1e-3  # of the measured rms: smaller differences, as on data without noise, do not count
 
@@ -64,7 +65,9 @@ class Metrics:
     `by_joint_relative` by joint. Relative means rms of the error over
     rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
     the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
-    mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
+    mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs. `noise`,
+    by group, is the rms that the stated noise of the readings leaves after the filter, which no model predicts; None
+    where it is not known.
     """
 
     rms: dict[str, float | None]
@@ -74,6 +77,7 @@ class Metrics:
     base_force_of_variation: float | None
     limb_rms: dict[str, float | None] = field(default_factory=dict)
     limb_relative: dict[str, float | None] = field(default_factory=dict)
+    noise: dict[str, float | None] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
         """As `metrics.json` has it."""
@@ -94,11 +98,19 @@ class Evaluation:
     """Evaluates several parameter vectors at once, in one pass over the logs."""
 
     def __init__(
-        self, robot: Robot, contacts: Sequence[Contact], device: str = "cpu", terms: ExtraTerms | None = None
+        self,
+        robot: Robot,
+        contacts: Sequence[Contact],
+        device: str = "cpu",
+        terms: ExtraTerms | None = None,
+        noise: SensorNoise | None = None,
     ) -> None:
-        """Set robot, contacts and actuator terms; all recorded sensors of a log are used."""
+        """Set robot, contacts and actuator terms; all recorded sensors of a log are used.
+
+        `noise`: standard deviations of readings as recorded, NaN where unknown, to compare errors with.
+        """
         actuators = replace(terms or ExtraTerms(), offsets={}, scales={})
-        self.robot = robot
+        self.robot, self.noise = robot, noise
         sensors = named_sensors("joints", robot.n, len(contacts), ft=len(robot.ft_names))
         self.builder = RowBuilder(robot, contacts, sensors, actuators).to(device)
 
@@ -125,6 +137,8 @@ class Evaluation:
                 for total, predicted in zip(sums, (torch.zeros_like(forces.torque), *forces.predicted), strict=True):
                     total.rows.add(predicted - forces.measured)
                 vectors = torch.cat([forces.torque[None], forces.predicted - forces.torque])
+                if self.noise is not None:
+                    sums[0].noise.merge(self._noise_sums(samples, state, kinematics, self.noise))
                 for group in null_space_components(builder, state, kinematics, vectors):
                     for total, inside in zip(sums, group, strict=True):
                         total.projected.add(inside.flatten()[:, None])
@@ -133,11 +147,22 @@ class Evaluation:
         parts = map_chunks(logs, builder, sum_chunks, progress=progress)
         return [ForceSums.total(same) for same in zip(*parts, strict=True)]
 
+    def _noise_sums(
+        self, samples: Samples, state: ContactState, kinematics: ChunkKinematics, noise: SensorNoise
+    ) -> SumsOfSquares:
+        """Sums of the variances of the measured forces, from some samples of a chunk: they hardly change."""
+        sums, step = SumsOfSquares(self.robot.n_rows), -(-len(samples) // _NOISE_SAMPLES)
+        part = samples.every(step)
+        variance = reading_variance(self.builder, part, state, kinematics.every(step), noise)
+        sums.add(variance.sqrt(), len(samples) / len(part))
+        return sums
+
     def summarize(self, measured: ForceSums, errors: ForceSums) -> Metrics:
         """Metrics from sums of squares."""
         base = self.robot.base_rows
         rms, size = errors.rms(base, self.robot.n), measured.rms(base, self.robot.n)
-        joints = slice(base, base + self.robot.n)
+        n = self.robot.n
+        joints = slice(base, base + n)
         by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
         groups = ERROR_GROUPS if errors.whitened.count.any() else ROW_GROUPS
         names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
@@ -149,6 +174,7 @@ class Evaluation:
             _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
             {group: finite_or_none(rms[group]) for group in limbs},
             {group: _ratio(rms[group], size[group]) for group in limbs},
+            {} if self.noise is None else measured.noise_rms(base, n),
         )
 
 
@@ -226,12 +252,14 @@ def null_space_components(
 class ForceSums:
     """Sums of squares of generalized forces or their errors: of rows, and inside the contacts' null space.
 
-    `whitened`: of the rows of a fit, V_x^T f of its sensors in units of their noise.
+    `whitened`: of the rows of a fit, V_x^T f of its sensors in units of their noise. `noise` of rows: what the noise of
+    readings adds to the measured forces; `whitened_noise`: to the rows of a fit.
     """
 
     def __init__(self, n_rows: int) -> None:
         """Start empty."""
         self.rows, self.projected, self.whitened = SumsOfSquares(n_rows), SumsOfSquares(1), SumsOfSquares(1)
+        self.noise, self.whitened_noise = SumsOfSquares(n_rows), SumsOfSquares(1)
 
     @classmethod
     def total(cls, parts: Sequence[ForceSums]) -> ForceSums:
@@ -241,7 +269,20 @@ class ForceSums:
             out.rows.merge(part.rows)
             out.projected.merge(part.projected)
             out.whitened.merge(part.whitened)
+            out.noise.merge(part.noise)
+            out.whitened_noise.merge(part.whitened_noise)
         return out
+
+    def noise_rms(self, base_rows: int, n: int) -> dict[str, float | None]:
+        """Rms of the noise by group of rows, as `rms`; None where it is not known."""
+        joints = self.noise.rms(slice(base_rows, base_rows + n))
+        by_group = {
+            "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
+            "base_force": self.noise.pooled(slice(0, 3)) if base_rows else np.nan,
+            "base_moment": self.noise.pooled(slice(3, 6)) if base_rows else np.nan,
+            WHITENED: self.whitened_noise.pooled(slice(None)),
+        }
+        return {group: finite_or_none(x) for group, x in by_group.items()}
 
     def rms(self, base_rows: int, n: int) -> dict[str, float]:
         """Rms by group of rows, NaN for an empty group, of a robot with `base_rows` and n joints."""

@@ -23,6 +23,7 @@ from torchid.problem.samples import Samples
 from torchid.regressor.columns import body_wrenches
 from torchid.regressor.regressor import generalized_forces, wrench_transform, wrenches_at_base
 from torchid.regressor.tree import KinematicTree
+from torchid.sensing import SensorNoise
 
 _ROWS = 2**16  # of a log on disk that are in memory at a time
 
@@ -119,6 +120,40 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, k
     return total
 
 
+def reading_variance(
+    builder: RowBuilder, samples: Samples, state: ContactState, kinematics: ChunkKinematics, noise: SensorNoise
+) -> Tensor:
+    """Variance of S^T tau + J_C^T lambda by the noise of the readings, (B, n_rows) [N^2, (N m)^2].
+
+    A filter leaves a share of it, one over the `oversampling` of the samples. NaN where a reading that enters, or its
+    noise, is not known.
+
+    Args:
+        builder: with all recorded sensors.
+        samples: of one contact state.
+        state: that state.
+        kinematics: of the samples.
+        noise: standard deviations of the readings as recorded, NaN where unknown.
+    """
+    tree = builder.tree
+    total = samples.time.new_zeros(tree.n_rows, len(samples))
+    std = noise.dof_std(tree.n, tree.n_dofs)
+    torque = builder.recorded_torque(samples).T
+    total[tree.base_rows :] = total.new_tensor(std**2)[:, None] + 0.0 * torque  # NaN where it was not recorded
+    for contact, active in enumerate(state):
+        if active:
+            body, T_joint_frame = builder.frames[contact]
+            possible = list(builder.contacts[contact].components)
+            units = total.new_tensor((wrench_transform(T_joint_frame) * noise.wrench_std).T[possible])
+            wrenches = wrenches_at_base(kinematics.states, body, units)
+            joints = builder.columns.joints_above(body)
+            rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
+            recorded = 0.0 * builder.recorded_wrench(samples, contact, kinematics)[:, possible].sum(1)
+            forces = generalized_forces(tree, kinematics.screw_axes, body, wrenches, joints)
+            total[rows] += forces.square().sum(0) + recorded
+    return total.T / samples.oversampling
+
+
 def measured_and_predicted_forces(
     builder: RowBuilder, samples: Samples, state: ContactState, phi: Tensor, kinematics: ChunkKinematics
 ) -> GeneralizedForces:
@@ -135,6 +170,17 @@ def measured_and_predicted_forces(
             column = dof_extra_column(extra, samples, builder.tree)
             predicted[..., base_rows + extra.dof] += phi[:, number, None] * column
     return GeneralizedForces(measured, torque, predicted)
+
+
+def noise_series(builder: RowBuilder, samples: Samples, noise: SensorNoise) -> Array:
+    """Standard deviation of the measured forces of a log in its order by `reading_variance`, (N, n_rows) [N, N m]."""
+    out = np.empty((len(samples), builder.tree.n_rows))
+    with torch.no_grad(), one_thread():
+        for state, index in chunks_by_state(samples):
+            chunk = samples[index].to(builder.device)
+            variance = reading_variance(builder, chunk, state, builder.kinematics(chunk), noise)
+            out[index if isinstance(index, slice) else index.numpy()] = variance.sqrt().cpu().numpy()
+    return out
 
 
 def force_series(builder: RowBuilder, samples: Samples, phi: Array) -> tuple[Array, Array]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -26,7 +25,7 @@ from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.parameters import PARAMETERS, PER_BODY, WRENCH_COMPONENTS, Array
 from torchid.problem import Metrics
-from torchid.problem.metrics import BASE_ROWS, ERROR_GROUPS, group_name
+from torchid.problem.metrics import ERROR_GROUPS, group_name
 from torchid.report.tables import MARKS, marks_legend
 from torchid.robot import Robot
 from torchid.robot.tree import BodyJoint
@@ -43,7 +42,7 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
 }
 #: Colors of forces and parameters: measured, by the URDF, and identified.
-_MEASURED, _NOMINAL, _IDENTIFIED = "black", "tab:orange", "tab:blue"
+MEASURED, NOMINAL, IDENTIFIED = "black", "tab:orange", "tab:blue"
 #: Extra parameters: rows of a panel (`parameters.json` has all), longest error bar over the largest value, and vertical
 #: offsets for logs in one row.
 _MAX_PANEL_ROWS, _MAX_ERROR_RATIO, _LANES = 40, 4, 5
@@ -66,51 +65,7 @@ def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
         figure.savefig(path, dpi=130, format=kind)
 
 
-# ---------------------------------------------------------------------------------------------------- forces and errors
-
-
-@dataclass(frozen=True)
-class ForceSeries:
-    """Forces of one log for plotting: `measured`, `nominal`, `identified`, (N, n_rows) each, NaN where unknown."""
-
-    source: str
-    time: Array
-    measured: Array
-    nominal: Array
-    identified: Array
-
-
-@matplotlib.rc_context(STYLE)
-def force_figure(series: ForceSeries, dof_names: Sequence[str], base_rows: int, max_rows: int = 6) -> Figure:
-    """Measured and predicted forces over time: the largest base force and moment, then the largest of the others."""
-    rows = _largest_rows(series, base_rows, max_rows)
-    figure = Figure(figsize=(9.0, 1.7 * max(len(rows), 1) + 0.8), layout="constrained")
-    axes = figure.subplots(max(len(rows), 1), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, row in zip(axes, rows, strict=False):
-        axis.plot(series.time, series.measured[:, row], color=_MEASURED, linewidth=1.6, label="measured")
-        axis.plot(series.time, series.nominal[:, row], color=_NOMINAL, linewidth=1.0, label="predicted, URDF")
-        axis.plot(
-            series.time, series.identified[:, row], color=_IDENTIFIED, linewidth=1.0, label="predicted, identified"
-        )
-        name = BASE_ROWS[row] if row < base_rows else dof_names[row - base_rows]
-        force = row < min(base_rows, 3) or name.endswith((".fx", ".fy", ".fz"))
-        axis.set_title(name, loc="left", fontsize=9)
-        axis.set_ylabel("[N]" if force else "[N m]")
-    if rows:
-        axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
-    axes[-1].set_xlabel("time [s]")
-    figure.suptitle(f"Generalized forces, {series.source}", x=0.01, ha="left")
-    return figure
-
-
-def _largest_rows(series: ForceSeries, base_rows: int, max_rows: int) -> list[int]:
-    """Numbers of the rows to plot: by rms of the measured force."""
-    size = np.sqrt(np.nanmean(np.square(np.nan_to_num(series.measured)), axis=0))
-    size[~np.isfinite(series.measured).any(axis=0)] = -1.0
-    base = [max(rows, key=lambda row: size[row]) for rows in (range(3), range(3, 6))] if base_rows else []
-    base = [row for row in base if size[row] >= 0.0]
-    joints = sorted((row for row in range(base_rows, len(size)) if size[row] >= 0.0), key=lambda row: -size[row])
-    return base + sorted(joints[: max_rows - len(base)])
+# ---------------------------------------------------------------------------------------------------- errors
 
 
 @matplotlib.rc_context(STYLE)
@@ -122,8 +77,8 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         index = np.arange(len(groups))
         for shift, metrics, color, label in (
-            (-0.2, nominal, _NOMINAL, "URDF"),
-            (0.2, identified, _IDENTIFIED, "identified"),
+            (-0.2, nominal, NOMINAL, "URDF"),
+            (0.2, identified, IDENTIFIED, "identified"),
         ):
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
@@ -157,8 +112,8 @@ def parameter_figure(body_names: Sequence[str], nominal: Array, identified: Arra
     error = np.nan_to_num(standard_error[:, mass])
     for axis, quantity, unit in zip(axes, _QUANTITIES, ("kg", "kg m", "kg m²"), strict=True):
         before, after = (_QUANTITIES[quantity](phi) for phi in (nominal, identified))
-        axis.barh(index - 0.2, before, 0.38, color=_NOMINAL, label="URDF")
-        axis.barh(index + 0.2, after, 0.38, color=_IDENTIFIED, label="identified")
+        axis.barh(index - 0.2, before, 0.38, color=NOMINAL, label="URDF")
+        axis.barh(index + 0.2, after, 0.38, color=IDENTIFIED, label="identified")
         if unit == "kg":
             axis.errorbar(after, index + 0.2, xerr=error, fmt="none", ecolor="black", elinewidth=0.8)
         axis.set_xlabel(f"{quantity} [{unit}]")
@@ -205,7 +160,7 @@ def contribution_figure(groups: Mapping[str, Sequence[tuple[str, float]]], max_r
     axes = figure.subplots(len(shown), 1, squeeze=False, height_ratios=[count + 0.8 for count in counts])[:, 0]
     for axis, (group, pairs) in zip(axes, shown.items(), strict=True):
         names, bits = zip(*pairs, strict=True)
-        bars = axis.barh(range(len(pairs)), bits, 0.7, color=_IDENTIFIED)
+        bars = axis.barh(range(len(pairs)), bits, 0.7, color=IDENTIFIED)
         axis.bar_label(bars, fmt="%.3g", fontsize=8, padding=2)
         axis.set_yticks(range(len(pairs)), [fill(name, 60) for name in names], fontsize=7)
         axis.set_ylim(len(pairs) - 0.4, -0.6)

@@ -81,6 +81,10 @@ def _error_table(columns: Mapping[str, Comparison[Metrics]]) -> Table:
         if group == "base_force":
             shares = [m.base_force_of_variation for pair in columns.values() for m in pair]
             table.add_row("  of its variation", *("-" if x is None else f"({100 * x:.3g} %)" for x in shares))
+        floors = [pair.identified.noise.get(group) for pair in columns.values()]
+        if any(floor is not None for floor in floors):
+            cells = (("", "-" if floor is None else f"{floor:.4g}") for floor in floors)
+            table.add_row("  noise of readings", *(cell for pair in cells for cell in pair))
     return table
 
 

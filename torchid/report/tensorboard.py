@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 
 from torchid.estimators import ConstrainedEstimate, Epoch, Estimate
+from torchid.fitting.cross_validation import RidgeChoice
 from torchid.identifiability.information import InformationGain
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, SETS
@@ -66,6 +68,14 @@ class RunEvents:
                     self._writer.add_scalar(f"relative_error_{name}/{group}", metrics.relative[group], step)
                 if metrics.rms.get(group) is not None:
                     self._writer.add_scalar(f"rms_error_{name}/{group}", metrics.rms[group], step)
+
+    def write_ridges(self, choice: RidgeChoice) -> None:
+        """Errors on held-out folds by ridge: in these charts, steps are the decades of ridges, -3 for 0.001."""
+        tried = zip(choice.tried, choice.mean_square, choice.standard_error, strict=True)
+        for ridge, mean, error in tried:
+            decade = round(math.log10(ridge))
+            self._writer.add_scalar("ridge/held_out_mean_square", mean, decade)
+            self._writer.add_scalar("ridge/held_out_standard_error", error, decade)
 
     def write_verdict(self, step: int, text: str) -> None:
         """Whether the identified parameters predict held-out blocks and test logs better than the URDF's."""

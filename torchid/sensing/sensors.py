@@ -131,6 +131,11 @@ class SensorNoise:
     ft_force: float | None = None
     ft_moment: float | None = None
 
+    @classmethod
+    def of_known(cls, known: Mapping[str, Any]) -> SensorNoise:
+        """The noise of readings with what is known of it by field, and NaN for all else."""
+        return cls(**dict.fromkeys(("joint_torque", "contact_force", "contact_moment"), np.nan) | dict(known))
+
     @property
     def base_std(self) -> Array:
         """Standard deviations of the six base rows along the levelled base's axes, (6,) [N, N m]."""

@@ -1,0 +1,210 @@
+"""Commands on parts of one recording: what they find is what files of those parts would give."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from demo import shortened_demo
+from large import assert_same, tensors
+from matplotlib.figure import Figure
+from trainings import FIGURES
+
+from torchid.cli import main
+from torchid.commands.cached_reading import CachedReader, open_cache
+from torchid.commands.compress import compress
+from torchid.commands.reading import LogReader
+from torchid.config import load_config
+from torchid.errors import ConfigError, TorchidWarning
+from torchid.fitting.experiment import set_up
+from torchid.fitting.factor_files import read_factors
+from torchid.logs import read_log, write_log
+from torchid.problem import Samples
+
+FEET = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rear_right")]
+
+
+@pytest.fixture(autouse=True)
+def _without_figures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
+    for figure in FIGURES:
+        monkeypatch.setattr(f"torchid.commands.results.{figure}", lambda *_: Figure(figsize=(1.0, 1.0)))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo, and files of the first seven and the last six seconds of its training log."""
+    folder = shortened_demo(tmp_path_factory.mktemp("parts") / "demo", 1_300)
+    log = read_log(folder / "sway_train.npz")
+    write_log(log.select(slice(0, 700)), folder / "first.npz")
+    write_log(log.select(slice(700, None)), folder / "last.npz")
+    return folder
+
+
+def read(demo: Path, logs: list[str], *overrides: str) -> list[Samples]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        config = load_config(demo / "quadruped.yaml", overrides)
+        scene = set_up(replace(config, logs=replace(config.logs, train=[demo / name for name in logs])))
+        return LogReader(scene, demo).read(scene.config.logs.train, None)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("preprocessing.cutoff_hz=8",),
+        ("preprocessing.cutoff_hz=null",),
+        ("preprocessing={cutoff_hz: 8, sample_rate_hz: 50, contact_margin_s: 0.05}",),
+        ("preprocessing.exclude_condemned=true",),
+    ],
+)
+def test_no_filter_carries_samples_from_one_part_into_the_other(demo: Path, settings: tuple[str, ...]) -> None:
+    parts = read(demo, ["sway_train.npz[:7]", "sway_train.npz[7:]"], *settings)
+    files = read(demo, ["first.npz", "last.npz"], *settings)
+    for part, file in zip(parts, files, strict=True):
+        assert tensors(part).keys() == tensors(file).keys()
+        for name, x in tensors(part).items():
+            assert torch.equal(x.nan_to_num(), tensors(file)[name].nan_to_num()), name
+    assert [Path(part.source).name for part in parts] == ["sway_train.npz[:7]", "sway_train.npz[7:]"]
+
+
+def test_parts_that_are_read_block_by_block_are_the_same(demo: Path) -> None:
+    names = ["sway_train.npz[:7]", "sway_train.npz[7:]"]
+    blocks = read(demo, names, "preprocessing.memory_gb=0.0001")
+    for part, whole in zip(blocks, read(demo, names), strict=True):
+        assert part.folder is not None
+        assert_same(part, whole, 1e-9)
+
+
+def identified(demo: Path, out: Path, logs: dict[str, list[Any]], *overrides: str) -> dict[str, Any]:
+    given = [f"logs.{name}={json.dumps(entries)}" for name, entries in logs.items()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        assert main(["identify", str(demo / "quadruped.yaml"), f"output={out}", *given, *overrides]) == 0
+    found: dict[str, Any] = json.loads((out / "metrics.json").read_text())
+    return found
+
+
+def test_a_run_on_parts_is_that_on_files_of_them(
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(demo)
+    parts = {"train": ["sway_train.npz[:7]"], "test": ["sway_train.npz[7:]"]}
+    of_parts = identified(demo, tmp_path / "parts", parts)
+    of_files = identified(demo, tmp_path / "files", {"train": ["first.npz"], "test": ["last.npz"]})
+    for key in ("train", "test", "cross_validation", "samples", "rank"):
+        assert of_parts[key] == of_files[key], key
+    again = identified(demo, tmp_path / "again", parts)  # from the cache
+    assert "samples of 2 logs" in capsys.readouterr().out
+    assert again["test"] == of_parts["test"]
+    assert main(["evaluate", str(tmp_path / "parts"), "--log", "sway_train.npz[7:]"]) == 0
+    evaluated = json.loads((tmp_path / "parts/evaluation/sway_train[7:]/metrics.json").read_text())
+    for name, value in evaluated["sway_train[7:]"]["identified"].items():
+        assert value == pytest.approx(of_parts["test"][name], rel=1e-9), name
+
+
+def test_a_fold_is_tested_on_what_is_left_is_fitted_on(
+    demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(demo)
+    logs = {"train": [{"file": "sway_train.npz", "without_fold": 2}], "test": [{"file": "sway_train.npz", "fold": 2}]}
+    metrics = identified(demo, tmp_path / "run", logs, "preprocessing.cutoff_hz=null")
+    assert metrics["samples"] == 1_300 - 260 - 4 - 4  # two samples at each end of each part are not differentiated
+    written = yaml.safe_load((tmp_path / "run/config.yaml").read_text())["logs"]
+    assert [Path(x).name for x in written["train"]] == ["sway_train.npz[:20%]", "sway_train.npz[40%:]"]
+    assert [Path(x).name for x in written["test"]] == ["sway_train.npz[20%:40%]"]
+
+
+def test_parts_that_turn_out_to_overlap_are_warned_of_or_refused(demo: Path, tmp_path: Path) -> None:
+    def analyzed(train: str, test: str) -> None:
+        from torchid.commands.identify import identify
+
+        overrides = [f"logs={{train: {train}, test: {test}}}".replace("sway", f"{demo}/sway"), f"output={tmp_path}/x"]
+        identify(load_config(demo / "quadruped.yaml", [*overrides, "overwrite=true"]))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        warnings.filterwarnings("error", "logs.test")
+        analyzed('["sway_train.npz[:6]"]', '["sway_train.npz[-6:]"]')
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        analyzed('["sway_train.npz[:6]"]', '["sway_train.npz[-8:]"]')
+    assert any("sway_train.npz[-8:] is fitted on as well" in str(one.message) for one in caught)
+    with pytest.raises(ConfigError, match="logs.train: .* share samples"):
+        analyzed('["sway_train.npz[:6]", "sway_train.npz[-8:]"]', "[]")
+
+
+def test_the_cache_tells_parts_apart(demo: Path, tmp_path: Path) -> None:
+    def reader() -> CachedReader:
+        scene = set_up(load_config(demo / "quadruped.yaml", [f"output={tmp_path / 'run'}"]))
+        cache = open_cache(scene)
+        assert cache is not None
+        return CachedReader(scene, cache)
+
+    paths = [demo / f"sway_train.npz{text}" for text in ("", "[:7]", "[7:]", "[:7.01]")]
+    first, second = reader(), reader()
+    lengths = [len(x) for x in first.read(paths, None)]
+    assert not first.reused
+    assert [len(x) for x in second.read(paths, None)] == lengths
+    assert len({*second.keys.values()}) == len(set(lengths)) == 4
+    assert second.reused == {*map(str, paths)}
+
+
+def test_parts_are_compressed_to_files_of_their_own(demo: Path, tmp_path: Path) -> None:
+    parts = [demo / f"sway_train.npz{text}" for text in ("[:7]", "[7:]")]
+    config = load_config(demo / "quadruped.yaml", [f"logs.train={[*map(str, parts)]}", "logs.test=[]"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        found = compress(config, tmp_path / "factors")
+    assert [one.name for one in found.files] == ["sway_train[:7].factor", "sway_train[7:].factor"]
+    assert len({read_factors(tmp_path / "factors" / one.name).sha256 for one in found.files}) == 2
+    fitted = identified(demo, tmp_path / "run", {"train": [str(tmp_path / "factors" / "*.factor")], "test": []})
+    assert fitted["samples"] == sum(one.samples for one in found.files)
+
+
+def test_a_part_is_checked_and_converted(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(demo)
+    main(["check", "sway_train.npz[-6:]"])
+    assert "600 samples" in " ".join(capsys.readouterr().out.split())
+    assert main(["convert", "sway_train.npz[:7]", str(tmp_path / "x.h5")]) == 0
+    assert len(read_log(tmp_path / "x.h5")) == 700
+    assert main(["convert", "sway_train.npz[:7]", "sway_train.npz", "--overwrite"]) == 2  # which is read
+
+
+@pytest.mark.parametrize("command", ["identify", "analyze", "check"])
+def test_a_range_outside_of_the_log_ends_in_one_line(
+    demo: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(demo / "quadruped.yaml"), f"output={tmp_path / 'run'}", f"logs.train=['{demo}/first.npz[3:9]']"]
+    assert main([command, *arguments]) == 2
+    line = capsys.readouterr().err.strip()
+    assert line == (
+        f"torchid: {demo}/first.npz[3:9]: time range: [3:9] of a log that lasts 7 s (700 samples); "
+        "accepted: a part of 0 to 7 s that has samples"
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_plausibility_reads_the_parts_that_were_fitted(demo: Path, tmp_path: Path) -> None:
+    log = read_log(demo / "sway_train.npz")
+    bad = np.array(log.joint_torque)
+    bad[700:] *= -1.0
+    write_log(replace(log, joint_torque=bad), path := tmp_path / "half.npz")
+    identified(demo, tmp_path / "run", {"train": [f"{path}[:7]"], "test": []})
+    assert (
+        main(["identify", str(demo / "quadruped.yaml"), f"logs={{train: ['{path}[7:]']}}", f"output={tmp_path}/y"]) == 2
+    )

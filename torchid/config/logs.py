@@ -1,0 +1,238 @@
+"""The block `logs` of an experiment file: patterns, parts of logs in time, folds, and what must not overlap."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+from pydantic.dataclasses import dataclass
+
+from torchid.config.sensors import STRICT
+from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, warn_about_file
+from torchid.logs import Topics
+from torchid.logs.containers import FACTORS, READABLE, list_bag_files
+from torchid.logs.remote import RemoteFile, as_path, list_matching
+from torchid.logs.time_range import LogPart, share_samples, split_range
+
+SETS = ("train", "test", "validation")
+"""Keys of `logs` that list logs."""
+
+FOLDS = 5
+"""Folds that a log is cut into where an entry names one and not their number."""
+
+_KEYS = ("file", "from", "to", "fold", "without_fold", "of")
+_ENTRY = "the name of a log, or a mapping with file and from, to, fold or without_fold"
+
+
+@dataclass(config=STRICT, frozen=True)
+class LogsConfig:
+    """Logs to fit on, held-out logs for the early stopping of a descent, and logs for tests alone.
+
+    A name with `*` or `?` is a pattern for all files that match. A range behind a name takes a part of each log, as if
+    it were a log of its own: `walk.npz[0:30]`, see `TimeRange`; mappings say the same in words (`entries_spelled_out`).
+    `topics` describes the topics of bags. The logs to fit on may be factors of logs, from `torchid compress`, which may
+    lie elsewhere: `s3://...`.
+    """
+
+    train: Annotated[list[Annotated[Path, BeforeValidator(as_path)]], Field(min_length=1)]
+    test: list[Path] = dataclasses.field(default_factory=list)
+    validation: list[Path] = dataclasses.field(default_factory=list)
+    topics: Topics | None = None
+
+    @property
+    def compressed(self) -> bool:
+        """Whether the logs to fit on are factors."""
+        return any(path.suffix == FACTORS for path in self.train)
+
+    @property
+    def files(self) -> list[Path]:
+        """All files, of parts of logs as well; a bag may be a folder."""
+        return list(dict.fromkeys(split_range(path).file for name in SETS for path in getattr(self, name)))
+
+    def require_samples(self, command: str) -> None:
+        """Refuse factors where samples are needed.
+
+        Raises:
+            ConfigError: names the file.
+        """
+        if self.compressed:
+            found = f"{self.train[0]}, factors of a log, where torchid {command} needs its samples"
+            raise ConfigError.at_field("logs.train", found, f"logs ({', '.join(READABLE)})")
+
+
+# ------------------------------------------------------------------------------------------------ entries in words
+
+
+def entries_spelled_out(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings with the entries of `logs` as names with ranges, where they are mappings.
+
+    Raises:
+        ConfigError: keys that do not go together, or a value of the wrong kind.
+        UnknownNameError: a key that entries have not.
+    """
+    logs = settings.get("logs")
+    if not isinstance(logs, dict):
+        return settings
+    spelled = {}
+    for name, entries in logs.items():
+        if name in SETS and isinstance(entries, list):
+            numbered = enumerate(entries)
+            spelled[name] = [x for number, entry in numbered for x in _names(f"logs.{name}.{number}", entry)]
+    return settings | {"logs": logs | spelled}
+
+
+def _names(field: str, entry: object) -> Iterator[object]:
+    """The names, with ranges, of what an entry stands for; anything but a mapping is left to other checks."""
+    if not isinstance(entry, Mapping):
+        yield entry
+        return
+    for key in entry:
+        if key not in _KEYS:
+            raise UnknownNameError.at_field(field, str(key), _KEYS)
+    file, folds = entry.get("file"), [key for key in ("fold", "without_fold") if key in entry]
+    bounds = [key for key in ("from", "to") if key in entry]
+    if not isinstance(file, str) or not file:
+        found = "missing" if "file" not in entry else f"found {excerpt(repr(file))}"
+        raise ConfigError.at_field(f"{field}.file", found, _ENTRY)
+    if len(folds) + bool(bounds) > 1 or ("of" in entry and not folds):
+        found = f"{' and '.join([*folds, *bounds, *(['of'] if not folds else [])])} together"
+        accepted = "from and to, or fold, or without_fold; of (the number of folds) with one of the last two"
+        raise ConfigError.at_field(field, found, accepted)
+    if not folds:
+        start, stop = (_bound(f"{field}.{key}", entry.get(key)) for key in ("from", "to"))
+        yield f"{file}[{start}:{stop}]" if bounds else file
+        return
+    number = _count(f"{field}.of", entry.get("of", FOLDS), 2)
+    fold = _count(f"{field}.{folds[0]}", entry[folds[0]], 1, number)
+    yield from (f"{file}{text}" for text in _fold_ranges(fold, number, folds[0] == "without_fold"))
+
+
+def _fold_ranges(fold: int, folds: int, without: bool) -> list[str]:
+    """Ranges of a fold, from 1, or of what is left without it."""
+    start, stop = ("" if x in (0, folds) else f"{100.0 * x / folds:.15g}%" for x in (fold - 1, fold))
+    if not without:
+        return [f"[{start}:{stop}]"]
+    return [*([f"[:{start}]"] if start else []), *([f"[{stop}:]"] if stop else [])]
+
+
+def _bound(field: str, value: object) -> str:
+    """A bound as it stands in a range."""
+    if value is None:
+        return ""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise ConfigError.at_field(field, f"found {excerpt(repr(value))}", "seconds, or a share such as 80%")
+    return str(value)
+
+
+def _count(field: str, value: object, least: int, most: int | None = None) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least or (most is not None and value > most):
+        accepted = f"a whole number from {least}" + ("" if most is None else f" to {most}, that of folds")
+        raise ConfigError.at_field(field, f"found {excerpt(repr(value))}", accepted)
+    return value
+
+
+# ---------------------------------------------------------------------------------------------- patterns and overlaps
+
+
+def resolve_logs(logs: LogsConfig) -> LogsConfig:
+    """The logs with patterns resolved.
+
+    Raises:
+        ConfigError: no file matches, a range that is none, or samples with two uses that exclude each other.
+
+    Warns:
+        TorchidWarning: samples are tested on that had another use.
+    """
+    files = {key: _matching(f"logs.{key}", getattr(logs, key)) for key in SETS}
+    parts = {key: [_part(f"logs.{key}", path) for path in files[key]] for key in SETS}
+    require_apart(parts, lambda one, other: share_samples(one.range, other.range) is True)
+    return LogsConfig(**files, topics=logs.topics)
+
+
+Parts = Mapping[str, Sequence[LogPart]]
+"""Parts of logs by their key."""
+
+
+def require_apart(parts: Parts, share: Callable[[LogPart, LogPart], bool]) -> None:
+    """Make sure that no sample has two uses.
+
+    Args:
+        parts: of logs.
+        share: whether two of the same file share samples.
+
+    Raises:
+        ConfigError: samples that are fitted on twice, or decide when to stop as well.
+
+    Warns:
+        TorchidWarning: samples are tested on that had another use.
+    """
+    for key, use in (("train", "fitted on"), ("validation", "a reason to stop")):
+        if both := sorted(str(part) for _, part in _sharing(parts, key, "test", share)):
+            warn_about_file(f"logs.test: {both[0]} is {use} as well; its errors say nothing of unseen motion")
+    if both := sorted(str(part) for _, part in _sharing(parts, "train", "validation", share)):
+        raise ConfigError.at_field("logs.validation", f"{both[0]} is fitted on as well", "logs the fit does not see")
+    for key in SETS:
+        for one, other in _sharing(parts, key, key, share):
+            raise ConfigError.at_field(f"logs.{key}", f"{one} and {other} share samples", "every sample once")
+
+
+def _sharing(
+    parts: Parts, key: str, other: str, share: Callable[[LogPart, LogPart], bool]
+) -> Iterator[tuple[LogPart, LogPart]]:
+    """Pairs of parts of two lists, or of one, that share samples."""
+    by_file = defaultdict[Path, list[tuple[int, LogPart]]](list)
+    for number, part in enumerate(parts.get(key, ())):
+        by_file[part.file].append((number, part))
+    for number, part in enumerate(parts.get(other, ())):
+        for before, one in by_file.get(part.file, ()):
+            if (key != other or before < number) and share(one, part):
+                yield one, part
+
+
+def _part(field: str, path: Path) -> LogPart:
+    if isinstance(path, RemoteFile):
+        return LogPart(path, None)
+    try:
+        return split_range(path)
+    except LogError as error:
+        raise ConfigError.at_field(field, f"{path}, {error.found}", error.accepted) from error
+
+
+def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
+    """The paths, with every file that matches in place of a name with * or ? in it."""
+    out: list[Path] = []
+    for path in paths:
+        if isinstance(path, RemoteFile) and path.suffix != FACTORS:
+            raise ConfigError.at_field(field, f"{path}, by URL", f"{FACTORS} files by URL; logs on this machine")
+        part = _part(field, path)
+        if part.range is not None and part.file.suffix == FACTORS:
+            found = f"{path}, a part of factors, which have no samples"
+            raise ConfigError.at_field(field, found, f"{FACTORS} files as they are, or parts of logs")
+        if not {"*", "?"} & set(part.file.name) or part.file.exists():
+            out.append(path)
+            continue
+        files = _listed(part.file)
+        if part.range is not None:
+            if named := _listed(path):
+                found = f"{path}, a pattern with a range, but {named[0].name} is a file that it matches without one"
+                raise ConfigError.at_field(field, found, "names without brackets, or each log by its name")
+            files = [file.with_name(file.name + part.range.text) for file in files]
+        if not files:
+            raise ConfigError.at_field(field, f"no file matches {part.file}", "a log, or a pattern of several")
+        out += files
+    again = [path for path in out if out.count(path) > 1]
+    if again:
+        raise ConfigError.at_field(field, f"{again[0]} is given twice", "every log once")
+    return out
+
+
+def _listed(pattern: Path) -> Sequence[Path]:
+    """All files whose names match a path with * or ? in its last part, in order; brackets stand for themselves."""
+    if isinstance(pattern, RemoteFile):
+        return list_matching(pattern)
+    matching = pattern.parent.glob(pattern.name.replace("[", "[[]"))
+    return sorted(file for file in matching if file.is_file() or list_bag_files(file))
