@@ -60,7 +60,7 @@ def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float)
         most: bytes that they may take.
 
     Returns:
-        None in all processes if one of them has failed, for whatever reason: who reads the log on its own meets it.
+        None in all processes but the first; there, too, if one has failed: who reads the log alone meets the reason.
     """
     share = _fill(log, with_unloaded, _Rows(folder, log, most))
     shares = ranks.gather(share, "blocks of a log")
@@ -71,7 +71,7 @@ def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float)
     paths = [folder / f"{name}.npy" for name in names]
     sizes = ranks.as_first([path.stat().st_size if ranks.is_first() else 0 for path in paths], "sizes of files")
     sums = ranks.share_out(paths, _checksum, "checksums of files", sizes)
-    if not all(sums):
+    if not all(sums) or not ranks.is_first():  # the first one moves the files to their place
         return None
     recorded = [one.recorded for one in shares if one.recorded is not None]
     sensors = SensorSet(
