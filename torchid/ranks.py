@@ -329,11 +329,10 @@ def is_restart() -> bool:
 @contextmanager
 def _group_of_cpus() -> Iterator[_Ranks]:
     """The processes of torch's default group, with connections between their CPUs."""
-    import torch.distributed as dist
-
+    dist: Any = sys.modules.get("torch.distributed")  # without it nobody has made a group
     if _launched is not None:
         yield _launched
-    elif not dist.is_available() or not dist.is_initialized() or dist.get_world_size() == 1:
+    elif dist is None or not dist.is_available() or not dist.is_initialized() or dist.get_world_size() == 1:
         yield _ALONE
     elif dist.get_backend() == "gloo":
         yield _Ranks(dist.group.WORLD, dist.get_rank(), dist.get_world_size())

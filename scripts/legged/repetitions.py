@@ -14,19 +14,19 @@ from legged.gait import Reference
 from legged.recording import Noise, record
 from legged.robots import ROBOTS, TrueRobot
 from legged.simulate import Exact, prescribed, simulated
-from torchid.commands.plausibility import _unexplained
 from torchid.errors import TorchidWarning
 from torchid.estimators import LeastSquares
 from torchid.estimators.least_squares import IDENTIFIED
 from torchid.fitting.fit import Fit, LogFitter
+from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import estimate_noise
 from torchid.fitting.robust import RobustLoss, fit_robustly
 from torchid.identifiability.confounding import ParameterCovariance, total_mass
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
 from torchid.parameters import FRICTION, MASS, PER_BODY, Array
-from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log, compress_parts
-from torchid.problem.compression import split_into_folds
+from torchid.problem import ExtraTerms, RowBuilder, Samples, bind_log
+from torchid.problem.compression import compress_in_blocks, split_into_folds
 from torchid.rounding import UNOBSERVABLE_SHARE
 from torchid.sensing import SensorNoise, named_sensors
 
@@ -145,8 +145,9 @@ class Repetitions:
         terms = ExtraTerms(armature=True, offsets={"joint_torque": "log"} if situation.offsets else {})
         builder = RowBuilder(self.true.robot, self.contacts, sensors, terms)
         fitter = self._fitter(builder)
-        weights = estimate_noise([self._samples(np.random.default_rng(0))], fitter).noise  # as identify does by default
-        builder = RowBuilder(self.true.robot, self.contacts, replace(sensors, noise=weights), terms)
+        first = self._samples(np.random.default_rng(0))
+        self.weights = estimate_noise([first], fitter, ["joint_torque"])  # as identify does
+        builder = RowBuilder(self.true.robot, self.contacts, replace(sensors, noise=self.weights.noise), terms)
         self.fitter = self._fitter(builder)
 
     def _fitter(self, builder: RowBuilder) -> LogFitter:
@@ -184,11 +185,11 @@ class Repetitions:
         logs = split_into_folds([samples], self.fitter.builder)
         if self.situation.robust:
             return fit_robustly(logs, self.fitter, RobustLoss.named("huber")).fit
-        return self.fitter.fit(compress_parts(logs, self.fitter.builder))
+        return self.fitter.fit(compress_in_blocks(logs, self.fitter.builder))
 
     def _add(self, tally: Tally, fit: Fit) -> None:
         base, estimate = structural_base(self.true.legged), fit.estimate
-        mass = total_mass(fit.assembly, estimate)
+        mass = total_mass(fit.assembly, estimate, block_error=fit.scatter.mass_error if fit.scatter else 0.0)
         known = estimate.verdict == IDENTIFIED
         off = np.abs(estimate.phi - self.true.phi.flatten()) / estimate.standard_error
         errors = combination_errors(fit, base.combination)
@@ -199,23 +200,21 @@ class Repetitions:
         tally.mass.append((mass.value, mass.standard_error))
         tally.parameters.append(np.where(known, off <= NORMAL, np.nan))
         tally.residual.append(estimate.residual_std)
-        tally.misfit.append(says_misfit(fit))
+        tally.misfit.append(not misfit(estimate, self.weights, fit.scatter).explained)
 
 
 def combination_errors(fit: Fit, combinations: Array) -> Array:
-    """Standard errors of combinations (K, 12 L) of parameters, as `combination_standard_error`; NaN if undetermined."""
+    """Standard errors of combinations (K, 12 L) of parameters, the larger of both kinds; NaN if undetermined."""
     problem, estimate = fit.assembly.problem, fit.estimate
     covariance = ParameterCovariance.of(problem, LeastSquares().rank_tolerance)
     along = covariance.scale_sensitivity(combinations)
     size = np.maximum(np.linalg.norm(along, axis=1), np.finfo(float).tiny)
     lost = np.linalg.norm(along @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
     noise = np.sqrt(problem.oversampling) * estimate.residual_std
-    return np.where(lost, np.nan, noise * np.linalg.norm(along @ covariance.root, axis=1))
-
-
-def says_misfit(fit: Fit) -> bool:
-    """Whether torchid warns that no model explains the forces."""
-    return _unexplained(fit) is not None
+    errors = noise * np.linalg.norm(along @ covariance.root, axis=1)
+    if fit.scatter is not None:
+        errors = np.maximum(errors, [fit.scatter.error_along(one) for one in combinations])
+    return np.where(lost, np.nan, errors)
 
 
 def summarize(tally: Tally) -> Mapping[str, float]:

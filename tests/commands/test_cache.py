@@ -111,10 +111,10 @@ def test_of_two_that_store_the_same_at_once_both_find_it(tmp_path: Path, monkeyp
 
     write, others = module._write, [Cache(tmp_path, 1.0)]
 
-    def written(*arguments: Any) -> None:
+    def written(*arguments: Any) -> Any:
         if others:
             assert others.pop().save(key_of(0), {"who": 2}, arrays_of(0.1))
-        write(*arguments)
+        return write(*arguments)
 
     monkeypatch.setattr(module, "_write", written)
     cache = Cache(tmp_path, 1.0)

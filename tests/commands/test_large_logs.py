@@ -53,7 +53,7 @@ def test_blocks_give_the_samples_of_the_whole_log(
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Logs in memory are read in blocks however short they are."""
     monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
-    monkeypatch.setattr("torchid.commands.reading._BLOCK_GB", 1e-4)
+    monkeypatch.setattr("torchid.commands.large_log.BLOCK_GB", 1e-4)
 
 
 @pytest.mark.parametrize(("settings", "tolerance"), SETTINGS.values(), ids=SETTINGS.keys())

@@ -265,7 +265,7 @@ def links(folder: Path) -> list[str]:
 
 
 READ = """
-import json, sys, threading, time, torch
+import json, scipy.signal, sys, threading, time, torch
 from torchid.config import load_config
 from torchid.problem.predict import calibrate_readings
 from torchid.fitting.experiment import set_up

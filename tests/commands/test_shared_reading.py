@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from demo import shortened_demo
-from large import recorded
+from large import SMALL, experiment, recorded, tensors
 from shared_work import TORCHRUN, finish
 
 from torchid import ranks
-from torchid.commands.cached_reading import _shares
+from torchid.commands.cache import FOLDER
+from torchid.commands.cached_reading import CachedReader, _shares, open_cache
+from torchid.commands.reading import LogReader
+from torchid.config import load_config
+from torchid.fitting.experiment import set_up
 
 #: What each of two processes does: reads logs of several experiments, and says which of them it has opened.
 PROGRAM = """
 import hashlib, json, os, sys, warnings
 from pathlib import Path
 from torchid import ranks
-from torchid.commands import reading
+from torchid.commands import large_log, reading
 from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.config import load_config
 from torchid.fitting.experiment import set_up
@@ -32,10 +40,15 @@ def digest(samples):
 
 opened, read_log = [], reading.read_log
 reading.read_log = lambda path, *rest, **named: [opened.append(Path(path).name), read_log(path, *rest, **named)][1]
+bound, bind = [], large_log.LargeLog._bound
+large_log.LargeLog._bound = lambda log, cover, block: [bound.append(block.piece.start), bind(log, cover, block)][1]
 dist.init_process_group("gloo")
 rank, found = dist.get_rank(), []
 for file, *more in json.loads(sys.argv[1]):
     opened.clear()
+    bound.clear()
+    reading._WHOLE_GB, large_log.BLOCK_GB = (0.0, 1e-4) if "in blocks" in more else (0.04, 0.01)
+    more = [x for x in more if x != "in blocks"]
     said = []
     with warnings.catch_warnings(record=True) as said, ranks.share_work():
         warnings.simplefilter("always")
@@ -48,6 +61,7 @@ for file, *more in json.loads(sys.argv[1]):
         except ValueError as failure:
             logs, error = [], str(failure)
     entry = {"opened": list(opened), "logs": [digest(x) for x in logs], "error": error, "cache": cache is not None}
+    entry["blocks"] = sorted(bound)
     found.append(entry | {"said": [str(x.message) for x in said], "sources": [x.source for x in logs]})
 Path(sys.argv[2], f"{rank}.json").write_text(json.dumps(found))
 sys.stdout.flush()
@@ -67,6 +81,13 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
     file, out = str(demo / "quadruped.yaml"), f"output={folder / 'run'}"
     three = "logs.train=[sway_train.npz, sway_test.npz, gaps.npz]".replace("[", f"[{demo}/").replace(", ", f", {demo}/")
     broken = f"logs.train=[{demo}/gaps.npz, {demo}/short.npz, {demo}/sway_train.npz]"
+    fields = recorded(14_000)
+    fields["contact_wrench_local"][9_500:9_700, 1, 2], fields["contact_active"][:, 1] = np.nan, True
+    np.savez(demo / "long.npz", **fields)
+    fields["joint_position"][13_000, 3] = np.nan
+    np.savez(demo / "nan.npz", **fields)
+    long, nan = f"logs.train=[{demo}/long.npz, {demo}/sway_train.npz]", f"logs.train=[{demo}/nan.npz]"
+    fewer = ["preprocessing.contact_margin_s=0.02", "preprocessing.sample_rate_hz=150"]
     runs = {
         "without": [three, out, "preprocessing.cache_gb=0"],
         "first": [three, out],
@@ -75,6 +96,21 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
         "broken": [broken, f"output={folder / 'broken' / 'run'}"],
         "apart": [three, f"output={folder / 'machineRANK' / 'run'}"],
         "parts": [f'logs.train=["{demo}/gaps.npz[:50%]", "{demo}/gaps.npz[50%:]"]', f"output={folder}/parts/run"],
+        "blocks, without": ["in blocks", long, out, "preprocessing.cache_gb=0"],
+        "blocks": ["in blocks", long, f"output={folder / 'blocks' / 'run'}"],
+        "blocks again": ["in blocks", long, f"output={folder / 'blocks' / 'run'}"],
+        "fewer, without": ["in blocks", long, *fewer, out, "preprocessing.cache_gb=0"],
+        "fewer": ["in blocks", long, *fewer, f"output={folder / 'fewer' / 'run'}"],
+        "on the disk, without": [long, SMALL, out, "preprocessing.cache_gb=0"],
+        "on the disk": ["in blocks", long, SMALL, f"output={folder / 'disk' / 'run'}"],
+        "broken blocks, without": ["in blocks", nan, out, "preprocessing.cache_gb=0"],
+        "broken blocks": ["in blocks", nan, f"output={folder / 'nan' / 'run'}"],
+        "no room": [
+            "in blocks",
+            long,
+            f"output={folder / 'less' / 'run'}",
+            "preprocessing.cache_gb=0.004",
+        ],
         "little room": [three, f"output={folder / 'little' / 'run'}", "preprocessing.cache_gb=0.001"],
     }
     common = ["logs.test=[]", "preprocessing.cutoff_hz=8"]
@@ -127,6 +163,88 @@ def test_processes_without_a_common_folder_read_all_logs(read: dict[str, list[An
 def test_what_the_cache_has_no_room_for_is_read_by_all(read: dict[str, list[Any]]) -> None:
     assert all(one["cache"] for one in read["little room"])
     assert len(set(sum((one["opened"] for one in read["little room"]), []))) == 3
+
+
+@pytest.mark.parametrize("name", ["blocks", "fewer", "on the disk"])
+def test_blocks_of_a_large_log_are_shared_and_its_samples_are_those_of_one_process(
+    read: dict[str, list[Any]], name: str
+) -> None:
+    expected = read[f"{name}, without"][0]
+    assert any("NaN in part of" in line for line in expected["said"])
+    for one in read[name]:
+        assert (one["logs"], one["said"], one["error"]) == (expected["logs"], expected["said"], "")
+        assert len(one["blocks"]) >= 1
+    assert sorted(sum((one["blocks"] for one in read[name]), [])) == expected["blocks"]
+
+
+def test_a_large_log_is_not_read_again(read: dict[str, list[Any]]) -> None:
+    assert [one["blocks"] for one in read["blocks again"]] == [[], []]
+    assert [one["logs"] for one in read["blocks again"]] == [one["logs"] for one in read["blocks"]]
+
+
+def test_an_error_in_the_blocks_of_one_process_is_said_by_all_as_by_one(read: dict[str, list[Any]]) -> None:
+    expected = read["broken blocks, without"][0]
+    assert "13000" in expected["error"]
+    assert [(one["error"], one["said"]) for one in read["broken blocks"]] == [(expected["error"], expected["said"])] * 2
+
+
+def test_a_large_log_without_room_in_the_cache_is_read_by_all(read: dict[str, list[Any]]) -> None:
+    expected = read["blocks, without"][0]
+    for one in read["no room"]:
+        assert (one["logs"], one["said"]) == (expected["logs"], expected["said"])
+        assert set(one["blocks"]) == set(expected["blocks"])
+
+
+@pytest.fixture
+def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The experiment of a log that one process reads in four blocks."""
+    monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
+    monkeypatch.setattr("torchid.commands.large_log.BLOCK_GB", 1e-4)
+    fields = recorded(14_000)
+    fields["contact_wrench_local"][500:700, 1, 2], fields["contact_active"][:, 1] = np.nan, True
+    return experiment(tmp_path, fields)
+
+
+def read_by(file: Path, cached: bool, *more: str) -> tuple[dict[str, torch.Tensor], list[str]]:
+    """All tensors of a log's samples, read with or without a cache, and what was said."""
+    scene = set_up(load_config(file, [f"output={file.parent / 'run'}", *more]))
+    cache = open_cache(scene)
+    assert cache is not None
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        reader = CachedReader(scene, cache) if cached else LogReader(scene)
+        (samples,) = reader.read(scene.config.logs.train, scene.sensors)
+    return tensors(samples), [str(one.message) for one in said]
+
+
+def test_one_process_writes_the_blocks_of_a_large_log_to_the_cache_as_it_reads_them(
+    alone: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected, said = read_by(alone, False)
+    monkeypatch.setattr(CachedReader, "_read", None)  # never has all of the log in memory
+    found, repeated = read_by(alone, True)
+    assert any("NaN in part of" in line for line in said)
+    assert repeated == said
+    assert found.keys() == expected.keys()
+    for name, x in expected.items():
+        assert found[name].numpy().tobytes() == x.numpy().tobytes(), name
+
+
+@pytest.mark.parametrize("more", ["preprocessing.cache_gb=0.008", "preprocessing.cache_gb=1"])
+def test_blocks_that_the_cache_does_not_take_are_read_into_memory(
+    alone: Path, monkeypatch: pytest.MonkeyPatch, more: str
+) -> None:
+    expected, said = read_by(alone, False)
+    if more.endswith("=1"):
+        monkeypatch.setattr("torchid.commands.shared_log.file_checksum", full_disk)
+    found, repeated = read_by(alone, True, more)
+    assert repeated == said
+    assert all(torch.equal(found[name].nan_to_num(), x.nan_to_num()) for name, x in expected.items())
+    assert not [path for path in (alone.parent / FOLDER).iterdir() if path.name.endswith(".torchid")]
+
+
+def full_disk(_: Path) -> str:
+    raise OSError(errno.ENOSPC, "no room")
 
 
 @pytest.mark.parametrize(("sizes", "processes"), [([5, 1, 1, 1, 2], 2), ([3], 3), ([], 2), ([7, 7, 7, 1], 3)])

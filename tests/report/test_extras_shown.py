@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.collections import PathCollection
@@ -15,7 +17,7 @@ from torchid.errors import ConfoundedWarning, about_file
 from torchid.fitting.calibration import warn_of_confounded
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.problem.extras import Extra
-from torchid.report.figures import extra_figure
+from torchid.report.figures import STYLE, extra_figure, save_figure
 from torchid.report.tables import extra_table
 
 
@@ -115,3 +117,10 @@ def test_every_point_is_in_the_row_of_its_unknown() -> None:
 def test_logs_of_one_name_in_two_folders_are_both_in_the_legend() -> None:
     figure = extra_figure([found("offset", "j0", f"{day}/walk.npz") for day in ("monday", "friday")])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["walk.npz", "walk.npz"]
+
+
+def test_a_png_is_what_savefig_draws_in_two_passes(tmp_path: Path) -> None:
+    save_figure(extra_figure(of_logs(2, 3)), tmp_path / "saved.png")
+    with matplotlib.rc_context(STYLE):
+        extra_figure(of_logs(2, 3)).savefig(tmp_path / "drawn.png", dpi=130)
+    assert (tmp_path / "saved.png").read_bytes() == (tmp_path / "drawn.png").read_bytes()

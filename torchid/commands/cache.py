@@ -14,7 +14,7 @@ import os
 import re
 import time
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -46,6 +46,10 @@ _MOST_FILES = 10_000  # in the index of checksums
 _FORGOTTEN = 3600.0  # [s]: age of a token whose process was killed
 _THERE = (errno.ENOTEMPTY, errno.EEXIST)  # of a rename
 _YOUNG = 2.0  # [s]: a file that is no older may change again within one tick of its time stamp
+
+
+Files = Mapping[str, Mapping[str, Any]]
+"""What an entry's description says of the file of each array."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,16 @@ class Cache:
             TorchidWarning: nothing can be written; the first time only.
         """
         size = sum(array.nbytes for array in arrays.values())
+        return self.save_files(key, size, lambda folder: (document, _write(folder, arrays)))
+
+    def save_files(self, key: str, size: int, write: Callable[[Path], tuple[Mapping[str, Any], Files] | None]) -> bool:
+        """Store an entry of so many bytes, as far as they are known, whose files a function writes; as `save`.
+
+        Args:
+            key: its name.
+            size: bytes of the arrays.
+            write: puts files into a folder; gives the document and a `written_file` for each, or None to give up.
+        """
         if not self._writable or size > self.limit:
             return False
         missing = missing_folders(self.folder)
@@ -148,7 +162,10 @@ class Cache:
                 return False
             with staging_folder(self.folder / key) as folder:
                 (folder / NEW).mkdir()
-                _write(folder / NEW, key, document, arrays)
+                written = write(folder / NEW)
+                if written is None:
+                    return False
+                _describe(folder / NEW, key, *written)
                 if not self.has(key):
                     _remove(self.folder / key)  # without a description it is nobody's
                 _rename(folder / NEW, self.folder / key)
@@ -327,7 +344,13 @@ class _Hashing:
         return self._digest.hexdigest()
 
 
-def _write(folder: Path, key: str, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+def written_file(path: Path, sha256: str) -> dict[str, Any]:
+    """What the description of an entry says of a file with this checksum."""
+    return {"state": _state(path), "sha256": sha256}
+
+
+def _write(folder: Path, arrays: Mapping[str, NDArray[Any]]) -> Files:
+    """A file for each array."""
     files = {}
     for name, array in arrays.items():
         path = folder / f"{name}.npy"
@@ -338,7 +361,11 @@ def _write(folder: Path, key: str, document: Mapping[str, Any], arrays: Mapping[
             data = rows.reshape(-1).view(np.uint8)
             for start in range(0, len(data), _BLOCK):  # np.save copies what does not go to a plain file
                 hashing.write(data[start : start + _BLOCK].data)
-        files[name] = {"state": _state(path), "sha256": hashing.hexdigest()}
+        files[name] = written_file(path, hashing.hexdigest())
+    return files
+
+
+def _describe(folder: Path, key: str, document: Mapping[str, Any], files: Files) -> None:
     text = json.dumps({"key": key, "files": files, "document": document}, allow_nan=False)
     checked = {"sha256": hashlib.sha256(text.encode()).hexdigest(), "entry": text}
     (folder / _DESCRIPTION).write_text(json.dumps(checked))

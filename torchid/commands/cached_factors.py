@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from torchid import ranks
-from torchid.commands.cache import Cache, Entry, content_key, tensor_of
+from torchid.commands.cache import Cache, Entry, content_key
 from torchid.fitting.experiment import Experiment
+from torchid.fitting.packed_parts import PackedPart, PartPacker, PartReader
 from torchid.problem import RowBuilder, Samples, TriangularFactor
 from torchid.problem.chunks import worker_count
 from torchid.problem.compression import Part
 
-_FORMAT = 1  # of entries
+_FORMAT = 2  # of entries
+_PARTS = TypeAdapter(list[PackedPart])
 
 
 def factors_key(experiment: Experiment, builder: RowBuilder, samples: Sequence[str], blocks: Sequence[Samples]) -> str:
@@ -73,44 +76,30 @@ def cached_parts(
 
 
 def _packed(parts: Sequence[Part], sources: Sequence[str]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """The document and the numbers of an entry, those of all triangles one after the other."""
-    values: list[NDArray[Any]] = [np.empty(0)]
-    entries = []
-    for part in parts:
-        factor, triangles = part.factor, []
-        for support, block in factor.blocks.items():
-            values.append(block.cpu().numpy().ravel())
-            triangles.append([list(support), len(block)])
-        entries.append(
-            {
-                "source": sources.index(part.source),
-                "state": list(part.state),
-                "samples": part.samples,
-                "fold": part.fold,
-                "block": part.block,
-                "unloaded": part.unloaded,
-                "gated": sorted(part.gated),
-                "rows": factor.rows,
-                "independent_rows": factor.independent_rows,
-                "triangles": triangles,
-            }
-        )
-    return {"parts": entries}, {"values": np.concatenate(values)}
+    """The document and the numbers of an entry."""
+    packer = PartPacker()
+    document = {
+        "parts": packer.pack(parts),
+        "of": [[sources.index(part.source), part.fold, part.block, part.unloaded] for part in parts],
+        "supports": packer.supports,
+    }
+    return document, {"values": packer.values}
 
 
 def _unpacked(entry: Entry, builder: RowBuilder, sources: Sequence[str]) -> list[Part]:
     """What was stored, of logs of these names; any exception where that is something else."""
-    values, taken, parts = entry.arrays["values"], 0, []
-    for one in entry.document["parts"]:
-        blocks = {}
-        for support, rows in one["triangles"]:
-            size = rows * (len(support) + 1)
-            block = values[taken : taken + size].reshape(rows, len(support) + 1)
-            blocks[tuple(support)] = tensor_of(block).clone().to(builder.device)
-            taken += size
-        factor = TriangularFactor.from_blocks(builder.width, one["rows"], one["independent_rows"], blocks)
-        plain = {name: one[name] for name in ("samples", "fold", "block", "unloaded")}
-        parts.append(Part(sources[one["source"]], tuple(one["state"]), factor, gated=set(one["gated"]), **plain))
-    if taken != len(values):
+    document, columns = entry.document, builder.width
+    reader = PartReader(
+        entry.arrays["values"], document["supports"], columns, len(builder.contacts), len(builder.extras)
+    )
+    parts = []
+    for packed, (source, fold, block, unloaded) in zip(
+        _PARTS.validate_python(document["parts"]), document["of"], strict=True
+    ):
+        part = reader.read(sources[source], packed, unloaded)
+        factor, blocks = part.factor, {x: rows.to(builder.device) for x, rows in part.factor.blocks.items()}
+        moved = TriangularFactor.from_blocks(columns, factor.rows, factor.independent_rows, blocks)
+        parts.append(replace(part, factor=moved, fold=fold, block=block))
+    if reader.numbers_left:
         raise ValueError("more numbers than are described")
     return parts

@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torchid import ranks
-from torchid.commands.cache import FOLDER, TOKEN, Cache, content_key, file_states, missing_folders, remove_empty
+from torchid.commands.cache import FOLDER, TOKEN, Cache, Files, content_key, file_states, missing_folders, remove_empty
 from torchid.commands.cached_samples import ReadLog, Said, content_of_scene, samples_entry, samples_of_entry
-from torchid.commands.reading import LogReader
+from torchid.commands.reading import LogReader, fits_contact_offsets
+from torchid.commands.shared_log import on_one_machine, read_together
 from torchid.errors import TorchidWarning, warn
 from torchid.fitting.experiment import Scene
 from torchid.fitting.noise import recorded_sensors
@@ -68,12 +70,16 @@ class _Content:
 
 @dataclass(frozen=True)
 class _Planned:
-    """A log that will be read, the name of its samples, what it takes with others if that is too much, its bytes."""
+    """A log that will be read, the name of its samples, what it takes with others if that is too much, its bytes.
+
+    `in_place`: it is read in blocks, which lie in its file as they are: neither a table nor compressed.
+    """
 
     path: Path
     key: str
     together: float | None
     size: int
+    in_place: bool
 
 
 class CachedReader(LogReader):
@@ -122,6 +128,8 @@ class CachedReader(LogReader):
             return super()._samples(path, required, together)
         if not self.cache.has(key):
             self._new.add(key)
+            if ranks.world_size() == 1 and (one := self._planned(path, key, together, self._together(path))).in_place:
+                self._store_together([one], 0, required)
         found = self._load(key, path, required, together)
         if found is None:
             said: list[Said] = []
@@ -215,7 +223,14 @@ class CachedReader(LogReader):
         self.cache.keep([one.key for one in plan])
         missing = {one.key: number for number, one in enumerate(plan) if not self.cache.has(one.key)}
         self._new.update(missing)
-        shares = ranks.as_first(_shares({number: plan[number].size for number in missing.values()}), "logs to read")
+        whole, in_pieces = {number: plan[number].size for number in missing.values()}, list[int]()
+        if on_one_machine():
+            in_pieces = [x for x in whole if plan[x].in_place and whole[x] * ranks.world_size() > sum(whole.values())]
+        in_pieces = ranks.as_first(in_pieces, "logs to read in pieces")
+        for number in in_pieces:
+            self._store_together(plan, number, required)
+        own = _shares({number: size for number, size in whole.items() if number not in in_pieces})
+        shares = ranks.as_first(own, "logs to read")
         for number in shares[ranks.rank()]:
             try:
                 one = plan[number]
@@ -223,6 +238,28 @@ class CachedReader(LogReader):
             except Exception:  # noqa: B902 - all processes meet it, and say it, when they read the log
                 break
         ranks.gather(None, "logs read")
+
+    def _store_together(self, plan: Sequence[_Planned], number: int, required: SensorSet | None) -> None:
+        """Store the samples of a log block by block, of which each process reads some; or not, if one of them fails."""
+
+        def fill(folder: str) -> tuple[dict[str, Any], Files] | None:
+            if not all(ranks.gather(number < len(plan), "plans")):
+                return None
+            one = plan[number]
+            log = self._large_log(one.path, required, None if one.together is None else self.folder)
+            return read_together(log, fits_contact_offsets(self.scene), Path(folder), self.cache.limit)
+
+        def fill_for_all(folder: Path) -> tuple[dict[str, Any], Files] | None:
+            told.append(ranks.as_first(str(folder), "a folder for a log"))
+            written, content = fill(str(folder)), self._contents[plan[number].path]
+            return written if file_states(content.files) == content.states else None
+
+        told: list[str] = []
+        if ranks.is_first():
+            self.cache.save_files(plan[number].key, plan[number].size, fill_for_all)
+        folder = "" if told else ranks.as_first("", "a folder for a log")
+        if folder:
+            fill(folder)
 
     def _plan(self, paths: Sequence[Path], required: SensorSet | None) -> list[_Planned]:
         """What will be read, up to the first log that cannot be; bags that are not in the cache count as nothing."""
@@ -234,14 +271,19 @@ class CachedReader(LogReader):
                 key = self._key(path, required, together if large else None)
                 if key is None:
                     break
-                size = sum(state[0] for state in self._contents[path].states)
-                plan.append(_Planned(path, key, together if large else None, size))
+                plan.append(self._planned(path, key, together if large else None, together))
                 self._held = self._held if large else together
         except Exception:  # noqa: B902 - said when the log is read
             return plan
         finally:
             self._held = held
         return plan
+
+    def _planned(self, path: Path, key: str, too_much: float | None, together: float) -> _Planned:
+        size = sum(state[0] for state in self._contents[path].states)
+        gigabytes = together - self._held
+        in_place = existing_log_kind(path) is LogKind.ARRAYS and size >= GIGABYTE * gigabytes
+        return _Planned(path, key, too_much, size, in_place and self._takes_blocks(gigabytes))
 
 
 def _shares(sizes: Mapping[int, int]) -> list[list[int]]:

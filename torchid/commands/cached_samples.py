@@ -62,12 +62,16 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
     }
 
 
+def named_tensors(samples: Samples) -> dict[str, Tensor]:
+    """All tensors by the names that their files have in an entry."""
+    own = {name: x for name, x in vars(samples).items() if isinstance(x, Tensor)}
+    return own | {_BASE + name: x for name, x in vars(samples.base).items() if isinstance(x, Tensor)}
+
+
 def samples_entry(read: ReadLog) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """The document and the arrays of an entry; axes are in the order of the strides, which come back with them."""
     samples, arrays, axes = read.samples, dict[str, NDArray[Any]](), dict[str, list[int]]()
-    own = {name: x for name, x in vars(samples).items() if isinstance(x, Tensor)}
-    base = {_BASE + name: x for name, x in vars(samples.base).items() if isinstance(x, Tensor)}
-    for name, x in (own | base).items():
+    for name, x in named_tensors(samples).items():
         axes[name] = sorted(range(x.ndim), key=lambda axis, x=x: -x.stride(axis))  # type: ignore[misc]
         arrays[name] = x.numpy().transpose(axes[name])
     document = {

@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, field
 from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid import __version__
 from torchid.errors import LogError, about_file, during, excerpt
+from torchid.fitting.packed_parts import PackedPart, PartPacker, PartReader
 from torchid.fitting.row_model import RowModel, Value
 from torchid.guards import MAX_ARRAYS, MAX_DESCRIPTION, MAX_LETTERS, MAX_TRIANGLES, check_unpacked_size
 from torchid.identifiability.base_parameters import StateReport
 from torchid.logs.containers import FACTORS, Container, open_npz, reader_errors_explained
 from torchid.logs.remote import RemoteFile, is_url, local_copy
 from torchid.parameters import Array
-from torchid.problem import TriangularFactor
 from torchid.problem.compressed_log import CompressedLog, piece_spans
-from torchid.problem.compression import FOLDS, Part, block_spans
+from torchid.problem.compression import FOLDS, block_spans
 from torchid.settings import NotNegative, Number
 from torchid.staging import atomic_file
 
@@ -78,22 +77,10 @@ class _State:
 
 
 @dataclass(config=_STRICT, frozen=True)
-class _Part:
-    """`state`: a digit for each contact; `triangles`: number of the support, rows, whether packed as a triangle."""
-
-    state: str
-    samples: _Whole
-    rows: _Whole
-    independent_rows: NotNegative
-    gated: list[_Whole]
-    triangles: list[tuple[_Whole, _Whole, bool]]
-
-
-@dataclass(config=_STRICT, frozen=True)
 class _Unloaded:
     start: _Whole
     stop: _Whole
-    parts: list[_Part]
+    parts: list[PackedPart]
 
 
 @dataclass(config=_STRICT, frozen=True)
@@ -109,8 +96,8 @@ class _Description:
     blocks: Annotated[int, Field(ge=1, le=FOLDS)]
     settings: dict[str, Value]
     noise: dict[str, Annotated[Number, Field(gt=0.0)]]
-    pieces: list[_Part]
-    by_state: list[_Part]
+    pieces: list[PackedPart]
+    by_state: list[PackedPart]
     unloaded: list[_Unloaded]
     supports: list[list[_Whole]]
     states: list[_State]
@@ -192,30 +179,7 @@ def _require_suffix(path: Path) -> None:
 
 def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
     """The description, and the numbers of all triangles."""
-    log, supports = factors.log, dict[tuple[int, ...], int]()
-    values: list[Array] = []
-
-    def entries(parts: Sequence[Part]) -> list[dict[str, object]]:
-        out: list[dict[str, object]] = []
-        for part in parts:
-            triangles = []
-            for support, block in part.factor.blocks.items():
-                rows = block.cpu().numpy()
-                packed = len(rows) == rows.shape[1] and not np.tril(rows, -1).any()
-                values.append(rows[np.triu_indices(len(rows))] if packed else rows.ravel())
-                triangles.append((supports.setdefault(support, len(supports)), len(rows), packed))
-            out.append(
-                {
-                    "state": "".join("01"[active] for active in part.state),
-                    "samples": part.samples,
-                    "rows": part.factor.rows,
-                    "independent_rows": part.factor.independent_rows,
-                    "gated": sorted(part.gated),
-                    "triangles": triangles,
-                }
-            )
-        return out
-
+    log, packer = factors.log, PartPacker()
     description = {
         "format": FORMAT,
         "torchid": factors.version,
@@ -228,13 +192,13 @@ def _packed(factors: FactorFile) -> tuple[dict[str, object], Array]:
         "blocks": log.blocks,
         "settings": factors.model.settings,
         "noise": factors.model.noise,
-        "pieces": entries(log.pieces),
-        "by_state": entries(log.by_state),
-        "unloaded": [{"start": a, "stop": b, "parts": entries(parts)} for (a, b), parts in log.unloaded.items()],
-        "supports": list(supports),
+        "pieces": packer.pack(log.pieces),
+        "by_state": packer.pack(log.by_state),
+        "unloaded": [{"start": a, "stop": b, "parts": packer.pack(parts)} for (a, b), parts in log.unloaded.items()],
+        "supports": packer.supports,
         "states": [asdict(state) for state in factors.states],
     }
-    return description, np.concatenate([np.empty(0), *values])
+    return description, packer.values
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
@@ -275,9 +239,13 @@ def _array(container: Container, name: str, dtype: type, dimensions: int | None 
 def _log(source: str, description: _Description, values: Array) -> CompressedLog:
     """The compressed log; ValueError if it cannot be one."""
     samples, blocks = description.samples, description.blocks
-    parts = _Parts(source, description, values)
-    pieces, by_state = ([parts.read(one) for one in same] for same in (description.pieces, description.by_state))
-    unloaded = {(x.start, x.stop): [parts.read(one, unloaded=True) for one in x.parts] for x in description.unloaded}
+    parts = PartReader(values, description.supports, *_sizes(description.settings), MAX_TRIANGLES)
+    pieces, by_state = (
+        [parts.read(source, one) for one in same] for same in (description.pieces, description.by_state)
+    )
+    unloaded = {
+        (x.start, x.stop): [parts.read(source, one, unloaded=True) for one in x.parts] for x in description.unloaded
+    }
     spans = {span for count in range(1, blocks + 1) for span in block_spans(samples, count)}
     if not set(unloaded) <= spans or len(unloaded) != len(description.unloaded):
         raise ValueError("readings in the air of what is no block of the log")
@@ -290,75 +258,10 @@ def _log(source: str, description: _Description, values: Array) -> CompressedLog
     return CompressedLog(source, samples, description.oversampling, blocks, pieces, by_state, unloaded)
 
 
-class _Parts:
-    """Parts of a log, read one after the other; ValueError where one cannot be that of a log."""
-
-    def __init__(self, source: str, description: _Description, values: Array) -> None:
-        settings = description.settings
-        columns, contacts = settings.get("columns"), settings.get("contacts")
-        if not isinstance(columns, int) or columns < 1 or not isinstance(contacts, list):
-            raise ValueError("neither columns nor contacts")
-        self._source, self._columns, self._contacts = source, columns, len(contacts)
-        labels = (settings.get(key) for key in _EXTRAS)
-        self._extras = sum(len(x) for x in labels if isinstance(x, list))
-        self._supports = [_support(one, columns) for one in description.supports]
-        self._stream, self._triangles = _Stream(values), 0
-
-    @property
-    def numbers_left(self) -> int:
-        """Numbers that belong to no part so far."""
-        return self._stream.left
-
-    def read(self, one: _Part, unloaded: bool = False) -> Part:
-        """The next part."""
-        self._triangles += 1 + len(one.triangles)
-        if self._triangles > MAX_TRIANGLES:
-            raise ValueError(f"more than {MAX_TRIANGLES} triangles")
-        if len(one.state) != self._contacts or set(one.state) - {"0", "1"}:
-            raise ValueError(f"contact state {one.state[:MAX_LETTERS]!r}")
-        if max(one.gated, default=-1) >= self._extras or (unloaded and one.samples):
-            raise ValueError("readings in the air of a sensor that is none")
-        if not one.independent_rows <= one.rows or (one.rows and not one.independent_rows):
-            raise ValueError(f"{one.independent_rows:g} independent of {one.rows} rows")
-        triangles = {}
-        for number, rows, packed in one.triangles:
-            support = self._supports[number]
-            triangles[support] = self._stream.triangle(len(support) + 1, rows, packed)
-        if len(triangles) != len(one.triangles):
-            raise ValueError("the same columns twice")
-        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles)
-        state = tuple(digit == "1" for digit in one.state)
-        return Part(self._source, state, factor, one.samples, unloaded=unloaded, gated=set(one.gated))
-
-
-def _support(columns: list[int], count: int) -> tuple[int, ...]:
-    if len(set(columns)) != len(columns) or max(columns, default=0) >= count:
-        raise ValueError(f"columns that are not among {count}")
-    return tuple(columns)
-
-
-class _Stream:
-    """The numbers of all triangles, one after the other."""
-
-    def __init__(self, values: Array) -> None:
-        self._values, self._taken = values, 0
-
-    @property
-    def left(self) -> int:
-        """How many are left."""
-        return len(self._values) - self._taken
-
-    def triangle(self, width: int, rows: int, packed: bool) -> torch.Tensor:
-        """The next triangle, or rows too few to make one, (rows, width); ValueError if there are not enough."""
-        if rows > width or (packed and rows != width):
-            raise ValueError(f"{rows} rows of {width} numbers")
-        size = width * (width + 1) // 2 if packed else rows * width
-        if size > self.left:
-            raise ValueError("fewer numbers than are described")
-        values = self._values[self._taken : self._taken + size]
-        self._taken += size
-        if not packed:
-            return torch.from_numpy(values.reshape(rows, width).copy())
-        triangle = np.zeros((width, width))
-        triangle[np.triu_indices(width)] = values
-        return torch.from_numpy(triangle)
+def _sizes(settings: Mapping[str, Value]) -> tuple[int, int, int]:
+    """Numbers of columns, contacts and extra parameters; ValueError without them."""
+    columns, contacts = settings.get("columns"), settings.get("contacts")
+    if not isinstance(columns, int) or columns < 1 or not isinstance(contacts, list):
+        raise ValueError("neither columns nor contacts")
+    labels = (settings.get(key) for key in _EXTRAS)
+    return columns, len(contacts), sum(len(x) for x in labels if isinstance(x, list))

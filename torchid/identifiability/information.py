@@ -13,11 +13,11 @@ from torch import Tensor
 from torchid.parameters import Array
 from torchid.problem import LinearProblem, RowBuilder, Samples
 from torchid.problem.chunks import ProgressCallback, chunks_by_state, one_thread, subsample_states
-from torchid.problem.compression import unloaded_offset_equations
 from torchid.problem.contact_state import ContactState
 from torchid.problem.extras import measured_components
 from torchid.problem.metrics import ROW_GROUPS, ForceSums, finite_or_none, null_space_components
 from torchid.problem.predict import predict_forces
+from torchid.problem.unloaded_offsets import unloaded_offset_equations
 from torchid.rounding import KINEMATIC_TOLERANCE, RANK_TOLERANCE
 from torchid.sensing import SensorNoise
 

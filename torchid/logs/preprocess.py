@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import takewhile
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torchid.errors import InputError, LogError, about_file, warn
+from torchid.errors import InputError, LogError, about_file
+from torchid.logs.coverage import Coverage, measure_coverage, warn_of_gaps
 from torchid.logs.log import (
     NAN_ALLOWED,
     NORMALS,
@@ -21,7 +20,6 @@ from torchid.logs.log import (
     Log,
     check_finite,
     column_labels,
-    describe_element,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
@@ -78,7 +76,7 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
         timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
     if timeline is None:
         return log
-    coverage = {name: _measure_coverage(log, name) for name in gapless_fields(log, timeline)}
+    coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
         warn_of_gaps(log, name, found)
     return move_to_timeline(log, timeline, coverage)
@@ -226,76 +224,6 @@ def _orientation(log: Log, derivatives: list[FloatArray], timeline: Timeline) ->
 
 #: Channels that are filtered together: few, so that copies are small compared with a long log.
 _CHANNELS_TOGETHER = 2
-
-
-@dataclass
-class Coverage:
-    """Which channels of a field were measured throughout, gathered block by block.
-
-    Of every channel: `measurable`, samples in which there is something to measure (all, or those in contact);
-    `missing`, those of them that are NaN, from the `first` to the `last`; `values`, samples with a value.
-    """
-
-    samples: int
-    measurable: NDArray[np.intp]
-    missing: NDArray[np.intp]
-    values: NDArray[np.intp]
-    first: NDArray[np.intp]
-    last: NDArray[np.intp]
-
-    @classmethod
-    def empty(cls, channels: tuple[int, ...]) -> Coverage:
-        """Coverage of no samples."""
-        return cls(0, *(np.zeros(channels, dtype=np.intp) for _ in range(5)))
-
-    def add(self, values: FloatArray, active: BoolArray | None) -> None:
-        """Add samples (N, ...) of the field; `active`: (N, C) of a wrench's contacts."""
-        nan = np.isnan(values)
-        self.values += len(values) - nan.sum(axis=0)
-        self.measurable += len(values) if active is None else active.sum(axis=0)[:, None]
-        if active is not None:
-            nan &= active[..., None]
-        count = nan.sum(axis=0)
-        new = (count > 0) & (self.missing == 0)
-        self.first[new] = self.samples + np.argmax(nan, axis=0)[new]
-        self.last[count > 0] = self.samples + (len(nan) - 1 - np.argmax(nan[::-1], axis=0))[count > 0]
-        self.missing += count
-        self.samples += len(values)
-
-    @property
-    def complete(self) -> BoolArray:
-        """Channels with a value in all measurable samples, and in at least one sample."""
-        return np.asarray((self.missing == 0) & (self.values > 0))
-
-    @property
-    def broken(self) -> BoolArray:
-        """Channels with a value in some samples and NaN in others."""
-        return np.asarray((self.missing > 0) & (self.missing < self.measurable) & (self.values > 0))
-
-
-def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
-    """Warn of channels that become NaN throughout because they are NaN in some samples.
-
-    Warns:
-        TorchidWarning: names them.
-    """
-    labels = column_labels(name, log.names)
-    broken = [
-        f"{describe_element((0, *channel), labels).partition(', ')[2]}"
-        f" (samples {coverage.first[channel]} to {coverage.last[channel]})"
-        for channel in map(tuple, np.argwhere(coverage.broken).tolist())
-    ]
-    if broken:
-        message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
-        warn(message)
-
-
-def _measure_coverage(log: Log, name: str) -> Coverage:
-    """Coverage of the field `name` of a log."""
-    values: FloatArray = getattr(log, name)
-    found = Coverage.empty(values.shape[1:])
-    found.add(values, log.contact_active if name in WRENCHES else None)
-    return found
 
 
 def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:

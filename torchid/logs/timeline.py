@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import signal
 from scipy.interpolate import make_interp_spline
 
 from torchid.errors import InputError, LogError, warn_about_file
@@ -89,6 +88,8 @@ class LowPass:
 
     def __call__(self, values: FloatArray) -> FloatArray:
         """Filter every channel of uniformly sampled values (M, ...) forward and backward."""
+        from scipy import signal  # takes 0.4 s, which runs that find their samples in a cache need not
+
         flat = values.reshape(len(values), -1)
         out = np.empty(flat.shape)
         for column in range(flat.shape[1]):  # one by one: the filter makes several copies of what it is given
@@ -104,6 +105,8 @@ class LowPass:
     @property
     def noise_share(self) -> float:
         """Share of the power of white noise that passes: equivalent noise bandwidth over half the sample rate."""
+        from scipy import signal
+
         _, response = signal.sosfreqz(self.sections, worN=_FREQUENCIES, whole=True)
         return float(np.mean(np.abs(response) ** 4))  # two passes, and power goes with the amplitude squared
 
@@ -280,6 +283,8 @@ def lay_out_timeline(
     dropped = DROPPED_SAMPLES if differentiates else 0
     kept = slice(dropped, len(native) - dropped)
     if cutoff_hz is not None:
+        from scipy import signal
+
         _check_rate("cutoff_hz", cutoff_hz, 0.5 / step, "half the log's median sample rate")
         if np.max(np.abs(np.diff(native) - step)) > JITTER * step:
             grid = step * np.arange(math.floor(native[-1] / step + JITTER) + 1)

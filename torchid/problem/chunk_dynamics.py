@@ -53,6 +53,8 @@ class ChunkKinematics:
             BodyStates(*(x[..., ::step] for x in vars(self.states).values())),
             self.screw_axes[..., ::step],
             None if self.rotation_world_base is None else self.rotation_world_base[::step],
+            {contact: arm[..., ::step] for contact, arm in self.arms.items()},
+            self.recorded_normals,
         )
 
 

@@ -8,7 +8,6 @@ from functools import partial
 from itertools import chain
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchid import parameters, ranks
@@ -19,6 +18,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.problem.unloaded_offsets import unloaded_offset_equations
 from torchid.robot import Robot
 
 FOLDS = 5
@@ -33,12 +33,6 @@ BLOCKS = 20
 _LEAST_PER_BLOCK = 10  # independent samples
 
 _MEMORY = 2**30  # [bytes] of factors
-_LEAST_READINGS = 16  # readings for one equation
-_BATCHES = 8  # batches of successive readings, whose means show drift
-_MASKED_SHARE = 0.01  # readings are masked or clamped, not measured, if more than this share is exactly 0 ...
-_ONE_SIDED = 0.05  # ... and less than this share has one of the signs (else 0 is one step of a coarse sensor)
-_OUTLYING = 4.0  # standard deviations; of Gaussian readings 6e-5 are dropped
-_NORMAL = 0.6745  # median of |x| of standard normal x
 RowWeighting = Callable[[Samples, tuple[int, ...], Tensor], Tensor]
 """Weighted rows, from samples, columns and rows."""
 
@@ -355,72 +349,3 @@ def merge_by_key(parts: Sequence[Part], keys: Sequence[tuple[object, ...]], buil
         out[key].gated |= part.gated
         out[key].samples += part.samples
     return list(out.values())
-
-
-@dataclass(frozen=True)
-class UnloadedOffsetEquation:
-    """The equation for a contact sensor's unknown offset from its readings while the contact is in the air.
-
-    The sensor then reads its offset and the weight of the parts beyond it.
-
-    Attributes:
-        offset: its number among the extras.
-        scale: number of the channel's unknown scale, None if that is known.
-        gated: whether the readings are masked, clamped or missing (exactly 0), so that there is no equation.
-        mean: of the readings, without outliers [N, N m].
-        deviation: standard deviation of the mean [N, N m]: that of independent readings with the stated noise, or more
-            if they or their means over longer spans of time scatter more.
-    """
-
-    offset: int
-    scale: int | None
-    gated: bool = False
-    mean: float = 0.0
-    deviation: float = 1.0
-
-    def row(self, builder: RowBuilder) -> tuple[tuple[int, ...], Tensor]:
-        """The whitened equation `o - (s - 1) mean = mean` as a block of one row: its columns, and (1, columns + 1).
-
-        The scale's column holds the mean: the noise of single readings would bias the scale towards 0. The row is on
-        the CPU, where readings in the air are, and so is the block of such rows in a factor.
-        """
-        first, row = builder.columns.count, [1.0, self.mean]
-        columns: tuple[int, ...] = (first + self.offset,)
-        if self.scale is not None:
-            columns, row = (*columns, first + self.scale), [1.0, -self.mean, self.mean]
-        return columns, torch.tensor([row], dtype=builder.tree.ancestors.dtype) / self.deviation
-
-
-def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator[UnloadedOffsetEquation]:
-    """Equations of the unknown offsets, from the readings in the air among some samples of a log."""
-    if samples.unloaded is None:
-        return
-    scales = {x.contact: number for number, x in enumerate(builder.extras) if x.what == "scale" and x.contact}
-    noise = builder.sensors.noise.wrench_std.tolist()
-    for number, extra in enumerate(builder.extras):
-        if extra.what != "offset" or extra.contact is None:
-            continue
-        contact, axis = extra.contact
-        y = samples.unloaded[:, contact, axis]
-        y = y[torch.isfinite(y)]
-        if len(y) < _LEAST_READINGS:
-            continue
-        if _is_masked(y):
-            yield UnloadedOffsetEquation(number, None, gated=True)
-        else:
-            mean, deviation = _robust_mean(y, noise[axis], samples.oversampling)
-            yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)
-
-
-def _is_masked(y: Tensor) -> bool:
-    above, below = ((y > 0.0).double().mean(), (y < 0.0).double().mean())
-    return bool(1.0 - above - below > _MASKED_SHARE and min(above, below) < _ONE_SIDED)
-
-
-def _robust_mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
-    """Mean of successive readings (M,) without outliers, and its standard deviation without oversampling."""
-    deviation = (y - y.median()).abs()
-    y = y[deviation <= _OUTLYING * max(float(deviation.median()) / _NORMAL, noise)]
-    batches = y[: len(y) // _BATCHES * _BATCHES].view(_BATCHES, -1).mean(1)
-    scatter = max(float(y.var()) / len(y), float(batches.var()) / _BATCHES) / oversampling
-    return float(y.mean()), max(noise**2 / len(y), scatter) ** 0.5

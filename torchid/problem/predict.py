@@ -145,7 +145,7 @@ def reading_variance(
             body, T_joint_frame = builder.frames[contact]
             possible = list(builder.contacts[contact].components)
             units = total.new_tensor((wrench_transform(T_joint_frame) * noise.wrench_std).T[possible])
-            wrenches = wrenches_at_base(kinematics.states, body, units)
+            wrenches = wrenches_at_base(kinematics.states, body, units, kinematics.arms.get(contact))
             joints = builder.columns.joints_above(body)
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
             recorded = 0.0 * builder.recorded_wrench(samples, contact, kinematics)[:, possible].sum(1)

@@ -8,7 +8,7 @@ from itertools import chain
 
 import numpy as np
 import torch
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtr
 from torch import Tensor
 
 from torchid import ranks
@@ -182,7 +182,7 @@ class SampledRows:
 
 def _radius(rows: Tensor) -> Tensor:
     """Size of whitened residuals of so many rows that is exceeded as seldom as `CLIP` standard deviations by one."""
-    return torch.from_numpy(np.sqrt(chi2.isf(2.0 * norm.sf(CLIP), rows.numpy())))
+    return torch.from_numpy(np.sqrt(chdtri(rows.numpy(), 2.0 * ndtr(-CLIP))))
 
 
 def _source_names(builder: RowBuilder) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
@@ -62,7 +63,11 @@ def save_figure(figure: Figure, path: Path, kind: str | None = None) -> None:
     with during("drawing", path), matplotlib.rc_context(STYLE):
         for text in figure.findobj(Text):
             text.set_text(escape(text.get_text(), "\n"))
-        figure.savefig(path, dpi=130, format=kind)
+        figure.set_dpi(130)
+        if (kind or path.suffix[1:]).lower() == "png":
+            FigureCanvasAgg(figure).print_png(path)  # `savefig` draws all of it twice, once for the layout
+        else:
+            figure.savefig(path, format=kind)
 
 
 # ---------------------------------------------------------------------------------------------------- errors
@@ -76,10 +81,8 @@ def error_figure(sets: Mapping[str, Comparison[Metrics]]) -> Figure:
     for axis, (name, (nominal, identified)) in zip(axes, sets.items(), strict=True):
         groups = [group for group in ERROR_GROUPS if nominal.relative.get(group) is not None]
         index = np.arange(len(groups))
-        for shift, metrics, color, label in (
-            (-0.2, nominal, NOMINAL, "URDF"),
-            (0.2, identified, IDENTIFIED, "identified"),
-        ):
+        pairs = ((-0.2, nominal, NOMINAL, "URDF"), (0.2, identified, IDENTIFIED, "identified"))
+        for shift, metrics, color, label in pairs:
             heights = [100.0 * (metrics.relative.get(group) or 0.0) for group in groups]
             bars = axis.bar(index + shift, heights, 0.38, color=color, label=label)
             axis.bar_label(bars, fmt="%.3g", fontsize=8)
@@ -203,8 +206,7 @@ def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
 def _draw_panel(axis: Axes, extras: Sequence[ExtraEstimate], rows: Sequence[str], colors: Mapping[str, str]) -> None:
     """Values with their intervals; the logs of a row have vertical offsets around its middle."""
     longest = _MAX_ERROR_RATIO * max(abs(x.value) for x in extras) or 1.0
-    logs = [log for log in colors if any(x.log == log for x in extras)]
-    for number, log in enumerate(logs):
+    for number, log in enumerate(logs := [log for log in colors if any(x.log == log for x in extras)]):
         points = [x for x in extras if x.log == log]
         offset = 0.15 * (number % _LANES - (min(len(logs), _LANES) - 1) / 2)
         values, index = [x.value for x in points], [rows.index(x.extra.label) + offset for x in points]
@@ -244,8 +246,8 @@ def tree_figure(
     contact_positions = _contact_positions(robot, contacts, positions)
     right = max(x for x, _ in positions)
     deepest = max(y for _, y in [*positions, *contact_positions.values()])
-    width = _COLUMN * (right + 1.0)
-    figure = Figure(figsize=(max(width, _LEGEND) + 0.2, _ROW * (deepest + 1) + 1.3), layout="constrained")
+    size = max(_COLUMN * (right + 1.0), _LEGEND) + 0.2, _ROW * (deepest + 1) + 1.3
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     for body, link in enumerate(robot.bodies):
         if link.joint is not None:

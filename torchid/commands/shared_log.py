@@ -1,0 +1,166 @@
+"""One large log that processes of a machine read together: each some of its blocks, into files that all of them map."""
+
+from __future__ import annotations
+
+import errno
+import io
+import platform
+import uuid
+import warnings
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from torchid import ranks
+from torchid.commands.cache import Files, written_file
+from torchid.commands.cached_samples import ReadLog, Said, named_tensors, samples_entry
+from torchid.commands.large_log import LargeLog
+from torchid.commands.manifest import file_checksum
+from torchid.fitting.noise import recorded_sensors
+from torchid.problem import Samples
+from torchid.sensing import SensorSet
+
+
+def on_one_machine() -> bool:
+    """Whether all processes can write to parts of one file; over a network they would overwrite each other's pages."""
+    machine = platform.node(), uuid.getnode()
+    return all(other == machine for other in ranks.gather(machine, "names of machines"))
+
+
+@dataclass(frozen=True)
+class _Share:
+    """What a process tells of its blocks.
+
+    `like`: samples without any, for whatever is no tensor, and the shapes of these; None if it had no block.
+    `recorded`: sensors whose every value is in its blocks. `said`: warnings, the first `common` of which are about the
+    log as a whole. `failed`: it could not go on.
+    """
+
+    like: Samples | None
+    recorded: SensorSet | None
+    said: Sequence[Said]
+    common: int
+    failed: bool
+
+
+def read_together(log: LargeLog, with_unloaded: bool, folder: Path, most: float) -> tuple[dict[str, Any], Files] | None:
+    """Fill the files of an entry with the samples of a log; its document and its files.
+
+    All processes that share the work call this together. Blocks do not depend on each other, so that the samples are
+    those of one process to the last bit.
+
+    Args:
+        log: the log.
+        with_unloaded: with readings of contact sensors in the air.
+        folder: where the files go, the same for all.
+        most: bytes that they may take.
+
+    Returns:
+        None in all processes but the first; there, too, if one has failed: who reads the log alone meets the reason.
+    """
+    share = _fill(log, with_unloaded, _Rows(folder, log, most))
+    shares = ranks.gather(share, "blocks of a log")
+    likes = [one.like for one in shares if one.like is not None]
+    if any(one.failed for one in shares) or not likes:
+        return None
+    names = list(named_tensors(likes[0]))
+    paths = [folder / f"{name}.npy" for name in names]
+    sizes = ranks.as_first([path.stat().st_size if ranks.is_first() else 0 for path in paths], "sizes of files")
+    sums = ranks.share_out(paths, _checksum, "checksums of files", sizes)
+    if not all(sums) or not ranks.is_first():  # the first one moves the files to their place
+        return None
+    recorded = [one.recorded for one in shares if one.recorded is not None]
+    sensors = SensorSet(
+        np.all([one.torque for one in recorded], axis=0), np.all([one.wrench for one in recorded], axis=0)
+    )
+    said = [*shares[0].said, *(x for one in shares[1:] for x in one.said[one.common :])]
+    document, _ = samples_entry(ReadLog(likes[0], sensors, None, said))
+    document["axes"] = {name: list(range(x.ndim)) for name, x in named_tensors(likes[0]).items()}
+    files = {name: written_file(path, found) for name, path, found in zip(names, paths, sums, strict=True)}
+    return document, files
+
+
+def _fill(log: LargeLog, with_unloaded: bool, rows: _Rows) -> _Share:
+    """Write this process's share of a log."""
+    common, failed = 0, False
+
+    def own(sizes: Sequence[int]) -> slice:
+        nonlocal common
+        common = len(caught)
+        return ranks.own_share(sizes)
+
+    with closing(rows), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            log.each_block(rows.add, with_unloaded, own)
+        except Exception:  # noqa: B902 - all processes meet it, and say it, when they read the log
+            failed = True
+    said = [(one.category, str(one.message)) for one in caught]
+    return _Share(rows.like, rows.recorded, said, common, failed)
+
+
+def _checksum(path: Path) -> str:
+    try:
+        return file_checksum(path)
+    except OSError:
+        return ""
+
+
+class _Rows:
+    """Files of the tensors of a log's samples, into which this process writes some rows.
+
+    Attributes:
+        like: as `_Share` has it; `recorded`: as well.
+    """
+
+    def __init__(self, folder: Path, log: LargeLog, most: float) -> None:
+        """No file is opened yet; together they may have so many bytes."""
+        self._folder, self._log, self._room = folder, log, most
+        self._files: dict[str, tuple[BinaryIO, int]] = {}
+        self.like: Samples | None = None
+        self.recorded: SensorSet | None = None
+
+    def close(self) -> None:
+        """Close the files."""
+        for file, _ in self._files.values():
+            file.close()
+
+    def add(self, samples: Samples, first: int, total: int) -> None:
+        """Write samples from a number on, of so many in all.
+
+        Raises:
+            OSError: there is no room.
+        """
+        for name, x in named_tensors(samples).items():
+            rows = np.ascontiguousarray(x.numpy())
+            if name not in self._files:
+                self._files[name] = self._open(name, rows, total)
+            file, start = self._files[name]
+            file.seek(start + first * rows[:1].nbytes)
+            rest = memoryview(rows.reshape(-1).view(np.uint8).data)
+            while rest:
+                rest = rest[file.write(rest) :]
+        found = recorded_sensors(self._log.robot, self._log.contacts, [samples])
+        if self.recorded is not None:
+            found = SensorSet(found.torque & self.recorded.torque, found.wrench & self.recorded.wrench)
+        self.like, self.recorded = samples[:0], found
+
+    def _open(self, name: str, rows: np.ndarray[Any, Any], total: int) -> tuple[BinaryIO, int]:
+        """The file of a tensor, as large as it will be, and where its rows begin; all processes make the same."""
+        header, shape = io.BytesIO(), (total, *rows.shape[1:])
+        described = np.lib.format.header_data_from_array_1_0(rows) | {"fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(header, described)
+        size = header.tell() + int(np.prod(shape)) * rows.dtype.itemsize
+        self._room -= size
+        if self._room < 0:
+            raise OSError(errno.EFBIG, "more than a cache may take")
+        path = self._folder / f"{name}.npy"
+        path.touch()
+        file = path.open("r+b", buffering=0)  # noqa: SIM115 - see `close`
+        file.truncate(size)
+        file.write(header.getvalue())
+        return file, header.tell()
