@@ -149,7 +149,7 @@ def needs(builder: RowBuilder, chunks: Sequence[Chunk]) -> tuple[Need, Need, Nee
     for chunk, state in chunks:
         plan, count = builder.layout(state), len(chunk)
         m = tree.base_rows + len(plan.coupled_joints)
-        k = sum(len(body.unmeasured) for body in plan.contact_bodies)
+        k = sum(len(part.rows) for body in plan.contact_bodies for part in body.unmeasured)
         r = m - k
         kinematics.add(
             count * (_POSE * tree.n_nodes + _COLUMN * layout.count),

@@ -87,6 +87,7 @@ from .problem.compressed_log import (
     merge_blocks,
 )
 from .problem.compression import (
+    compress_in_blocks,
     split_into_folds,
 )
 from .ranks import (
@@ -156,6 +157,7 @@ __all__ = [
     "choose_ridge",
     "chosen_sensors",
     "compress",
+    "compress_in_blocks",
     "compress_log",
     "compress_parts",
     "cross_validate",

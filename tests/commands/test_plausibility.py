@@ -68,7 +68,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> list[str]
         (
             reversed_torques,
             ["sensors.set=joints"],
-            ("total mass is -21.24", "opposite sign", "joint_torque: all reversed"),
+            ("total mass is -21.25", "opposite sign", "joint_torque: all reversed"),
         ),
         (reversed_torques, ["estimator.name=consistent"], ("-1.03 times what the URDF's bodies need", "all reversed")),
         (reversed_torques, ["sensors.set=full"], ("times the stated sensor noise", "joint_torque: all reversed")),

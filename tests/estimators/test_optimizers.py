@@ -88,10 +88,11 @@ def test_an_optimizer_of_torch_that_cannot_do_it_is_refused_by_those_that_can(na
 
 @pytest.mark.parametrize("name", optimizer_names())
 def test_every_supported_optimizer_comes_near_the_closed_form_by_its_name_alone(name: str) -> None:
-    """52 times the closed form at the nominal parameters; after so few epochs most are within 2 %, ASGD at 1.7."""
+    """Share of the way from the URDF that is left after so few epochs: most 3e-4 to 7e-4, Adam 4e-3, RAdam 7e-3."""
     w = demo()
     estimate = Trainer(Sgd(0.001, optimizer={"name": name}, epochs=EPOCHS_OF.get(name, 15)), w.problem, w.batches).run()
-    assert 1.0 < estimate.objective / estimate.unconstrained < (2.0 if name == "ASGD" else 1.3)
+    whole = w.problem.cost(w.problem.nominal) / w.problem.rows - estimate.unconstrained
+    assert 0.0 < estimate.objective - estimate.unconstrained < 0.01 * whole
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ from torchid.problem import (
     compress_parts,
     linear_problem,
 )
-from torchid.problem.compression import FOLDS, merge_folds, merge_states, split_into_folds
+from torchid.problem.compression import FOLDS, compress_in_blocks, merge_folds, merge_states, split_into_folds
 from torchid.problem.metrics import ROW_GROUPS, WHITENED, describe_worse, worse_than_nominal
 from torchid.report.ridge import ridge_figure
 from torchid.sensing import Contact, SensorNoise, named_sensors
@@ -125,7 +125,7 @@ def test_of_long_training_logs_every_kth_sample_is_scored(run: Path, demo: tuple
     experiment = set_up(load_config(run / "config.yaml"))
     builder, evaluation = experiment.builder(experiment.sensors), experiment.evaluation()
     fitter, blocks = experiment.fitter(builder, experiment.conditions()), split_into_folds([log], builder)
-    fit = fitter.fit(compress_parts(blocks, builder))
+    fit = fitter.fit(compress_in_blocks(blocks, builder))
     compared, *without = (experiment.calibrations(one, builder) for one in (fit, *fitter.fit_without_folds(fit.parts)))
     parts = merge_states(fit.parts, builder)
 

@@ -47,7 +47,7 @@ def test_noise_ridge_outliers_and_cross_validation_are_those_of_the_command(tmp_
     ]
     loss, unregularized = torchid.RobustLoss.named("huber"), fitter(found.noise, 0.0)
     blocks = torchid.split_into_folds(logs, unregularized.builder)
-    parts = torchid.compress_parts(blocks, unregularized.builder)
+    parts = torchid.compress_in_blocks(blocks, unregularized.builder)
     estimators = [torchid.LeastSquares(ridge) for ridge in torchid.RIDGES]
     choice = torchid.choose_ridge(parts, blocks, unregularized, estimators, loss)
     assert choice.ridge == written["ridge_selection"]["ridge"]
@@ -81,7 +81,7 @@ def test_cross_validation_predicts_blocks_that_a_fit_has_not_seen(tmp_path: Path
     assert found.identified.as_dict() == written["cross_validation"]["identified"]
     assert found.nominal.as_dict() == written["cross_validation"]["nominal"]
 
-    fit = fitter.fit(torchid.compress_parts(logs, fitter.builder))
+    fit = fitter.fit(torchid.compress_in_blocks(logs, fitter.builder))
     compared = torchid.calibrations(fit, robot, fitter.builder)
     assert compared.identified.calibrate(logs) == logs, "without offsets, readings are what they are"
     np.testing.assert_array_equal(compared.nominal.phi, robot.nominal.ravel())
@@ -102,7 +102,7 @@ def test_a_frozen_body_keeps_its_parameters_and_must_exist(tmp_path: Path) -> No
         estimator=torchid.LeastSquares(1e-3),
         frozen=torchid.frozen_parameters(robot, [name]),
     )
-    phi = fitter.fit(torchid.compress_parts(logs, builder)).estimate.phi.reshape(robot.nominal.shape)
+    phi = fitter.fit(torchid.compress_in_blocks(logs, builder)).estimate.phi.reshape(robot.nominal.shape)
     np.testing.assert_array_equal(phi[1], robot.nominal[1])
     assert (phi[0] != robot.nominal[0]).any()
     with pytest.raises(UnknownNameError, match="^frozen: unknown name 'trunkk'"):

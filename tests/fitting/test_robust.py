@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -129,20 +130,21 @@ class Bench:
         return replace(self.clean, torque=self.clean.torque + torch.from_numpy(error))
 
     def off(self, estimate: Estimate, errors: Estimate | None = None) -> Array:
-        """How far identified parameters are from the truth, in standard errors."""
+        """How far identified parameters are from the truth, in standard errors by noise."""
         known = estimate.verdict == "identified"
-        return ((estimate.phi - self.true) / (errors or estimate).standard_error)[known]
+        return ((estimate.phi - self.true) / (errors or estimate).noise_error)[known]
 
 
 class StillRows(RowBuilder):
-    """A builder for logs of one chunk and one motion, whose dynamics are worked out once."""
+    """A builder for logs of one motion, the dynamics of whose chunks are worked out once."""
 
-    kept: ChunkDynamics | None = None
+    kept: ClassVar[dict[tuple[float, int], ChunkDynamics]] = {}
 
     def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
-        if self.kept is None:
-            self.kept = super().dynamics(samples)
-        return self.kept
+        key = float(samples.time[0]), len(samples)
+        if key not in self.kept:
+            self.kept[key] = super().dynamics(samples)
+        return self.kept[key]
 
 
 @pytest.fixture(scope="module")
@@ -334,7 +336,7 @@ def test_the_order_of_chunks_and_the_number_of_threads_do_not_matter(
     logs = [replace(bench.noisy(rng, 0.005), source=name) for name in ("a", "b")]
     found = []
     for order, options in ((logs, {"threads": 1}), (logs[::-1], {"threads": 3, "chunk": 37})):
-        monkeypatch.setattr("torchid.fitting.robust.compress_parts", partial(compress_parts, **options))
+        monkeypatch.setattr("torchid.problem.compression.compress_parts", partial(compress_parts, **options))
         found.append(bench.fits(kind, *order)[1:])
     (one, one_found), (other, other_found) = found
     size = np.abs(one.estimate.phi).max()
@@ -387,7 +389,7 @@ def test_errors_of_all_figures_are_those_of_the_loss(arm: Bench) -> None:
     assert problem.cost(estimate.phi) == pytest.approx(estimate.cost, rel=1e-9)
     assert problem.cost(problem.nominal) == pytest.approx(estimate.nominal_cost, rel=1e-9)
     again = LeastSquares().solve(problem)
-    np.testing.assert_allclose(again.standard_error, estimate.standard_error, rtol=1e-6)
+    np.testing.assert_allclose(again.noise_error, estimate.noise_error, rtol=1e-6)
     assert estimate.residual_std < 0.1 * first.estimate.residual_std
 
 

@@ -83,7 +83,7 @@ def test_holes_in_poses_are_found_and_left_out_where_that_is_asked_for(tmp_path:
     same = clean[np.flatnonzero(np.isin(clean.time.numpy(), kept.time.numpy()))]
     assert len(kept) == len(same) > 0.9 * len(clean)
     error = np.abs(fitted(kept).phi - fitted(same).phi) / fitted(same).standard_error
-    assert np.nanmax(error) < 0.1, "a tenth of a standard error is left of ten samples interpolated by a line"
+    assert np.nanmax(error) < 0.15, "of ten samples interpolated by a line; a residual twice as large hid half of it"
 
 
 def test_a_pose_that_was_mostly_not_measured_makes_a_log_useless(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_the_table_shows_four_columns_and_counts_what_it_leaves_out(
 def test_a_value_has_as_many_decimals_as_its_error_and_that_two_digits(
     value: float, error: float, expected: str
 ) -> None:
-    assert expected in printed([replace(ARMATURE, value=value, standard_error=error)])
+    assert expected in printed([replace(ARMATURE, value=value, noise_error=error)])
 
 
 def test_a_warning_of_what_cannot_be_told_apart_lists_sensors_and_parameters_by_their_commas() -> None:

@@ -17,7 +17,7 @@ from torchid.parameters import Array
 from torchid.problem import Evaluation, ExtraTerms, Metrics, RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback, one_thread
 from torchid.problem.compressed_log import Block
-from torchid.problem.compression import Part, merge_states, split_into_folds
+from torchid.problem.compression import Part, compress_in_blocks, merge_states, split_into_folds
 from torchid.problem.extras import recorded_components
 from torchid.problem.metrics import ForceSums
 
@@ -77,8 +77,7 @@ def cross_validate(
         LogError: too few samples to leave some out.
     """
     blocks = split_into_folds(logs, fitter.builder)
-    parts = compress_parts(blocks, fitter.builder)
-    fit = fitter.fit(parts)
+    fit = fitter.fit(compress_in_blocks(blocks, fitter.builder))
     without_folds = fitter.fit_without_folds(fit.parts)
 
     def compared(one: Fit) -> Comparison[Calibration]:

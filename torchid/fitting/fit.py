@@ -75,7 +75,7 @@ class LogFitter:
 
         builder = torchid.RowBuilder(robot, contacts, sensors)
         fitter = torchid.LogFitter(robot=robot, builder=builder, estimator=torchid.LeastSquares(ridge=1e-3))
-        fit = fitter.fit(torchid.compress_parts(logs, builder))
+        fit = fitter.fit(torchid.compress_in_blocks(logs, builder))
         fit.estimate.phi  # (12 L,)
 
     Attributes:
