@@ -54,7 +54,7 @@ def check_magnitudes(log: Log) -> Iterator[Finding]:
 
 
 def check_missing_values(log: Log) -> Iterator[Finding]:
-    """Findings about NaN, in readings of contacts while they touch. Motion must be known throughout, forces need not."""
+    """Findings about NaN, in readings of contacts while they touch. Motion must be known throughout, not forces."""
     for field in log.arrays():
         if field not in NON_SIGNAL_FIELDS:
             yield from _missing_findings(log, field)
