@@ -286,5 +286,6 @@ def _check_scalar(field_name: str, contact: Contact, names: Sequence[str]) -> No
         raise SensorError.at_field(field_name, found, accepted)
     if not contact.along_normal:
         found = f"'{NORMAL_FORCE}' of a contact whose wrench is read"
-        accepted = f"{', '.join(contact.component_names)}; [{NORMAL_FORCE}] takes a Contact with along_normal=True"
+        accepted = f"{', '.join(contact.component_names)}; {NORMAL_FORCE} if the experiment's own sensors have it too "
+        accepted += "(in Python: a Contact with along_normal=True)"
         raise SensorError.at_field(field_name, found, accepted)
