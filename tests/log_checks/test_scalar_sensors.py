@@ -69,6 +69,12 @@ def test_a_good_log_with_scalar_sensors_is_usable_and_its_faults_are_named() -> 
     assert not [one for one in clean.findings if one.field == "contact_force_normal"]
     contacts = [replace(contact, along_normal=True) for contact in CONTACTS]
     assert check(log, demo_robot(), contacts, CUTOFF).findings == clean.findings
+    both = replace(scalar(demo_log()), **{FIELD: 40.0 * getattr(demo_log(), FIELD)})
+    expected = [(one.name, one.field, one.found) for one in of_demo(both).findings]
+    assert [
+        (one.name, one.field, one.found) for one in check(both, demo_robot(), contacts, CUTOFF).findings
+    ] == expected
+    assert expected
     foot = log.contact_names.index(FEET[3])
     touching = np.flatnonzero(value(log.contact_active)[:, foot])
 
@@ -76,7 +82,10 @@ def test_a_good_log_with_scalar_sensors_is_usable_and_its_faults_are_named() -> 
         force[touching[40:45], foot] = np.nan
 
     def spike(force: NDArray[np.float64]) -> None:
-        force[touching[len(touching) // 2], foot] += 5000.0
+        """While another foot is in the air and not read."""
+        force[~value(log.contact_active)] = np.nan
+        lifted = np.flatnonzero(value(log.contact_active)[:, foot] & ~value(log.contact_active)[:, foot - 1])
+        force[lifted[len(lifted) // 4], foot] += 5000.0
 
     for change, name in ((gap, "not measured"), (spike, "spike")):
         finding = only(of_demo(changed(log, "contact_force_normal", change)), name, "contact_force_normal")
