@@ -108,11 +108,8 @@ MACHINES: dict[str, tuple[Path | None, bool, Sequence[Contact]]] = {
         PANDA, True, scalar([*rolling(("panda_rightfinger", 0.02)), Contact("panda_hand", "line", "x")])),
 }  # fmt: skip
 
-ROLLING = [
-    name
-    for name, (_, _, contacts) in MACHINES.items()
-    if any(contact.radius for contact in contacts) and not any(contact.along_normal for contact in contacts)
-]
+ROLLING = [k for k, (_, _, feet) in MACHINES.items() if any(c.radius for c in feet)]
+ROLLING = [k for k in ROLLING if not any(c.along_normal for c in MACHINES[k][2])]
 
 
 @dataclass(frozen=True)
