@@ -94,6 +94,31 @@ def test_normals_of_the_ground_come_in_blocks_too(
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
+def test_forces_along_the_normal_come_in_blocks_too(
+    tmp_path: Path, suffix: str, request: pytest.FixtureRequest
+) -> None:
+    fields = recorded(9_000)
+    fields["contact_force_normal"] = fields.pop("contact_wrench_local")[..., 2]
+    file = experiment(tmp_path, fields, suffix)
+    feet = ", ".join(f"{foot}: [fn]" for foot in fields["contact_names"])
+    settings = (
+        *overrides({"cutoff_hz": 20}, f"{{contact_wrenches: {{{feet}}}, offsets: {{contact_force: log}}}}"),
+        "sensors.set=null",
+    )
+    whole = samples_of(file, *settings)
+    assert whole.has_force_normal
+    assert whole.wrench is not None
+    assert whole.wrench[:, :, 2].abs().max() > 20.0
+    assert whole.unloaded is not None
+    assert whole.unloaded[:, 0, 2].isfinite().any()
+    request.getfixturevalue("small_blocks")
+    for more in ((), (SMALL,)):
+        blocks = samples_of(file, *settings, *more)
+        assert_same(blocks, whole, 1e-10)
+        assert blocks.has_force_normal
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet", ".h5"])
 @pytest.mark.parametrize("terms", ["{}", "{contact_force: log}"])
 def test_readings_in_the_air_are_kept_where_offsets_are_fitted(
     tmp_path: Path, suffix: str, terms: str, request: pytest.FixtureRequest

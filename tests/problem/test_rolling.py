@@ -19,6 +19,7 @@ import torchid
 from torchid.errors import LogError, SensorError
 from torchid.logs import Log, preprocess, read_log, write_log
 from torchid.problem import ExtraTerms, RowBuilder, bind_log, compress
+from torchid.problem.sampled_rows import SampledRows
 from torchid.sensing import Contact
 
 ASKEW = (0.3, -0.2, 0.8)
@@ -208,6 +209,22 @@ def test_filters_hold_normals_and_give_widened_contacts_those_of_the_nearest_sam
         np.testing.assert_array_equal(chosen, np.broadcast_to(normal, chosen.shape))
     assert np.isnan(found[~down]).all()
     assert bind_log(filtered, load(ANYMAL), BALLS).contact_normal is not None
+
+
+@pytest.mark.parametrize("along_normal", [False, True])
+def test_sources_of_noise_know_nothing_of_normals_in_the_air(along_normal: bool) -> None:
+    contacts = [replace(ball, along_normal=along_normal) for ball in BALLS]
+    robot = load(ANYMAL)
+    samples, _ = random_samples(robot, contacts, 40, 0, states=4)
+    normals = unit(np.random.default_rng(0).normal(size=(40, 4, 3)))
+    known = torch.from_numpy(normals)
+    unknown = torch.where(samples.active[..., None], known, torch.nan)
+    builder = RowBuilder(robot, contacts, sensor_set("full", robot, contacts))
+    found, expected = (SampledRows([replace(samples, contact_normal=x)], builder).chunks for x in (unknown, known))
+    assert not samples.active.all()
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one.sources, other.sources)
+        assert one.sources.isfinite().all()
 
 
 # --------------------------------------------------------------------------------------------------------- refusals

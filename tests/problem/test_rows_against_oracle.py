@@ -34,6 +34,7 @@ NOISE = SensorNoise(0.3, 1.5, 0.1, tuple(BASE[:3].tolist()), tuple(BASE[3:].toli
 JOINT, WRENCH, LIMB = 0.3, *(np.repeat(pair, 3) for pair in ((1.5, 0.1), (0.9, 0.02)))  # of NOISE once more
 EXACT = 1e-11  # of the largest number; 1e-12 measured
 
+LEGS = ("LF", "RF", "LH", "RH")
 SOLES = tuple(Contact(f"{side}_ankle_roll_link", "flat") for side in ("left", "right"))
 ASKEW = (0.3, -0.2, 0.8)
 """A normal of the ground, not of unit length."""
@@ -42,6 +43,11 @@ ASKEW = (0.3, -0.2, 0.8)
 def rolling(*radii: tuple[str, float]) -> list[Contact]:
     """Spheres about frames on ground that is not level."""
     return [Contact(frame, "point", radius=radius, normal=ASKEW) for frame, radius in radii]
+
+
+def scalar(contacts: Sequence[Contact], *frames: str) -> list[Contact]:
+    """The contacts, those at some frames, by default all, with a sensor of the force along the normal alone."""
+    return [replace(x, along_normal=x.frame in frames or not frames) for x in contacts]
 
 
 MACHINES: dict[str, tuple[Path | None, bool, Sequence[Contact]]] = {
@@ -80,7 +86,30 @@ MACHINES: dict[str, tuple[Path | None, bool, Sequence[Contact]]] = {
         TIAGO, False, rolling(("base_link", 0.1), ("base_imu_link", 0.2), ("caster_front_left_1_link", 0.0))),
     "bolted arm on a ball": (
         PANDA, True, [*rolling(("panda_rightfinger", 0.02)), Contact("panda_hand", "line", "x", 0.04)]),
+    "quadruped with scalar sensors": (ANYMAL, False, scalar(rolling(*((f"{leg}_FOOT", 0.0) for leg in LEGS)))),
+    "balls, two with scalar sensors": (
+        ANYMAL, False, scalar(rolling(*((f"{leg}_FOOT", 0.04) for leg in LEGS)), "LF_FOOT", "LH_FOOT")),
+    "balls with scalar sensors on recorded ground": (
+        ANYMAL, False, scalar(rolling(*((f"{leg}_FOOT", 0.04) for leg in LEGS)))),
+    "points, two with scalar sensors, on recorded ground": (
+        ANYMAL, False, scalar([Contact(f"{leg}_FOOT", "point") for leg in LEGS], "LF_FOOT", "RF_FOOT")),
+    "humanoid with insoles": (G1, False, scalar([replace(sole, normal=ASKEW) for sole in SOLES])),
+    "rockers with scalar sensors below sensors in limbs": (
+        None, False, scalar([Contact("sole", "line", "x", 0.3, ASKEW), Contact("fin", "line", "z"),
+                             Contact("thigh", "point", radius=0.1)], "sole", "fin")),
+    "welded, two cells in a foot": (None, False, scalar(rolling(("foot", 0.05), ("sole", 0.0), ("hand", 0.02)))),
+    "welded, a cell and a plate on a foot": (
+        None, False, scalar([*rolling(("foot", 0.05)), Contact("sole", "flat")], "foot")),
+    "welded, a ball and a plate with a cell on a foot": (
+        None, False, scalar([*rolling(("foot", 0.05)), Contact("sole", "flat")], "sole")),
+    "three cells on a base": (
+        TIAGO, False, scalar(rolling(("base_link", 0.1), ("base_imu_link", 0.0), ("caster_front_left_1_link", 0.1)))),
+    "bolted arm with a scalar sensor": (
+        PANDA, True, scalar([*rolling(("panda_rightfinger", 0.02)), Contact("panda_hand", "line", "x")])),
 }  # fmt: skip
+
+ROLLING = [k for k, (_, _, feet) in MACHINES.items() if any(c.radius for c in feet)]
+ROLLING = [k for k in ROLLING if not any(c.along_normal for c in MACHINES[k][2])]
 
 
 @dataclass(frozen=True)
@@ -96,7 +125,10 @@ class Recorded:
 
 
 class RollingOracle(Oracle):
-    """An oracle whose contacts roll: forces act at c - r n, and a wrench is what a sensor at c reads of them."""
+    """An oracle whose contacts roll: forces act at c - r n, and a wrench is what a sensor at c reads of them.
+
+    Its Jacobian of a contact with a scalar sensor is along two directions across the ground's normal, then along it.
+    """
 
     contacts: dict[str, Contact] = {}
     normals: dict[str, Array] = {}
@@ -110,6 +142,8 @@ class RollingOracle(Oracle):
             (self.mounting @ self.pose(q, frame)[0]).transpose(0, 2, 1)
             @ np.broadcast_to(normal, (len(q), 3))[..., None]
         )[..., 0]
+        across = np.linalg.svd(n[:, :, None])[0].transpose(0, 2, 1)[:, 1:]
+        ground = np.concatenate([across, n[:, None]], axis=1)
         if contact.kind == "line":
             along = "xyz".index(contact.line_axis)
             n[:, along] = 0.0
@@ -118,6 +152,8 @@ class RollingOracle(Oracle):
         if contact.kind == "line":  # the ground has no moment about the axis; those across it are unknowns of their own
             moment[..., [axis for axis in range(3) if axis != along]] = 0.0
         J[:, :3] += moment @ J[:, 3:]
+        if contact.along_normal:  # components of its force are then along the axes of the ground
+            J[:, :3] = ground @ J[:, :3]
         return J
 
 
@@ -145,11 +181,20 @@ def recorded(name: str) -> Recorded:
     if oracle.normals:
         normals = np.stack(list(oracle.normals.values()), axis=1)
         log = replace(log, contact_normal_world=np.where(value(log.contact_active)[..., None], normals, np.nan))
+    log = with_scalar_readings(log, contacts)
     state = states_of(log)
     K = np.concatenate([oracle.regressor(robot, *state), oracle.friction_regressor(robot, state[1])], axis=3)
     J = np.array([oracle.jacobian(state[0], contact.frame) for contact in contacts])
     J = J.reshape(count, len(log), 6, K.shape[1]).swapaxes(0, 1)
     return Recorded(robot, oracle, tuple(contacts), log, K.reshape(*K.shape[:2], -1), J)
+
+
+def with_scalar_readings(log: Log, contacts: Sequence[Contact]) -> Log:
+    """The log with the forces along the normal that its scalar sensors read, in place of fz."""
+    along = np.array([contact.along_normal for contact in contacts], dtype=bool)
+    if not along.any():
+        return log
+    return replace(log, contact_force_normal=np.where(along, value(log.contact_wrench_local)[..., 2], np.nan))
 
 
 # ------------------------------------------------------------------------------------------ sensors and conventions
@@ -163,14 +208,16 @@ def some(rng: np.random.Generator, *shape: int) -> np.ndarray:
 SETS = ("full", "contacts only", "torques only", "limbs only", "some components")
 
 
-def sensor_set(name: str, robot: Robot, count: int) -> SensorSet:
+def sensor_set(name: str, robot: Robot, contacts: Sequence[Contact]) -> SensorSet:
     """One of `SETS`; without sensors in limbs, "limbs only" measures nothing but the motion."""
+    count, readable = len(contacts), np.ones((len(contacts), 6), dtype=bool)
+    readable[[contact.along_normal for contact in contacts]] = np.arange(6) == 2
     if name == "some components":
         rng = np.random.default_rng(1)
-        return SensorSet(some(rng, robot.n_dofs), some(rng, count, 6), NOISE)
+        return SensorSet(some(rng, robot.n_dofs), some(rng, count, 6) & readable, NOISE)
     joint = np.arange(robot.n_dofs) < robot.n
     torque = joint & (name in ("full", "torques only")) | ~joint & (name in ("full", "limbs only"))
-    return SensorSet(torque, np.full((count, 6), name in ("full", "contacts only")), NOISE)
+    return SensorSet(torque, readable & (name in ("full", "contacts only")), NOISE)
 
 
 def in_other_order(log: Log) -> Log:
@@ -187,6 +234,7 @@ def in_other_order(log: Log) -> Log:
         ft_names=log.ft_names[::-1],
         **backwards(["joint_position", "joint_velocity", "joint_acceleration", "joint_torque"]),
         **backwards(["contact_active", "contact_wrench_local", "contact_wrench_world", "contact_normal_world"]),
+        **backwards(["contact_force_normal"]),
         **backwards(["ft_wrench"]),
     )
 
@@ -211,7 +259,7 @@ CASES = [
     (name, convention)
     for name, (_, fixed_base, contacts) in MACHINES.items()
     for convention in (ANY_BASE if fixed_base else CONVENTIONS)
-    if convention != "IMU" or not any(contact.radius for contact in contacts)
+    if convention != "IMU" or not any(contact.radius or contact.along_normal for contact in contacts)
 ]
 
 
@@ -221,7 +269,7 @@ def with_wild_unmeasured_forces(r: Recorded, sensors: SensorSet) -> Log:
     wrench, torque = value(r.log.contact_wrench_local).copy(), value(r.log.joint_torque).copy()
     wrench[:, ~sensors.wrench] += 1e3 * rng.normal(size=wrench[:, ~sensors.wrench].shape)
     torque[:, ~sensors.torque[:n]] += 1e3 * rng.normal(size=torque[:, ~sensors.torque[:n]].shape)
-    log = replace(r.log, contact_wrench_local=wrench, joint_torque=torque)
+    log = with_scalar_readings(replace(r.log, contact_wrench_local=wrench, joint_torque=torque), r.contacts)
     if log.ft_wrench is not None:
         limbs, unread = log.ft_wrench.copy(), ~sensors.torque[n:].reshape(-1, 6)
         limbs[:, unread] += 1e3 * rng.normal(size=limbs[:, unread].shape)
@@ -283,7 +331,7 @@ def assert_close(found: Array, expected: Array, size: float) -> None:
 @cache
 def row_builder(name: str, sensors: str) -> RowBuilder:
     r = recorded(name)
-    return RowBuilder(r.robot, r.contacts, sensor_set(sensors, r.robot, len(r.contacts)))
+    return RowBuilder(r.robot, r.contacts, sensor_set(sensors, r.robot, r.contacts))
 
 
 @pytest.mark.parametrize("sensors", SETS)
@@ -311,7 +359,7 @@ def test_rows_are_white_combinations_of_pinocchios_equations_that_no_unmeasured_
     assert_close(again, rows, size)
 
 
-@pytest.mark.parametrize("name", [name for name, machine in MACHINES.items() if any(c.radius for c in machine[2])])
+@pytest.mark.parametrize("name", ROLLING)
 def test_forces_measured_where_contacts_roll_are_those_that_the_true_parameters_predict(name: str) -> None:
     r = recorded(name)
     builder = row_builder(name, "full")

@@ -21,7 +21,7 @@ from torchid.errors import LogError, about_file
 from torchid.logs import Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, count_samples_from, open_log_blocks
 from torchid.logs.coverage import Coverage, warn_of_gaps
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray
+from torchid.logs.log import CONTACT_READINGS, BoolArray, FloatArray
 from torchid.logs.preprocess import (
     away_from_changes,
     find_unloaded,
@@ -139,7 +139,7 @@ class LargeLog:
         for piece in self._pieces(blocks, len(blocks)) if coverages else ():
             log = blocks.read(piece, only=(*coverages, "contact_active"))
             for name, coverage in coverages.items():
-                coverage.add(getattr(log, name), log.contact_active if name in WRENCHES else None)
+                coverage.add(getattr(log, name), log.contact_active if name in CONTACT_READINGS else None)
         for name, coverage in coverages.items():
             warn_of_gaps(first, name, coverage)
         return coverages

@@ -32,7 +32,7 @@ FileName = Annotated[str, AfterValidator(_file_name)]
 Device = Annotated[str, AfterValidator(_torch_device)]
 
 
-Component = Literal["fx", "fy", "fz", "mx", "my", "mz"]
+Component = Literal["fx", "fy", "fz", "mx", "my", "mz", "fn"]
 
 
 def _per_axis(value: object) -> float | tuple[float, float, float]:
@@ -111,7 +111,8 @@ class NoiseConfig:
 class ChoiceConfig:
     """A named set, or sensors by name; `full` is short for `{set: full}`.
 
-    `ft_sensors`, the fixed joints that carry a force/torque sensor, may be given with a named set too.
+    `ft_sensors`, the fixed joints that carry a force/torque sensor, may be given with a named set too. `fn`, alone
+    among the components of a contact, is the force along the ground's normal, `contact_force_normal` of the logs.
     """
 
     set: Literal["full", "contacts", "joints"] | None = None

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from torchid.config.sensors import ContactConfig
+from torchid.config.sensors import ChoiceConfig, ContactConfig
 from torchid.errors import ConfigError, SensorError
 from torchid.robot import CollisionShapes, Robot, RollingShape
 from torchid.sensing import Contact, validate_contacts
-from torchid.sensing.sensors import UP, join_numbers
+from torchid.sensing.sensors import NORMAL_FORCE, UP, join_numbers
 
 
 def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[tuple[Contact, ...], str]:
@@ -41,6 +41,12 @@ def resolve_contacts(settings: Sequence[ContactConfig], robot: Robot) -> tuple[t
         out.append(contact)
         sources.append(source)
     return tuple(out), _describe(out, sources)
+
+
+def read_along_normals(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tuple[Contact, ...]:
+    """The contacts, those with a scalar sensor (`fn`) read along the ground's normal."""
+    scalar = {frame for frame, names in sensors.contact_wrenches.items() if NORMAL_FORCE in names}
+    return tuple(replace(x, along_normal=True) if x.frame in scalar else x for x in contacts)
 
 
 def rolling_shape(shapes: CollisionShapes, contact: Contact) -> RollingShape | None:

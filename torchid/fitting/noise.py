@@ -116,7 +116,9 @@ def recorded_sensors(
         else:
             wrench &= (log.wrench.isfinite() | ~log.active[..., None]).all(0).numpy()
             if log.wrench_in_world:  # components along a frame's axes take whole vectors
-                wrench = np.repeat(wrench.reshape(-1, 2, 3).all(axis=2), 3, axis=1)
+                whole = np.repeat(wrench.reshape(-1, 2, 3).all(axis=2), 3, axis=1)
+                scalar = np.array([contact.along_normal for contact in contacts], dtype=bool)[:, None]
+                wrench = np.where(scalar, wrench, whole)
     return SensorSet(torque, wrench, noise or SensorNoise())
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchid.errors import LogError, join_names
-from torchid.parameters import WRENCH_COMPONENTS, Array
+from torchid.parameters import Array
 from torchid.problem import RowBuilder
 from torchid.problem.extras import measured_components
 from torchid.problem.sampled_rows import noise_of_sensors
@@ -119,6 +119,8 @@ def _contact_text(contact: Contact) -> str:
     kind = f"line along {contact.line_axis}" if contact.kind == "line" else contact.kind
     if contact.radius:  # a factor of a contact that does not roll stays what it was
         kind += f", radius {contact.radius!r} m, normal {', '.join(map(repr, contact.normal))}"
+    if contact.along_normal:
+        kind += f", read along {', '.join(map(repr, contact.normal))}"
     return f"{contact.frame} ({kind})"
 
 
@@ -130,7 +132,9 @@ def _channels(robot: Robot, builder: RowBuilder) -> list[str]:
     """Measured channels by name."""
     measured = measured_components(builder.contacts, builder.sensors)
     names = [robot.dof_names[dof] for dof in np.flatnonzero(builder.sensors.torque)]
-    return names + [f"{builder.contacts[i].frame} {WRENCH_COMPONENTS[k]}" for i, k in np.argwhere(measured)]
+    return names + [
+        f"{builder.contacts[i].frame} {builder.contacts[i].component_name(k)}" for i, k in np.argwhere(measured)
+    ]
 
 
 def _texts(found: Value, expected: Value, reference: str) -> tuple[str, str]:

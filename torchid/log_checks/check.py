@@ -29,7 +29,7 @@ from torchid.log_checks.findings import (
     median_step,
 )
 from torchid.log_checks.forces import check_forces_against_urdf
-from torchid.log_checks.frozen import check_repeats
+from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
 from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
@@ -104,6 +104,7 @@ def check(
         contacts: of the robot.
         cutoff_hz: cutoff [Hz] of the filter that the log will be preprocessed with; None for the default.
     """
+    contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
     results: list[Finding | Skipped] = list(check_magnitudes(log))
     if (blocking := _blocking_finding(results)) is not None:
         return _collect(log, log, [*results, _skip_dependent(blocking)])
@@ -118,7 +119,7 @@ def check(
     repaired = repair_log(log, _findings(results))
     if units := list(check_angle_unit(repaired, robot)):  # thresholds of position steps are in radians
         results = [x for x in results if not (isinstance(x, Finding) and x.name == "step" and x.whole)]
-    results += [*units, *check_contact_flags(repaired)]
+    results += [*units, *check_contact_flags(repaired), *check_scalar_wrenches(repaired)]
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
     if blocking is None or blocking.field != "time":

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.logs import Log
-from torchid.logs.log import NORMALS, WRENCHES, BoolArray, FloatArray, column_labels
+from torchid.logs.log import CONTACT_READINGS, NORMALS, BoolArray, FloatArray, column_labels
 from torchid.parameters import WRENCH_COMPONENTS
 
 #: The samples must not be fitted.
@@ -139,6 +139,7 @@ FIELD_UNITS = {
     "joint_velocity": "rad/s",
     "joint_acceleration": "rad/s^2",
     "joint_torque": "N m",
+    "contact_force_normal": "N",
     "base_position_world": "m",
     "base_linear_velocity_world": "m/s",
     "base_angular_velocity_base": "rad/s",
@@ -166,7 +167,7 @@ class ChannelGroup:
         name: of the contact or force/torque sensor; "" elsewhere.
         names: of the c channels within the field.
         samples: (M,) numbers of the samples at which all channels were measured; of a contact, those while it is
-            active and its wrench is not zero.
+            active and its reading is not zero.
         values: (M, c).
         elapsed: (M,) time since the first in median steps of the log.
         piece: (M,) number of the run of samples without a gap that each sample belongs to.
@@ -211,14 +212,16 @@ def channel_groups(log: Log) -> Iterator[ChannelGroup]:
             continue
         values: FloatArray = getattr(log, field)
         names = channel_names(log, field)
-        if values.ndim == 2:
+        if values.ndim == 2 and field not in CONTACT_READINGS:
             yield from _group(log, field, "", names, values, np.ones(len(log), dtype=bool))
             continue
         for index, label in enumerate(column_labels(field, log.names)):
             measured = np.ones(len(log), dtype=bool)
-            if field in WRENCHES and log.contact_active is not None:
-                measured = log.contact_active[:, index] & (values[:, index] != 0.0).any(axis=1)
-            yield from _group(log, field, label, names[6 * index : 6 * index + 6], values[:, index], measured)
+            own = values[:, index].reshape(len(log), -1)
+            if field in CONTACT_READINGS and log.contact_active is not None:
+                measured = log.contact_active[:, index] & (own != 0.0).any(axis=1)
+            width = own.shape[1]
+            yield from _group(log, field, label, names[width * index : width * (index + 1)], own, measured)
 
 
 def _group(

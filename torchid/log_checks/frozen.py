@@ -20,14 +20,16 @@ from torchid.log_checks.findings import (
     finite_median,
     neighbours_of,
 )
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray
+from torchid.logs import Log
+from torchid.logs.log import CONTACT_READINGS, FORCE_NORMAL, WRENCHES, BoolArray, FloatArray
+from torchid.parameters import WRENCH_COMPONENTS
 
 #: Samples at one extreme value from which on it is a limit of the sensor.
 MIN_SAMPLES_AT_LIMIT = 5
 #: Fields that are zero while a joint rests.
 RATE_FIELDS = ("joint_velocity", "joint_acceleration")
 #: Fields in which a driver may set small readings to zero.
-DEAD_BAND_FIELDS = (*RATE_FIELDS, "joint_torque", "ft_wrench", *WRENCHES)
+DEAD_BAND_FIELDS = (*RATE_FIELDS, "joint_torque", "ft_wrench", *CONTACT_READINGS)
 #: Logarithm (base 10) of the probability of a run of repeats by chance: none in a million samples.
 MAX_LOG10_PROBABILITY = -8.0
 #: Steps on either side that a run is compared with.
@@ -324,3 +326,22 @@ def _smallest_difference(sides: list[FloatArray], rounding: FloatArray) -> Float
     sizes = np.concatenate([*sides, *(np.abs(np.diff(side, axis=1)) for side in sides)], axis=1)
     least = np.where(sizes > rounding, sizes, np.inf).min(axis=1)  # NaN compares false
     return np.where(np.isfinite(least), least, 0.0)
+
+
+def check_scalar_wrenches(log: Log) -> Iterator[Finding]:
+    """Findings about wrenches of which one force alone is ever other than 0: a scalar sensor's reading among zeros."""
+    wrench, active = log.contact_wrench, log.contact_active
+    if wrench is None or active is None:
+        return
+    for index, name in enumerate(log.contact_names):
+        touching = wrench[active[:, index], index]
+        present = np.nan_to_num(touching).any(axis=0)
+        forces = np.flatnonzero(present[:3])
+        if len(forces) != 1 or present[3:].any() or np.isnan(touching[:, :3]).any():
+            continue
+        text = f"{name}: all but {WRENCH_COMPONENTS[forces[0]]} is 0 throughout, as of a scalar sensor"
+        advice = (
+            f"give it as {FORCE_NORMAL}, with sensors.contact_wrenches: {{FRAME: [fn]}}: zeros are fitted as measured "
+            "forces along the frame's axes"
+        )
+        yield Finding("scalar sensor", SUSPICIOUS, log.contact_wrench_field, text, advice, (name,))

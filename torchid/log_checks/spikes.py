@@ -25,12 +25,12 @@ from torchid.log_checks.findings import (
     widen_mask,
 )
 from torchid.logs import Log
-from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.log import CONTACT_READINGS, BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
 
 POSITION_FIELDS = ("joint_position", "base_quat_xyzw", "base_position_world")
 #: Fields whose lasting steps are reported; those of velocities and accelerations are caused by impacts and commands.
-_FORCE_FIELDS = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "ft_wrench")
+_FORCE_FIELDS = ("joint_torque", *CONTACT_READINGS, "ft_wrench")
 #: Ends of the names of fields in which impacts appear as spikes.
 _ACCELERATION_SUFFIXES = ("acceleration", "acceleration_world", "acceleration_base", "specific_force")
 #: Spike over the channel's range (1st to 99th percentile; of a force or moment, the largest range of its components):

@@ -19,7 +19,7 @@ from torchid.log_checks.findings import (
     find_spans,
 )
 from torchid.logs import Log
-from torchid.logs.log import NAN_ALLOWED, WRENCHES, BoolArray, FloatArray
+from torchid.logs.log import CONTACT_READINGS, NAN_ALLOWED, BoolArray, FloatArray
 from torchid.logs.preprocess import lacks_derivatives
 from torchid.logs.timeline import FEWEST_DIFFERENTIATED, LONGEST_STEP, SHORTEST_STEP
 
@@ -54,7 +54,7 @@ def check_magnitudes(log: Log) -> Iterator[Finding]:
 
 
 def check_missing_values(log: Log) -> Iterator[Finding]:
-    """Findings about NaN, in wrenches while the contact is active. Motion must be known throughout, forces need not."""
+    """Findings about NaN, in readings of contacts while they touch. Motion must be known throughout, not forces."""
     for field in log.arrays():
         if field not in NON_SIGNAL_FIELDS:
             yield from _missing_findings(log, field)
@@ -64,9 +64,10 @@ def _missing_findings(log: Log, field: str) -> Iterator[Finding]:
     array: FloatArray = getattr(log, field)
     names = channel_names(log, field)
     nan = np.isnan(array)
-    if field in WRENCHES and log.contact_active is not None:
-        nan = nan & log.contact_active[..., None]
-        relevant = np.repeat(log.contact_active.sum(axis=0), array.shape[2])
+    if field in CONTACT_READINGS and log.contact_active is not None:
+        active = log.contact_active.reshape(log.contact_active.shape + (1,) * (array.ndim - 2))
+        nan = nan & active
+        relevant = np.broadcast_to(active.sum(axis=0), array.shape[1:]).ravel()
     else:
         relevant = np.full(len(names), len(log))
     nan = nan.reshape(len(log), -1)

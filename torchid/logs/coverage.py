@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import warn
-from torchid.logs.log import WRENCHES, BoolArray, FloatArray, Log, column_labels, describe_element
+from torchid.logs.log import CONTACT_READINGS, BoolArray, FloatArray, Log, column_labels, describe_element
 
 
 @dataclass
@@ -32,12 +32,14 @@ class Coverage:
         return cls(0, *(np.zeros(channels, dtype=np.intp) for _ in range(5)))
 
     def add(self, values: FloatArray, active: BoolArray | None) -> None:
-        """Add samples (N, ...) of the field; `active`: (N, C) of a wrench's contacts."""
+        """Add samples (N, ...) of the field; `active`: (N, C) of the contacts of a reading."""
         nan = np.isnan(values)
-        self.values += len(values) - nan.sum(axis=0)
-        self.measurable += len(values) if active is None else active.sum(axis=0)[:, None]
         if active is not None:
-            nan &= active[..., None]
+            active = active.reshape(active.shape + (1,) * (values.ndim - 2))
+        self.values += len(values) - nan.sum(axis=0)
+        self.measurable += len(values) if active is None else active.sum(axis=0)
+        if active is not None:
+            nan &= active
         count = nan.sum(axis=0)
         new = (count > 0) & (self.missing == 0)
         self.first[new] = self.samples + np.argmax(nan, axis=0)[new]
@@ -77,5 +79,5 @@ def measure_coverage(log: Log, name: str) -> Coverage:
     """Coverage of the field `name` of a log."""
     values: FloatArray = getattr(log, name)
     found = Coverage.empty(values.shape[1:])
-    found.add(values, log.contact_active if name in WRENCHES else None)
+    found.add(values, log.contact_active if name in CONTACT_READINGS else None)
     return found

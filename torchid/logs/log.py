@@ -37,6 +37,7 @@ SHAPES: dict[str, FieldShape] = {
     "contact_wrench_local": ("N", "C", 6),
     "contact_wrench_world": ("N", "C", 6),
     "contact_normal_world": ("N", "C", 3),
+    "contact_force_normal": ("N", "C"),
     "ft_names": ("F",),
     "ft_wrench": ("N", "F", 6),
     "imu_frame": (),
@@ -60,15 +61,19 @@ REQUIRED = ("time", "joint_names", "joint_position")
 NAME_FIELDS = {"joint_names": "n", "contact_names": "C", "ft_names": "F"}
 WRENCHES = ("contact_wrench_local", "contact_wrench_world")
 NORMALS = "contact_normal_world"
+FORCE_NORMAL = "contact_force_normal"
+
+#: Readings of sensors at contacts: 0, whatever was recorded, where nothing touches.
+CONTACT_READINGS = (*WRENCHES, FORCE_NORMAL)
 
 #: NaN marks "not measured here" in these fields and is an error in all others.
-NAN_ALLOWED = ("joint_torque", *WRENCHES, "ft_wrench")
+NAN_ALLOWED = ("joint_torque", *CONTACT_READINGS, "ft_wrench")
 
 IMU_FIELDS = ("imu_frame", "imu_specific_force", "imu_angular_velocity")
 
 #: Fields that a field requires.
 REQUIRED_WITH: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("contact_active", *WRENCHES, NORMALS), ("contact_names", "contact_active")),
+    **dict.fromkeys(("contact_active", *CONTACT_READINGS, NORMALS), ("contact_names", "contact_active")),
     "ft_wrench": ("ft_names",),
     **dict.fromkeys((*IMU_FIELDS, "imu_angular_acceleration"), IMU_FIELDS),
 }
@@ -102,8 +107,10 @@ class Log:
         contact_wrench_local: (N, C, 6) [N, N m] on the robot at the contact frame's origin, in that frame's axes;
             NaN where not measured.
         contact_wrench_world: as `contact_wrench_local` but in world axes; at most one of the two is given.
-        contact_normal_world: (N, C, 3) unit vectors away from the ground under a contact that rolls; any values, NaN
-            too, while it is in the air.
+        contact_normal_world: (N, C, 3) unit vectors away from the ground under a contact that rolls or is read along
+            them; any values, NaN too, while it is in the air.
+        contact_force_normal: (N, C) [N] on the robot along the ground's normal, as a scalar sensor in a foot or an
+            insole reads it; NaN where not measured.
         ft_names: F names of fixed joints with a force/torque sensor.
         ft_wrench: (N, F, 6) [N, N m] that the parent side exerts on the child side, in the joint's child frame; NaN
             where not measured.
@@ -115,8 +122,9 @@ class Log:
             filtered, where it is that sign. No part of a file.
         contact_share: (N, C), what the filter makes of a reading that is 1 while the contact is active and 0 else; None
             in a log that was not filtered, where it is `contact_active`. No part of a file.
-        contact_unloaded: (N, C, 6), as recorded even in a filtered log: what the sensors read in the air, NaN
-            elsewhere (see `unloaded_readings`); None where `preprocess` found no such sample. No part of a file.
+        contact_unloaded: (N, C, 6), or (N, C, 7) with `contact_force_normal`, as recorded even in a filtered log: what
+            the sensors read in the air, NaN elsewhere (see `unloaded_readings`); None where `preprocess` found no such
+            sample. No part of a file.
         noise_bandwidth_hz: [Hz], up to where `preprocess` has left the sensors' noise white; None if it did not filter.
             No part of a file.
 
@@ -142,6 +150,7 @@ class Log:
     contact_wrench_local: FloatArray | None = None
     contact_wrench_world: FloatArray | None = None
     contact_normal_world: FloatArray | None = None
+    contact_force_normal: FloatArray | None = None
     ft_names: tuple[str, ...] = ()
     ft_wrench: FloatArray | None = None
     imu_frame: str = ""

@@ -12,9 +12,9 @@ import numpy as np
 from torchid.errors import InputError, LogError, about_file
 from torchid.logs.coverage import Coverage, measure_coverage, warn_of_gaps
 from torchid.logs.log import (
+    CONTACT_READINGS,
     NAN_ALLOWED,
     NORMALS,
-    WRENCHES,
     BoolArray,
     FloatArray,
     Log,
@@ -229,7 +229,7 @@ _CHANNELS_TOGETHER = 2
 def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Coverage | None) -> FloatArray:
     """The field `name` (N, ...) at the output's stamps (K, ...), filtered like all others.
 
-    A channel that is NaN throughout stays so. A wrench of an inactive contact is 0, whatever was recorded. A channel
+    A channel that is NaN throughout stays so. A reading of an inactive contact is 0, whatever was recorded. A channel
     with NaN among other values can be neither filtered nor resampled: it becomes NaN throughout.
 
     Args:
@@ -242,7 +242,7 @@ def _resample_measured(log: Log, name: str, timeline: Timeline, coverage: Covera
     check_finite(name, values, allow_nan=True, labels=column_labels(name, log.names))
     if coverage is None:
         return values[timeline.kept]
-    flags = log.contact_active if name in WRENCHES else None
+    flags = log.contact_active if name in CONTACT_READINGS else None
     complete = np.argwhere(coverage.complete)
     out = np.full((len(timeline.output_stamps), *values.shape[1:]), np.nan)
     for start in range(0, len(complete), _CHANNELS_TOGETHER):
@@ -320,16 +320,21 @@ def find_unloaded(time: FloatArray, active: BoolArray, margin: float = UNLOADED_
 def unloaded_readings(log: Log, where: BoolArray | None = None) -> FloatArray | None:
     """What the sensors of contacts read while nothing touches, (N, C, 6), NaN elsewhere; None if there is none.
 
+    The force along the normal is a seventh component where a log has it.
+
     Args:
         log: as recorded.
         where: (N, C), from `find_unloaded`, of a part of a log; the result is an array then, whatever it holds.
     """
     if log.contact_unloaded is not None:
         return log.contact_unloaded
-    wrench = log.contact_wrench
-    if wrench is None or log.contact_active is None:
+    wrench, scalar = log.contact_wrench, log.contact_force_normal
+    if (wrench is None and scalar is None) or log.contact_active is None:
         return None
     chosen = find_unloaded(log.time, log.contact_active) if where is None else where
     if where is None and not chosen.any():
         return None
-    return np.where(chosen[..., None], wrench, np.nan)
+    readings = np.full((*chosen.shape, 6), np.nan) if wrench is None else wrench
+    if scalar is not None:
+        readings = np.concatenate([readings, scalar[..., None]], axis=2)
+    return np.where(chosen[..., None], readings, np.nan)

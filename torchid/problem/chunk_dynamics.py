@@ -37,6 +37,8 @@ class ChunkKinematics:
         rotation_world_base: (B, 3, 3), None where it was not recorded.
         arms: (3, 3, B) [m] by rolling contact, see `torchid.regressor.regressor.rolling_arms`.
         recorded_normals: whether each of these has normals of its own.
+        ground_axes: (3, 3, B) in base axes by contact that is read along the ground's normal, see
+            `torchid.regressor.regressor.ground_axes`.
     """
 
     joints: JointMotion
@@ -45,6 +47,7 @@ class ChunkKinematics:
     rotation_world_base: Tensor | None
     arms: Mapping[int, Tensor]
     recorded_normals: bool
+    ground_axes: Mapping[int, Tensor]
 
     def every(self, step: int) -> ChunkKinematics:
         """The kinematics of every `step`-th sample from the first on, views."""
@@ -55,6 +58,7 @@ class ChunkKinematics:
             None if self.rotation_world_base is None else self.rotation_world_base[::step],
             {contact: arm[..., ::step] for contact, arm in self.arms.items()},
             self.recorded_normals,
+            {contact: axes[..., ::step] for contact, axes in self.ground_axes.items()},
         )
 
 
@@ -84,5 +88,6 @@ class ChunkDynamics(ChunkKinematics):
             None if self.rotation_world_base is None else self.rotation_world_base[index],
             {contact: pick(arms) for contact, arms in self.arms.items()},
             self.recorded_normals,
+            {contact: pick(axes) for contact, axes in self.ground_axes.items()},
             pick(self.wrenches),
         )

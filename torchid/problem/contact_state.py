@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,10 +14,17 @@ from torchid import parameters
 from torchid.parameters import Array
 from torchid.problem.extras import Extra, measured_components
 from torchid.problem.row_blocks import RowBlock, RowBlocks, row_block
-from torchid.problem.samples import Samples
+from torchid.problem.wrench_rows import Acting, WrenchRows
 from torchid.regressor.columns import reduced_layout, reduction_matrix
 from torchid.regressor.kinematics import BodyStates
-from torchid.regressor.regressor import JointRow, contact_arms, joint_rows, rolling_arms, wrench_transform
+from torchid.regressor.regressor import (
+    JointRow,
+    contact_arms,
+    ground_axes,
+    joint_rows,
+    rolling_arms,
+    wrench_transform,
+)
 from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.rounding import KINEMATIC_TOLERANCE, is_significant
@@ -73,18 +80,6 @@ class Columns:
             matrix[self.friction(node), body, parameters.COULOMB] = 1.0
             matrix[self.friction(node) + 1, body, parameters.VISCOUS] = 1.0
         return matrix.reshape(self.count, -1)
-
-
-@dataclass(frozen=True)
-class WrenchRows:
-    """Wrenches, (k, 6), at a body's joint frame, in its axes.
-
-    `rolling`: contact whose `rolling_arms` they have, so that their forces act where it touches the ground; None for
-    those whose points of action are fixed to the body.
-    """
-
-    rows: Tensor
-    rolling: int | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +144,8 @@ class ContactStateLayouts:
         self._measured = measured_components(self.contacts, sensors)
         self.dof_std = sensors.noise.dof_std(robot.n, robot.n_dofs)
         self.rolling = tuple(index for index, contact in enumerate(contacts) if contact.radius)
+        self.along_normal = tuple(index for index, contact in enumerate(contacts) if contact.along_normal)
+        self._points: dict[int, Tensor] = {}
         self._cache: dict[tuple[ContactState, bool], ContactStateLayout] = {}
         self._rotations: dict[int, Tensor] = {}
         self._normals: dict[int, Tensor] = {}
@@ -223,16 +220,28 @@ class ContactStateLayouts:
             self._rotations[contact] = self._tensor(self.frames[contact][1][:3, :3])
         return self._rotations[contact]
 
-    def arms(self, states: BodyStates, normals: Tensor | None, rotation_world_base: Tensor | None) -> dict[int, Tensor]:
-        """Moments of unit forces of the ground on each rolling contact, (3, 3, B) [m], see `rolling_arms`.
+    def frame_origin(self, contact: int) -> Tensor:
+        """Origin of a contact frame in its node's joint frame, (3,) [m], cached."""
+        if contact not in self._points:
+            self._points[contact] = self._tensor(self.frames[contact][1][:3, 3])
+        return self._points[contact]
+
+    def ground(
+        self, states: BodyStates, normals: Tensor | None, rotation_world_base: Tensor | None
+    ) -> tuple[dict[int, Tensor], dict[int, Tensor]]:
+        """What depends on the ground's normal, see `rolling_arms` and `ground_axes`.
 
         Args:
             states: of the joint frames.
             normals: (B, C, 3), in the world; None for those of the contacts.
             rotation_world_base: (B, 3, 3); None where the base's axes are the world's.
+
+        Returns:
+            Moments of unit forces of the ground on each rolling contact, (3, 3, B) [m], and the ground's axes in base
+            axes, (3, 3, B), of each that is read along its normal.
         """
-        arms = {}
-        for index in self.rolling:
+        arms, along = {}, {}
+        for index in dict.fromkeys((*self.rolling, *self.along_normal)):
             contact, body = self.contacts[index], self.frames[index][0]
             if normals is None:
                 normal = self._normal(index)[:, None].expand(3, states.position.shape[-1])
@@ -240,9 +249,12 @@ class ContactStateLayouts:
                 normal = normals[:, index].T
             if rotation_world_base is not None:
                 normal = (normal.T[:, None] @ rotation_world_base)[:, 0].T
-            axes, axis = self.frame_rotation(index), contact.rolling_axis
-            arms[index] = contact_arms(states, body, axes, contact.radius, normal, axis)
-        return arms
+            if contact.radius:
+                axes, axis = self.frame_rotation(index), contact.rolling_axis
+                arms[index] = contact_arms(states, body, axes, contact.radius, normal, axis)
+            if contact.along_normal:
+                along[index] = ground_axes(normal)
+        return arms, along
 
     def _normal(self, contact: int) -> Tensor:
         """Stated normal of a contact, (3,), cached."""
@@ -255,6 +267,7 @@ class ContactStateLayouts:
         self._cache.clear()
         self._rotations.clear()
         self._normals.clear()
+        self._points.clear()
 
     def _contact_body(
         self, body: int, contacts: list[int], coupled: tuple[int, ...], recorded_normals: bool
@@ -262,56 +275,67 @@ class ContactStateLayouts:
         unmeasured, measured, components = _Grouped(), _Grouped(), []
         for contact in contacts:
             at_body = wrench_transform(self.frames[contact][1]).T
-            rolling = contact if contact in self.rolling else None
             for k in self.contacts[contact].components:
+                acting = self._acting(contact, k)
+                row = at_body[k] if acting.ground is None else np.eye(3)[k]
                 if self._measured[contact, k]:
-                    measured.setdefault(rolling, []).append(at_body[k])
+                    measured.setdefault(acting, []).append(row)
                     components.append((contact, k))
                 else:
-                    alike = self._rolling_alike(rolling, unmeasured, recorded_normals)
-                    unmeasured.setdefault(alike, []).append(at_body[k])
-        components.sort(key=lambda component: list(measured).index(self._rolls(component[0])))
-        spans = {rolling: _span(np.array(rows)) for rolling, rows in unmeasured.items()}
+                    alike = self._rolling_alike(acting, unmeasured, recorded_normals)
+                    unmeasured.setdefault(alike, []).append(row)
+        components.sort(key=lambda component: list(measured).index(self._acting(*component)))
+        spans = {acting: _span(np.array(rows)) for acting, rows in unmeasured.items()}
         count = sum(map(len, spans.values()))
-        if len(spans) > 1:
+        if len(spans) > 1 and not any(acting.ground is not None for acting in spans):
             count = self._generic_rank(spans)
             if count == _WRENCH:
-                spans = {None: np.eye(_WRENCH)}
+                spans = {Acting(): np.eye(_WRENCH)}
         above = set(self.columns.joints_above(body))
         joints = tuple(index for index, joint in enumerate(coupled) if joint in above)
         rows = [
-            tuple(WrenchRows(self._tensor(np.array(x)), rolling) for rolling, x in part.items())
+            tuple(WrenchRows(self._tensor(np.array(x)), acting) for acting, x in part.items())
             for part in (spans, measured)
         ]
         return ContactBody(body, rows[0], count, rows[1], tuple(components), joints)
 
-    def _rolls(self, contact: int) -> int | None:
-        return contact if contact in self.rolling else None
+    def _acting(self, contact: int, k: int) -> Acting:
+        """How a component of a contact acts; moments of one that is read along the normal act as they do of others.
 
-    def _rolling_alike(self, rolling: int | None, others: Iterable[int | None], recorded_normals: bool) -> int | None:
+        Forces of several such contacts on a body may span less by chance, as those of cells in a flat sole do: their
+        rank is that of each sample, by its null space.
+        """
+        if contact not in self.along_normal:
+            return Acting(contact if contact in self.rolling else None)
+        return Acting(contact if contact in self.rolling else None, contact) if k < 3 else Acting()
+
+    def _rolling_alike(self, acting: Acting, others: Iterable[Acting], recorded_normals: bool) -> Acting:
         """The first of other contacts of the body that touches the ground by the same arm from its origin, or itself.
 
         Forces of contacts with the same arm span a space that is moved as a whole by it.
         """
-        if rolling is None or recorded_normals:
-            return rolling
+        rolling = acting.rolling
+        if rolling is None or acting.ground is not None or recorded_normals:
+            return acting
         own = self.contacts[rolling]
         for other in others:
-            if other is not None:
-                contact = self.contacts[other]
+            if other.rolling is not None and other.ground is None:
+                contact = self.contacts[other.rolling]
                 alike = (contact.kind, contact.radius, contact.normal) == (own.kind, own.radius, own.normal)
-                if alike and (own.kind == "point" or np.allclose(self._axis(other), self._axis(rolling), atol=1e-12)):
+                if alike and (
+                    own.kind == "point" or np.allclose(self._axis(other.rolling), self._axis(rolling), atol=1e-12)
+                ):
                     return other
-        return rolling
+        return acting
 
     def _axis(self, contact: int) -> Array:
         """Axis of a cylinder in its node's joint frame, (3,)."""
         return self.frames[contact][1][:3, "xyz".index(self.contacts[contact].line_axis)]
 
-    def _generic_rank(self, spans: Mapping[int | None, Array]) -> int:
+    def _generic_rank(self, spans: Mapping[Acting, Array]) -> int:
         """Dimension of the space that wrenches span with normals in any directions; it is never larger."""
         rng, moved = np.random.default_rng(0), []
-        for rolling, rows in spans.items():
+        for (rolling, _), rows in spans.items():
             if rolling is not None:
                 contact, normal = self.contacts[rolling], torch.from_numpy(_unit(rng.normal(size=3)))[:, None]
                 axis = torch.from_numpy(self._axis(rolling).copy())[:, None] if contact.kind == "line" else None
@@ -326,7 +350,7 @@ class ContactStateLayouts:
 
 
 _WRENCH = 6
-_Grouped = dict[int | None, list[Array]]
+_Grouped = dict[Acting, list[Array]]
 
 
 def _span(rows: Array) -> Array:
@@ -339,62 +363,3 @@ def _span(rows: Array) -> Array:
 def _unit(x: Array) -> Array:
     unit: Array = x / np.linalg.norm(x)
     return unit
-
-
-def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
-    """Column of a degree of freedom's extra parameter in its row, (B,)."""
-    if extra.dof is None:
-        raise ValueError(f"extra: found {extra.label}; accepted: one of a degree of freedom")
-    if extra.what == "scale":
-        reading = samples.torque
-        return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, extra.dof]
-    if extra.what == "armature":
-        return samples.joint_acceleration[:, extra.dof]
-    if extra.what == "asymmetric_coulomb":
-        return tree.coulomb_sign(samples.joint_velocity[:, extra.dof]).abs()
-    return torch.ones_like(samples.time)
-
-
-def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
-    """Column of a contact sensor's extra parameter, subtracted from its reading along a recorded axis, (B,)."""
-    if extra.what == "offset":
-        return samples.active[:, contact].to(samples.time) if samples.share is None else samples.share[:, contact]
-    reading = samples.wrench
-    return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, contact, axis]
-
-
-def extra_columns(
-    extras: Sequence[Extra],
-    samples: Samples,
-    layout: ContactStateLayout,
-    tree: KinematicTree,
-    measured: Tensor,
-    W: Tensor,
-    rotations: dict[int, Tensor],
-) -> Iterator[Tensor]:
-    """Columns of extra parameters in coupled rows, (r, B) each.
-
-    Args:
-        extras: the parameters.
-        samples: B of one contact state and rank.
-        layout: of that state.
-        tree: of the robot.
-        measured: (B, k_m, base rows + coupled joints), rows of the contact Jacobian of the measured components.
-        W: (B, base rows + coupled joints, r), the basis.
-        rotations: by contact, (B, 3, 3) from its frame to the recorded axes where these are the world's.
-    """
-    projected = (measured @ W).permute(1, 2, 0)  # rows per unit of each measured component
-    components = [component for body in layout.contact_bodies for component in body.components]
-    for extra in extras:
-        if extra.dof is not None:
-            row = W[:, tree.base_rows + layout.coupled_joints.index(extra.dof)]
-            yield row.T * dof_extra_column(extra, samples, tree)
-            continue
-        contact, axis = extra.contact or (0, 0)
-        column, reading = W.new_zeros(W.shape[2], len(samples)), contact_extra_column(extra, samples, contact, axis)
-        vector = range(3) if axis < 3 else range(3, 6)
-        for k in vector if contact in rotations else [axis]:
-            if (contact, k) in components:
-                along = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
-                column = column + projected[components.index((contact, k))] * along
-        yield column

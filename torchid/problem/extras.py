@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchid.parameters import WRENCH_COMPONENTS
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -109,7 +108,7 @@ def _channels(
         yield kind, name, component, dof, None
     for index, k in np.argwhere(recorded_components(contacts, sensors, in_world=True)).tolist():
         kind = "contact_force" if k < 3 else "contact_moment"
-        yield kind, contacts[index].frame, WRENCH_COMPONENTS[k], None, (index, k)
+        yield kind, contacts[index].frame, contacts[index].component_name(k), None, (index, k)
 
 
 def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:
@@ -121,9 +120,13 @@ def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.n
 
 
 def recorded_components(contacts: Sequence[Contact], sensors: SensorSet, in_world: bool) -> np.ndarray:
-    """Recorded components (C, 6) from which the measured ones are computed: whole vectors if along world axes."""
+    """Recorded components (C, 6) from which the measured ones are computed: whole vectors if along world axes.
+
+    Of a contact that is read along the ground's normal they are those that are measured.
+    """
     measured = measured_components(contacts, sensors)
     if not in_world:
         return measured
     whole = measured.reshape(-1, 2, 3).any(axis=2)
-    return np.repeat(whole, 3, axis=1)
+    turned = np.array([not contact.along_normal for contact in contacts], dtype=bool)[:, None]
+    return np.where(turned, np.repeat(whole, 3, axis=1), measured)

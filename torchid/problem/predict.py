@@ -16,12 +16,13 @@ from torchid.logs.spill import Spill
 from torchid.parameters import Array
 from torchid.problem.chunk_dynamics import ChunkKinematics
 from torchid.problem.chunks import chunks_by_state, one_thread
-from torchid.problem.contact_state import ContactState, contact_extra_column, dof_extra_column
+from torchid.problem.contact_state import ContactState
+from torchid.problem.extra_columns import contact_extra_column, dof_extra_column
 from torchid.problem.extras import ACTUATORS, Extra
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.regressor.columns import body_wrenches
-from torchid.regressor.regressor import generalized_forces, wrench_transform, wrenches_at_base
+from torchid.regressor.regressor import generalized_forces
 from torchid.regressor.tree import KinematicTree
 from torchid.sensing import SensorNoise
 
@@ -108,11 +109,10 @@ def contact_forces(builder: RowBuilder, samples: Samples, state: ContactState, k
     total = samples.time.new_zeros(tree.n_rows, len(samples))
     for contact, active in enumerate(state):
         if active:
-            body, T_joint_frame = builder.frames[contact]
+            body, _ = builder.frames[contact]
             possible = list(builder.contacts[contact].components)
-            units = total.new_tensor(wrench_transform(T_joint_frame).T[possible])
             components = builder.recorded_wrench(samples, contact, kinematics)[:, possible].T
-            at_base = wrenches_at_base(kinematics.states, body, units, kinematics.arms.get(contact))
+            at_base = builder.unit_wrenches(kinematics, contact, possible)
             wrench = (at_base * components).sum(1, keepdim=True)
             joints = builder.columns.joints_above(body)  # other rows must not become NaN by an unmeasured force
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
@@ -142,10 +142,9 @@ def reading_variance(
     total[tree.base_rows :] = total.new_tensor(std**2)[:, None] + 0.0 * torque  # NaN where it was not recorded
     for contact, active in enumerate(state):
         if active:
-            body, T_joint_frame = builder.frames[contact]
+            body, _ = builder.frames[contact]
             possible = list(builder.contacts[contact].components)
-            units = total.new_tensor((wrench_transform(T_joint_frame) * noise.wrench_std).T[possible])
-            wrenches = wrenches_at_base(kinematics.states, body, units, kinematics.arms.get(contact))
+            wrenches = builder.unit_wrenches(kinematics, contact, possible, noise.wrench_std)
             joints = builder.columns.joints_above(body)
             rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
             recorded = 0.0 * builder.recorded_wrench(samples, contact, kinematics)[:, possible].sum(1)

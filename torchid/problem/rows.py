@@ -17,16 +17,16 @@ from torchid.problem.contact_state import (
     ContactState,
     ContactStateLayout,
     ContactStateLayouts,
-    WrenchRows,
-    dof_extra_column,
-    extra_columns,
 )
+from torchid.problem.extra_columns import dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
 from torchid.problem.row_blocks import RowBlock, multiply_wrenches, turn_rows
 from torchid.problem.samples import Samples
+from torchid.problem.wrench_rows import wrenches_at_ground
 from torchid.regressor.columns import all_wrench_columns
 from torchid.regressor.kinematics import body_states, joint_motion, joint_screw_axes
 from torchid.regressor.regressor import (
+    forces_at_base,
     generalized_forces,
     wrench_transform,
     wrenches_at_base,
@@ -126,11 +126,10 @@ class RowBuilder(nn.Module):
         """Kinematics of some samples."""
         motion = samples.motion()
         joints = joint_motion(self.tree, motion)
-        states, rotation, arms = body_states(self.tree, motion, joints), samples.base.rotation, {}
-        if self._layouts.rolling:
-            arms = self._layouts.arms(states, samples.contact_normal, rotation)
+        states, rotation = body_states(self.tree, motion, joints), samples.base.rotation
+        arms, along = self._layouts.ground(states, samples.contact_normal, rotation)
         screw_axes, recorded_normals = joint_screw_axes(self.tree, states), samples.contact_normal is not None
-        return ChunkKinematics(joints, states, screw_axes, rotation, arms, recorded_normals)
+        return ChunkKinematics(joints, states, screw_axes, rotation, arms, recorded_normals, along)
 
     def dynamics(self, samples: Samples, workspace: Workspace | None = None) -> ChunkDynamics:
         """Dynamics of some samples; with a workspace, valid until the next call with the same."""
@@ -204,15 +203,35 @@ class RowBuilder(nn.Module):
     def contact_jacobian(self, samples: Samples) -> Tensor:
         """Jacobians of all contacts along their frames' axes, active or not, (B, C, 6, n_rows).
 
-        Linear velocities are those of frames' origins, or of the material points where contacts roll.
+        Linear velocities are those of frames' origins, or of the material points where contacts roll; they are along
+        the ground's axes where its normal is what a contact is read along.
         """
         kinematics, joints = self.kinematics(samples), range(self.tree.n_dofs)
         J = kinematics.screw_axes.new_zeros(len(samples), len(self.frames), 6, self.tree.n_rows)
-        for contact, (body, T_joint_frame) in enumerate(self.frames):
-            units = J.new_tensor(wrench_transform(T_joint_frame).T.copy())
-            at_base = wrenches_at_base(kinematics.states, body, units, kinematics.arms.get(contact))
+        for contact, (body, _) in enumerate(self.frames):
+            at_base = self.unit_wrenches(kinematics, contact, range(6))
             J[:, contact] = generalized_forces(self.tree, kinematics.screw_axes, body, at_base, joints).permute(2, 0, 1)
         return J
+
+    def unit_wrenches(
+        self, kinematics: ChunkKinematics, contact: int, components: Sequence[int], std: Array | None = None
+    ) -> Tensor:
+        """Wrenches at the base origin of a unit of each of a contact's components, in order, (6, k, B) [N, N m].
+
+        `std`: (6,), what to have of each component in place of a unit.
+        """
+        body, T_joint_frame = self.frames[contact]
+        std = np.ones(6) if std is None else std
+        arms, axes = kinematics.arms.get(contact), kinematics.ground_axes.get(contact)
+        in_frame = [k for k in components if axes is None or k >= 3]
+        units = kinematics.screw_axes.new_tensor((wrench_transform(T_joint_frame) * std).T[in_frame])
+        wrenches = wrenches_at_base(kinematics.states, body, units, arms)
+        if axes is None:
+            return wrenches
+        along = [k for k in components if k < 3]
+        forces = axes[:, along] * axes.new_tensor(std[along])[:, None]
+        point = self._layouts.frame_origin(contact)
+        return torch.cat([forces_at_base(kinematics.states, body, point, forces, arms), wrenches], dim=1)
 
     def noise_axes(self, rotation_world_base: Tensor | None) -> Tensor | None:
         """Axes of the stated noise of the base rows, (B, 3, 3); None for the base's own, if its attitude is unknown."""
@@ -221,11 +240,11 @@ class RowBuilder(nn.Module):
         )
 
     def recorded_wrench(self, samples: Samples, contact: int, kinematics: ChunkKinematics) -> Tensor:
-        """Recorded wrench of a contact along its frame's axes, (B, 6) [N, N m], NaN where not recorded."""
+        """Recorded wrench of a contact along the axes of its components, (B, 6) [N, N m], NaN where not recorded."""
         if samples.wrench is None:
             return samples.time.new_full((len(samples), 6), torch.nan)
         wrench = samples.wrench[:, contact]
-        if not samples.wrench_in_world:
+        if not samples.wrench_in_world or self.contacts[contact].along_normal:
             return wrench
         return (self._rotation(contact, kinematics).mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
 
@@ -294,7 +313,8 @@ class RowBuilder(nn.Module):
         """Columns of a block's extra parameters, (extras, r, B)."""
         extras = [self.extras[column - self.columns.count] for column in block.extras]
         touching = {extra.contact[0] for extra in extras if extra.contact is not None}
-        rotations = {k: self._rotation(k, part.dynamics) for k in touching} if part.samples.wrench_in_world else {}
+        turned = touching.difference(self._layouts.along_normal) if part.samples.wrench_in_world else ()
+        rotations = {k: self._rotation(k, part.dynamics) for k in turned}
         basis = W.permute(2, 0, 1)
         columns = extra_columns(extras, part.samples, layout, self.tree, part.measured, basis, rotations)
         return torch.stack(list(columns))
@@ -355,7 +375,9 @@ class RowBuilder(nn.Module):
             counts = contact.count, len(contact.components)
             for kind, parts in enumerate((contact.unmeasured, contact.measured)):
                 if parts:
-                    at_base = _at_ground(kinematics, contact.body, parts, counts[kind])
+                    at_base = wrenches_at_ground(
+                        parts, counts[kind], kinematics, contact.body, self._layouts.frame_origin
+                    )
                     rows = generalized_forces(self.tree, kinematics.screw_axes, contact.body, at_base, joints)
                     target = both[starts[kind] : starts[kind] + counts[kind]]
                     target.index_copy_(1, self.tree.index(columns), rows)
@@ -370,22 +392,3 @@ class RowBuilder(nn.Module):
             for contact in {contact for contact, _ in components}
         }
         return torch.stack([local[contact][:, k] for contact, k in components], dim=1)
-
-
-def _at_ground(kinematics: ChunkKinematics, body: int, parts: Sequence[WrenchRows], count: int) -> Tensor:
-    """Wrenches on a body at the base origin in base axes, (6, count, B); of more, a basis of what they span.
-
-    Where they span less at some sample, the basis has directions too many: it costs equations, but lets no unmeasured
-    force in.
-    """
-    rows = [
-        wrenches_at_base(
-            kinematics.states, body, part.rows, None if part.rolling is None else kinematics.arms[part.rolling]
-        )
-        for part in parts
-    ]
-    at_base = rows[0] if len(rows) == 1 else torch.cat(rows, dim=1)
-    if at_base.shape[1] == count:
-        return at_base
-    Vh: Tensor = torch.linalg.svd(at_base.permute(2, 1, 0), full_matrices=False).Vh
-    return Vh[:, :count].permute(2, 1, 0)

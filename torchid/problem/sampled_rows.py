@@ -138,7 +138,8 @@ class SampledRows:
         forces.append(unit[(base + np.flatnonzero(builder.sensors.torque)).tolist()].expand(len(samples), -1, -1))
         components = measured_components(builder.contacts, builder.sensors)
         if components.any():
-            J = builder.contact_jacobian(samples) * samples.active[..., None, None]
+            J = builder.contact_jacobian(samples)
+            J = torch.where(samples.active[..., None, None], J, 0.0)  # in the air a normal may be NaN
             forces.append(J[:, torch.from_numpy(components)])
         return torch.cat(forces, dim=1)
 

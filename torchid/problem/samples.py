@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError, about_file
 from torchid.logs import Log
-from torchid.logs.log import FloatArray, normalize_normals
+from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS
 from torchid.problem.base_motion import BaseMotion, base_motion
@@ -22,6 +22,7 @@ from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
+from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX
 
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
 
@@ -38,6 +39,7 @@ class Samples:
         torque: (N, n + 6 F) [N m, N, N m] by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs;
             NaN where not measured, or None.
         wrench: (N, C, 6), NaN where not measured, or None; along world axes if `wrench_in_world`, else the frames'.
+            Of a contact that is read along the ground's normal the force along it, in place of fz, is all.
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
             rate over the noise bandwidth of the filter.
@@ -51,6 +53,7 @@ class Samples:
         folder: where the tensors of a log larger than memory are stored; None for one in memory.
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
         block: number of the block in which they are compressed, see `compress_in_blocks`.
+        has_force_normal: whether the log has forces along the ground's normal, which contacts may be read along.
     """
 
     source: str
@@ -71,6 +74,7 @@ class Samples:
     folder: Path | None = None
     fold: int = 0
     block: int = 0
+    has_force_normal: bool = False
 
     def __len__(self) -> int:
         return len(self.time)
@@ -168,7 +172,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
         raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
     normals = _contact_normals(log, robot, contacts, base, chosen, active)
-    wrench = log.contact_wrench
+    wrench = _wrenches(log, contacts, chosen)
     unloaded = unloaded_readings(log) if contacts else None
     samples = Samples(
         log.source,
@@ -178,14 +182,15 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         acceleration,
         base,
         _torques(log, robot, order),
-        None if wrench is None else torch.from_numpy(_columns(wrench, chosen)),
+        None if wrench is None else torch.from_numpy(wrench),
         log.contact_wrench_world is not None,
         torch.from_numpy(active),
         oversampling(log.time, log.noise_bandwidth_hz),
         normals,
         None if log.contact_share is None else torch.from_numpy(_columns(log.contact_share, chosen)),
-        None if unloaded is None else torch.from_numpy(_columns(unloaded, chosen)),
+        None if unloaded is None else torch.from_numpy(_unloaded(_columns(unloaded, chosen), contacts)),
         None if log.joint_direction is None else torch.from_numpy(_columns(log.joint_direction, order)),
+        has_force_normal=log.contact_force_normal is not None,
     )
     if required is not None:
         _require_limb_sensors(log, robot, required)
@@ -196,20 +201,47 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
 def _contact_normals(
     log: Log, robot: Robot, contacts: Sequence[Contact], base: BaseMotion, order: list[int], active: np.ndarray
 ) -> Tensor | None:
-    """Normals of the ground under the contacts as recorded, (N, C, 3); None without, or if no contact rolls."""
-    rolling = [contact for contact in contacts if contact.radius]
-    if not rolling:
+    """Normals of the ground under the contacts as recorded, (N, C, 3); None without, or if nothing depends on them."""
+    grounded = [contact for contact in contacts if contact.radius or contact.along_normal]
+    if not grounded:
         return None
     if base.quat_xyzw is None and not robot.fixed_base:
-        first = rolling[0]
-        found = f"missing, though {first.frame} (radius {first.radius:g} m) rolls on ground that is known in the world"
-        accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or radius: 0 for this contact"
+        first = grounded[0]
+        does = f"radius {first.radius:g} m) rolls" if first.radius else f"sensor {NORMAL_FORCE}) stands"
+        found = f"missing, though {first.frame} ({does} on ground that is known in the world"
+        otherwise = "radius: 0 for this contact" if first.radius else f"sensors without {NORMAL_FORCE}"
+        accepted = f"base_quat_wxyz or base_quat_xyzw beside the IMU, or {otherwise}"
         raise LogError(log.source, "base_quat_xyzw", found, accepted)
     if log.contact_normal_world is None:
         return None
     with about_file(log.source):
         labels = tuple(contact.frame for contact in contacts)
         return torch.from_numpy(normalize_normals(_columns(log.contact_normal_world, order), active, labels))
+
+
+def _wrenches(log: Log, contacts: Sequence[Contact], order: list[int]) -> FloatArray | None:
+    """Wrenches of the contacts (N, C, 6), the force along the normal of those that are read along it; None without."""
+    wrench, scalar = log.contact_wrench, log.contact_force_normal
+    along = [contact.along_normal for contact in contacts]
+    if not any(along) or wrench is None and scalar is None:
+        return None if wrench is None else _columns(wrench, order)
+    out = np.full((len(log), len(contacts), 6), np.nan) if wrench is None else wrench[:, order]
+    out[:, along] = np.nan
+    if scalar is not None:
+        out[:, along, NORMAL_INDEX] = scalar[:, order][:, along]
+    return out
+
+
+def _unloaded(readings: FloatArray, contacts: Sequence[Contact]) -> FloatArray:
+    """Readings in the air (N, C, 6 or 7) of the contacts, (N, C, 6), by the components that they are read along."""
+    along = [contact.along_normal for contact in contacts]
+    if not any(along) and readings.shape[2] == len(WRENCH_COMPONENTS):
+        return readings
+    out = readings[..., : len(WRENCH_COMPONENTS)].copy()
+    out[:, along] = np.nan
+    if readings.shape[2] > len(WRENCH_COMPONENTS):
+        out[:, along, NORMAL_INDEX] = readings[:, along, -1]
+    return out
 
 
 def oversampling(time: FloatArray, noise_bandwidth_hz: float | None) -> float:
@@ -308,11 +340,28 @@ def require_forces(samples: Samples, robot: Robot, contacts: Sequence[Contact], 
     needed = recorded_components(contacts, required, samples.wrench_in_world)
     if needed.any() and samples.active.any():
         if samples.wrench is None:
-            raise LogError(samples.source, "contact_wrench", "missing", "contact_wrench_local or contact_wrench_world")
+            accepted = "contact_wrench_local or contact_wrench_world"
+            if samples.has_force_normal:
+                accepted += f", or contact_wrenches: {{FRAME: [{NORMAL_FORCE}]}} for the log's {FORCE_NORMAL}"
+            raise LogError(samples.source, "contact_wrench", "missing", accepted)
         bad = ~torch.isfinite(samples.wrench) & torch.from_numpy(needed) & samples.active[..., None]
         if bad.any():
             sample, contact, k = torch.nonzero(bad)[0].tolist()
+            if contacts[contact].along_normal:
+                raise _scalar_error(samples, contacts[contact].frame, sample, k)
             found = f"{WRENCH_COMPONENTS[k]} is not a finite number at sample {sample}, while in contact"
             raise LogError(
                 samples.source, f"contact_wrench '{contacts[contact].frame}'", found, "a value: it is a sensor"
             )
+
+
+def _scalar_error(samples: Samples, frame: str, sample: int, k: int) -> LogError:
+    """What is missing of a contact that is read along the ground's normal."""
+    field = f"{FORCE_NORMAL} '{frame}'"
+    if k != NORMAL_INDEX:
+        found = f"no {WRENCH_COMPONENTS[k]}: the contact is read along the ground's normal"
+        return LogError(samples.source, field, found, f"contact_wrenches: {{{frame}: [{NORMAL_FORCE}]}}")
+    if not samples.has_force_normal:
+        return LogError(samples.source, field, "missing", f"the field, or sensors without {NORMAL_FORCE}")
+    found = f"not a finite number at sample {sample}, while in contact"
+    return LogError(samples.source, field, found, "a value: it is a sensor")

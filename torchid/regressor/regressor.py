@@ -165,6 +165,26 @@ def wrenches_at_base(states: BodyStates, body: int, wrenches: Tensor, arms: Tens
     return torch.cat([force, moment])
 
 
+def forces_at_base(states: BodyStates, body: int, point: Tensor, forces: Tensor, arms: Tensor | None = None) -> Tensor:
+    """Wrenches at the base origin, (6, k, B) [N, N m], of forces (3, k, B) in base axes that act at a point of a node.
+
+    `point`: (3,) [m] in the node's joint frame; `arms` as of `wrenches_at_base`.
+    """
+    at = states.position[:, body] + point @ states.rotation[:, :, body]
+    moments = cross_product(at[:, None].expand_as(forces), forces)
+    if arms is not None:
+        moments = moments + (arms[:, :, None] * forces).sum(1)
+    return torch.cat([forces, moments])
+
+
+def ground_axes(normal: Tensor) -> Tensor:
+    """Axes of the ground, (3, 3, B) as columns: two across its normals, (3, B) unit vectors, and these."""
+    least = torch.zeros_like(normal).scatter(0, normal.abs().argmin(dim=0, keepdim=True), 1.0)
+    across = cross_product(normal, least)
+    across = across / torch.linalg.vector_norm(across, dim=0)
+    return torch.stack([across, cross_product(normal, across), normal], dim=1)
+
+
 def rolling_arms(radius: float, normal: Tensor, axis: Tensor | None = None) -> Tensor:
     """Moments about a contact frame's origin of unit forces of the ground on a sphere or cylinder about it.
 

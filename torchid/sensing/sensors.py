@@ -14,6 +14,10 @@ from torchid.robot import Robot
 
 _FORCES, _MOMENTS = (0, 1, 2), (3, 4, 5)
 CONTACT_TYPES = ("point", "line", "flat")
+NORMAL_FORCE = "fn"
+"""Name of the component that a scalar sensor of a contact reads."""
+NORMAL_INDEX = 2
+"""Its place among the components of a contact whose force is along the axes of the ground."""
 
 
 UP = (0.0, 0.0, 1.0)
@@ -35,6 +39,9 @@ class Contact:
     `line_axis`: the ground acts at c - radius n, n being `normal`, (3,), a unit vector in the world that points away
     from the ground (of a cylinder its part across the axis). Readings are wrenches at c all the same; of a line's
     force, the part along the axis then counts as acting at c, since moments across the axis are free.
+
+    `along_normal`: the contact has a scalar sensor, which reads the force along `normal` alone, "fn". The axes of its
+    force are then the ground's, fz that along the normal and fx and fy across it, instead of the frame's.
     """
 
     frame: str
@@ -42,6 +49,7 @@ class Contact:
     line_axis: str = "y"
     radius: float = 0.0
     normal: tuple[float, float, float] = UP
+    along_normal: bool = False
 
     def __post_init__(self) -> None:
         """Validate all, and give the normal unit length.
@@ -81,6 +89,10 @@ class Contact:
     def rolling_axis(self) -> str | None:
         """Axis of the frame about which a line rolls; None for a point, whose sphere has none."""
         return self.line_axis if self.kind == "line" else None
+
+    def component_name(self, k: int) -> str:
+        """Name of a component that its sensors measure, by index in `WRENCH_COMPONENTS`."""
+        return NORMAL_FORCE if self.along_normal and k == NORMAL_INDEX else WRENCH_COMPONENTS[k]
 
     @property
     def component_names(self) -> tuple[str, ...]:
@@ -229,7 +241,8 @@ def chosen_sensors(
         joint_names: the robot's independent joints.
         contacts: the contacts in use.
         joint_torques: joints whose torque is measured.
-        contact_wrenches: measured components ("fx" ... "mz") by contact frame.
+        contact_wrenches: measured components ("fx" ... "mz") by contact frame, or "fn" alone of one that is read
+            `along_normal`.
         noise: of the sensors.
         ft: force/torque sensors in limbs that the robot has; none of them is in the set.
 
@@ -248,8 +261,13 @@ def chosen_sensors(
         if frame not in frames:
             raise UnknownNameError.at_field("sensors.contact_wrenches", frame, frames)
         contact = contacts[frames.index(frame)]
-        for name in names:
-            field_name = f"sensors.contact_wrenches.{frame}"
+        field_name = f"sensors.contact_wrenches.{frame}"
+        chosen = tuple(names)
+        if NORMAL_FORCE in chosen or contact.along_normal and chosen:
+            _check_scalar(field_name, contact, chosen)
+            wrench[frames.index(frame), NORMAL_INDEX] = True
+            continue
+        for name in chosen:
             if name not in WRENCH_COMPONENTS:
                 raise UnknownNameError.at_field(field_name, name, contact.component_names)
             if name not in contact.component_names:
@@ -257,3 +275,17 @@ def chosen_sensors(
                 raise SensorError.at_field(field_name, found, ", ".join(contact.component_names))
             wrench[frames.index(frame), WRENCH_COMPONENTS.index(name)] = True
     return SensorSet(torque, wrench, noise or SensorNoise())
+
+
+def _check_scalar(field_name: str, contact: Contact, names: Sequence[str]) -> None:
+    """Refuse components beside that of a scalar sensor, and a contact that is read along other axes."""
+    others = [name for name in names if name != NORMAL_FORCE]
+    if others:
+        found = f"'{others[0]}' of a contact whose force is read along the ground's normal, '{NORMAL_FORCE}'"
+        accepted = f"[{NORMAL_FORCE}] alone, or components of the wrench without it"
+        raise SensorError.at_field(field_name, found, accepted)
+    if not contact.along_normal:
+        found = f"'{NORMAL_FORCE}' of a contact whose wrench is read"
+        accepted = f"{', '.join(contact.component_names)}; {NORMAL_FORCE} if the experiment's own sensors have it too "
+        accepted += "(in Python: a Contact with along_normal=True)"
+        raise SensorError.at_field(field_name, found, accepted)

@@ -1,0 +1,117 @@
+"""Whole runs with sensors of the force along the ground's normal, on the demo's quadruped."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from demo import DEMO
+from motions import value
+from refusals import refusal
+from scipy.spatial.transform import Rotation
+
+from torchid.cli import main
+from torchid.logs import read_log, write_log
+from torchid.robot import load_robot
+
+FEET = tuple(f"{end}_{side}_foot" for end in ("front", "rear") for side in ("left", "right"))
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning"),
+    pytest.mark.filterwarnings("ignore::torchid.errors.NumericalWarning"),
+    pytest.mark.filterwarnings("ignore::torchid.errors.ConfoundedWarning"),
+]
+EVERY_FOOT = ", ".join(f"{foot}: [fn]" for foot in FEET)
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo's experiment file with logs of insoles in place of wrenches."""
+    folder = tmp_path_factory.mktemp("insoles")
+    robot = load_robot(DEMO / "quadruped.urdf")
+    for name in ("sway_train", "sway_test"):
+        log = read_log(DEMO / f"{name}.npz")
+        assert log.contact_wrench_local is not None
+        order = [log.joint_names.index(joint) for joint in robot.joint_names]
+        poses = robot.link_poses(torch.from_numpy(log.joint_position[:, order]))
+        up = Rotation.from_quat(value(log.base_quat_xyzw)).inv().apply([0.0, 0.0, 1.0])
+        force = np.stack(
+            [
+                np.einsum("ni,nij,nj->n", up, poses[foot][:, :3, :3].numpy(), log.contact_wrench_local[:, c, :3])
+                for c, foot in enumerate(log.contact_names)
+            ],
+            axis=1,
+        )
+        write_log(replace(log, contact_wrench_local=None, contact_force_normal=force), folder / f"{name}.npz")
+    text = (DEMO / "quadruped.yaml").read_text().replace("quadruped.urdf", str(DEMO / "quadruped.urdf"))
+    joints = ", ".join(robot.joint_names)
+    assert "  set: joints\n" in text
+    chosen = f"  joint_torques: [{joints}]\n  contact_wrenches: {{{EVERY_FOOT}}}\n"
+    (folder / "run.yaml").write_text(text.replace("  set: joints\n", chosen))
+    return folder / "run.yaml"
+
+
+def test_a_run_counts_scalar_sensors_in_projected_errors_and_fits_their_offsets(experiment: Path) -> None:
+    output = experiment.parent / "runs/insoles"
+    assert main(["identify", str(experiment), "sensors.offsets={contact_force: log}", f"output={output}"]) == 0
+    metrics = json.loads((output / "metrics.json").read_text())
+    for figure in ("base_force_rms", "base_moment_rms"):
+        assert metrics["test"][figure] is None
+    assert metrics["test"]["projected_residual"] < 0.15 * metrics["test_nominal"]["projected_residual"]
+    assert metrics["test"]["nullspace_rms"] < 0.1
+    assert metrics["rank"] == 118
+    extras = json.loads((output / "parameters.json").read_text())["extras"]
+    assert len(extras) == 4
+    for extra in extras:
+        assert extra["component"] == "fn"
+        assert abs(extra["value"]) < 1.0
+    log = experiment.parent / "sway_test.npz"
+    assert main(["evaluate", str(output), "--log", str(log)]) == 0
+
+
+def test_factors_of_scalar_sensors_are_not_those_of_others(
+    experiment: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = experiment.parent / "factors"
+    assert main(["compress", str(experiment), "--output", str(folder)]) == 0
+    train = f"logs.train=[{folder / 'sway_train.factor'}]"
+    output = experiment.parent / "runs/factors"
+    assert main(["identify", str(experiment), train, f"output={output}"]) == 0
+    capsys.readouterr()
+    arguments = ["identify", str(experiment), train, f"output={output}x"]
+    contacts = ", ".join(f"{{frame: {foot}, type: point, normal: [0, 0.6, 0.8]}}" for foot in FEET)
+    message = refusal([*arguments, f"contacts=[{contacts}]"], experiment.parent, capsys)
+    assert "contacts: without front_left_foot (point, read along 0.0, 0.6, 0.8), front_right_foot" in message
+    message = refusal([*arguments, "sensors.contact_wrenches={}"], experiment.parent, capsys)
+    assert "front_left_foot (point, read along 0.0, 0.0, 1.0)" in message
+
+
+@pytest.mark.parametrize(
+    ("command", "override", "message"),
+    [
+        ("identify", "sensors=full", "contact_wrench: missing; accepted: contact_wrench_local or contact_wrench_"
+         "world, or contact_wrenches: {FRAME: [fn]} for the log's contact_force_normal"),
+        ("identify", f"sensors.contact_wrenches={{{FEET[0]}: [fn, fz]}}",
+         f"sensors.contact_wrenches.{FEET[0]}: 'fz' of a contact whose force is read along the ground's normal, 'fn'; "
+         "accepted: [fn] alone, or components of the wrench without it"),
+        ("identify", "sensors.contact_wrenches={paw: [fn]}", "sensors.contact_wrenches: unknown name 'paw'"),
+        ("analyze", "analysis.compare={left: {contact_wrenches: {front_left_foot: [fx]}}}",
+         "analysis.compare.left.contact_wrenches.front_left_foot: 'fx' of a contact whose force is read along"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_in_one_line(
+    experiment: Path, command: str, override: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [command, str(experiment), override, f"output={experiment.parent / 'runs/none'}"]
+    assert message in refusal(arguments, experiment.parent, capsys)
+
+
+def test_analyze_takes_a_set_with_scalar_sensors_as_proposed(experiment: Path) -> None:
+    output = experiment.parent / "runs/analysis"
+    assert main(["analyze", str(experiment), f"output={output}"]) == 0
+    accuracy = json.loads((output.with_name("analysis.analysis") / "analysis.json").read_text())["accuracy"]
+    assert accuracy["proposed"]["rank"] == 118
+    assert accuracy["proposed"]["channels"] == 16

@@ -1,0 +1,73 @@
+"""Columns of extra parameters in the rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from torchid.problem.contact_state import ContactStateLayout
+from torchid.problem.extras import Extra
+from torchid.problem.samples import Samples
+from torchid.regressor.tree import KinematicTree
+
+
+def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
+    """Column of a degree of freedom's extra parameter in its row, (B,)."""
+    if extra.dof is None:
+        raise ValueError(f"extra: found {extra.label}; accepted: one of a degree of freedom")
+    if extra.what == "scale":
+        reading = samples.torque
+        return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, extra.dof]
+    if extra.what == "armature":
+        return samples.joint_acceleration[:, extra.dof]
+    if extra.what == "asymmetric_coulomb":
+        return tree.coulomb_sign(samples.joint_velocity[:, extra.dof]).abs()
+    return torch.ones_like(samples.time)
+
+
+def contact_extra_column(extra: Extra, samples: Samples, contact: int, axis: int) -> Tensor:
+    """Column of a contact sensor's extra parameter, subtracted from its reading along a recorded axis, (B,)."""
+    if extra.what == "offset":
+        return samples.active[:, contact].to(samples.time) if samples.share is None else samples.share[:, contact]
+    reading = samples.wrench
+    return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, contact, axis]
+
+
+def extra_columns(
+    extras: Sequence[Extra],
+    samples: Samples,
+    layout: ContactStateLayout,
+    tree: KinematicTree,
+    measured: Tensor,
+    W: Tensor,
+    rotations: dict[int, Tensor],
+) -> Iterator[Tensor]:
+    """Columns of extra parameters in coupled rows, (r, B) each.
+
+    Args:
+        extras: the parameters.
+        samples: B of one contact state and rank.
+        layout: of that state.
+        tree: of the robot.
+        measured: (B, k_m, base rows + coupled joints), rows of the contact Jacobian of the measured components.
+        W: (B, base rows + coupled joints, r), the basis.
+        rotations: by contact, (B, 3, 3) from its frame to the recorded axes where these are the world's; none of a
+            contact that is read along the ground's normal.
+    """
+    projected = (measured @ W).permute(1, 2, 0)  # rows per unit of each measured component
+    components = [component for body in layout.contact_bodies for component in body.components]
+    for extra in extras:
+        if extra.dof is not None:
+            row = W[:, tree.base_rows + layout.coupled_joints.index(extra.dof)]
+            yield row.T * dof_extra_column(extra, samples, tree)
+            continue
+        contact, axis = extra.contact or (0, 0)
+        column, reading = W.new_zeros(W.shape[2], len(samples)), contact_extra_column(extra, samples, contact, axis)
+        vector = range(3) if axis < 3 else range(3, 6)
+        for k in vector if contact in rotations else [axis]:
+            if (contact, k) in components:
+                along = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
+                column = column + projected[components.index((contact, k))] * along
+        yield column
