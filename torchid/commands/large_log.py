@@ -31,6 +31,7 @@ from torchid.logs.preprocess import (
     move_to_timeline,
     unloaded_readings,
 )
+from torchid.logs.rate_noise import warn_of_noisy_accelerations
 from torchid.logs.spill import Filled, Spill
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
@@ -163,6 +164,8 @@ class LargeLog:
     def _bound(self, coverage: Mapping[str, Coverage], block: _Block) -> tuple[slice, Samples]:
         """The numbers of a block's samples, and these; errors count from the beginning."""
         log = block.log if block.timeline is None else move_to_timeline(block.log, block.timeline, coverage)
+        if block.timeline is not None and not block.piece.start:
+            warn_of_noisy_accelerations(block.log, log, block.timeline)  # the first block stands for all
         samples = bind_log(log, self.robot, self.contacts)
         if self.required is not None:
             try:

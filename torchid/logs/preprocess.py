@@ -22,6 +22,7 @@ from torchid.logs.log import (
     column_labels,
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
+from torchid.logs.rate_noise import warn_of_noisy_accelerations
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
@@ -70,7 +71,8 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
         LogError: the log has too few samples or too wide gaps, or a value that is not finite.
 
     Warns:
-        TorchidWarning: a torque or wrench channel is NaN in some samples, or time stamps nearly coincide.
+        TorchidWarning: a torque or wrench channel is NaN in some samples, time stamps nearly coincide, or accelerations
+            are noise to a large part.
     """
     with about_file(log.source):
         timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
@@ -79,7 +81,10 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
         warn_of_gaps(log, name, found)
-    return move_to_timeline(log, timeline, coverage)
+    out = move_to_timeline(log, timeline, coverage)
+    with about_file(log.source):
+        warn_of_noisy_accelerations(log, out, timeline)
+    return out
 
 
 def make_timeline(

@@ -110,6 +110,13 @@ class LowPass:
         _, response = signal.sosfreqz(self.sections, worN=_FREQUENCIES, whole=True)
         return float(np.mean(np.abs(response) ** 4))  # two passes, and power goes with the amplitude squared
 
+    def gain(self, cycles: FloatArray) -> FloatArray:
+        """By how much amplitudes change at frequencies (K,) [1/samples], in both passes together."""
+        from scipy import signal
+
+        _, response = signal.sosfreqz(self.sections, worN=2.0 * np.pi * cycles)
+        return np.asarray(np.square(np.abs(response)))
+
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
@@ -139,6 +146,11 @@ class Timeline:
     def output_stamps(self) -> FloatArray:
         """Stamps (K,) of the preprocessed log, counted from the log's first sample."""
         return self.grid[self.kept] if self.output is None else self.output
+
+    @property
+    def cutoff_hz(self) -> float | None:
+        """Cutoff of the filter [Hz], None without one."""
+        return REACH_PERIODS / self.reach if self.reach else None
 
     @property
     def keeps_stamps(self) -> bool:

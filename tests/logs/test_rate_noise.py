@@ -1,0 +1,68 @@
+"""Accelerations that are noise of what they were derived from."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motions import value
+
+from torchid.errors import TorchidWarning
+from torchid.logs import Log
+from torchid.logs.preprocess import preprocess
+
+RATE, SIGMA = 500.0, 1e-3
+
+
+def swinging(sigma: float, sizes: tuple[float, ...] = (0.02, 0.5)) -> Log:
+    """Joints that swing at 1 Hz, by so many radians, read by encoders with white noise."""
+    time = np.arange(10_000) / RATE
+    clean = np.array(sizes) * np.sin(2.0 * np.pi * time[:, None] + np.arange(len(sizes)))
+    noise = sigma * np.random.default_rng(0).normal(size=clean.shape)
+    return Log("swing.npz", time, tuple(f"joint_{k}" for k in range(len(sizes))), clean + noise)
+
+
+def said(log: Log, **settings: float) -> str:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", TorchidWarning)
+        preprocess(log, **settings)
+    return " ".join(str(one.message) for one in caught)
+
+
+def test_a_joint_whose_acceleration_is_noise_is_named_with_the_share_that_is() -> None:
+    log, clean = swinging(SIGMA), swinging(0.0)
+    text = said(log, cutoff_hz=20.0)
+    assert "swing.npz" in text
+    assert "joint_0 (" in text
+    assert "joint_1" not in text
+    share = float(text.split("joint_0 (")[1].split(" %")[0]) / 100.0
+    with pytest.warns(TorchidWarning):
+        noisy = value(preprocess(log, 20.0).joint_acceleration)[:, 0]
+    exact = value(preprocess(clean, 20.0).joint_acceleration)[:, 0]
+    assert share == pytest.approx(np.var(noisy - exact) / np.var(noisy), rel=0.1)
+
+
+def test_the_cutoff_that_is_proposed_is_low_enough() -> None:
+    log = swinging(SIGMA)
+    proposed = float(said(log, cutoff_hz=20.0).split("a cutoff of ")[1].split(" Hz")[0])
+    assert 2.0 < proposed < 20.0
+    assert said(log, cutoff_hz=proposed) == ""
+
+
+def test_without_a_filter_one_is_proposed_and_recorded_or_clean_accelerations_are_left_alone() -> None:
+    log = swinging(SIGMA, (0.5,))
+    assert "accepted: a low-pass filter, preprocessing.cutoff_hz" in said(log)
+    assert said(swinging(0.0, (0.5,)), cutoff_hz=20.0) == ""
+    rates = {name: np.zeros_like(log.joint_position) for name in ("joint_velocity", "joint_acceleration")}
+    assert said(replace(log, **rates), cutoff_hz=20.0) == ""
+    assert said(log.select(slice(0, 90)), cutoff_hz=100.0) == "", "too short to say"
+
+
+def test_a_gyroscope_counts_as_well() -> None:
+    log = swinging(0.0, (0.5,))
+    rng = np.random.default_rng(1)
+    rate = 0.05 * np.sin(2.0 * np.pi * log.time[:, None] + np.arange(3)) + 0.02 * rng.normal(size=(len(log), 3))
+    imu = replace(log, imu_frame="base", imu_angular_velocity=rate, imu_specific_force=np.ones((len(log), 3)))
+    assert "imu_angular_velocity x (" in said(imu, cutoff_hz=20.0)

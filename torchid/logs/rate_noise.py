@@ -1,0 +1,92 @@
+"""How much of a derived acceleration is noise of what it was derived from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import comb
+
+import numpy as np
+
+from torchid.errors import join_names, warn_about_file
+from torchid.logs.log import FloatArray, Log, column_labels
+from torchid.logs.timeline import Timeline
+
+_ORDER = 5  # of the differences that show noise: smooth motion vanishes in them
+_MUCH = 0.1  # share of an acceleration's variance: parameters that rest on it are as much too small
+_LITTLE = 0.03  # share at the cutoff that is proposed
+_FEWEST = 100  # samples
+_FREQUENCIES = 2000
+_NORMAL = 0.6745  # median of |x| of standard normal x
+_NAMED = 4
+#: Accelerations, and what each is derived from, with the number of derivatives.
+_DERIVED = {
+    "joint_acceleration": (("joint_velocity", 1), ("joint_position", 2)),
+    "imu_angular_acceleration": (("imu_angular_velocity", 1),),
+    "base_angular_acceleration_base": (("base_angular_velocity_base", 1),),
+}
+_AXES = ("x", "y", "z")
+
+
+def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline) -> None:
+    """Name accelerations that are noise to a large part, which biases what depends on them towards 0.
+
+    Args:
+        log: as recorded.
+        preprocessed: the same with its accelerations.
+        timeline: that was used.
+
+    Warns:
+        TorchidWarning: one, with a lower cutoff that would do.
+    """
+    noisy = sorted(_noise_shares(log, preprocessed, timeline), key=lambda one: -one[1])
+    if not noisy:
+        return
+    names = [f"{name} ({100.0 * share:.2g} %)" for name, share, _ in noisy]
+    found = f"accelerations of {join_names(names, _NAMED)} are that much noise of the signals they are derived from"
+    cutoff = timeline.cutoff_hz
+    if cutoff is None:
+        advice = "a low-pass filter, preprocessing.cutoff_hz"
+    else:
+        lower = cutoff * min(_slower(share, order) for _, share, order in noisy)
+        advice = f"a cutoff of {lower:.2g} Hz, if the motion is that slow, or faster motion"
+    warn_about_file(f"{found}: parameters that rest on them come out too small; accepted: {advice}")
+
+
+def _slower(share: float, order: int) -> float:
+    """Factor of the cutoff that leaves little noise: its power goes with the cutoff to the power 2 order + 1."""
+    ratio = _LITTLE / (1.0 - _LITTLE) * max(1.0 - share, 1e-3) / share
+    return float(ratio ** (1.0 / (2 * order + 1)))
+
+
+def _noise_shares(log: Log, preprocessed: Log, timeline: Timeline) -> Iterator[tuple[str, float, int]]:
+    """Channels of accelerations with much noise: its share of the variance, and the number of derivatives."""
+    if len(log) < _FEWEST:
+        return
+    step = float(np.median(np.diff(log.time)))
+    for name, sources in _DERIVED.items():
+        derived: FloatArray | None = getattr(preprocessed, name)
+        if getattr(log, name) is not None or derived is None:
+            continue
+        source, order = next(((field, order) for field, order in sources if getattr(log, field) is not None), ("", 0))
+        if not source:
+            continue
+        gain = _gain(order, step, timeline)
+        variance = np.square(_noise(getattr(log, source))) * gain
+        share = np.divide(variance, derived.var(axis=0), out=np.zeros_like(variance), where=variance > 0.0)
+        labels = column_labels(source, log.names) or tuple(f"{source} {axis}" for axis in _AXES)
+        yield from ((labels[column], min(float(share[column]), 1.0), order) for column in np.flatnonzero(share > _MUCH))
+
+
+def _noise(values: FloatArray) -> FloatArray:
+    """Standard deviation of white noise in smooth channels (N, c), (c,)."""
+    differences = np.diff(values, n=_ORDER, axis=0) / np.sqrt(comb(2 * _ORDER, _ORDER))
+    off = np.abs(differences - np.median(differences, axis=0))
+    return np.asarray(np.minimum(np.median(off, axis=0) / _NORMAL, differences.std(axis=0)))
+
+
+def _gain(order: int, step: float, timeline: Timeline) -> float:
+    """Variance of a filtered derivative of some order of white noise of unit variance, recorded every so many s."""
+    hertz = np.linspace(0.0, 0.5 / step, _FREQUENCIES)
+    passed = np.ones_like(hertz) if timeline.low_pass is None else timeline.low_pass.gain(hertz * step)
+    power = 2.0 * step * (2.0 * np.pi * hertz) ** (2 * order) * np.square(passed)
+    return float(np.trapezoid(power, hertz))
