@@ -21,9 +21,9 @@ NORMAL = 1.959964
 
 
 def covered(estimates: list[Estimate], true: Array) -> NDArray[np.bool_]:
-    """Whether each 95 % interval holds the truth, (repetitions, identified parameters)."""
+    """Whether each 95 % interval by noise holds the truth, (repetitions, identified parameters)."""
     known = estimates[0].verdict == "identified"
-    off = np.array([(estimate.phi - true) / estimate.standard_error for estimate in estimates])
+    off = np.array([(estimate.phi - true) / estimate.noise_error for estimate in estimates])
     return np.abs(off[:, known]) <= NORMAL
 
 

@@ -142,7 +142,7 @@ def _by_block(
         number, columns = keys.index(_key(part)), maps[part.source]
         along = columns.by_phi @ basis
         for support, block in part.factor.blocks.items():
-            rows, at = block.cpu().double().numpy(), list(support)
+            rows, at = np.ascontiguousarray(block.cpu().double().numpy()), list(support)  # the same bits from a cache
             residual = rows[:, -1] - rows[:, :-1] @ columns.values[at]
             gradient = rows[:, :-1].T @ residual
             gradients["bodies"][number] += columns.by_phi[at].T @ gradient

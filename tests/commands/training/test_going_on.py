@@ -96,8 +96,8 @@ def test_curves_say_everything_by_epoch_and_show_train_and_unseen_logs(run: Path
             assert steps(events, tag) == expected
     for tag in ("loss/data", "loss_held_out/data", "relative_error_test/nullspace", "closed_form/distance"):
         values = [event.value for event in events.Scalars(tag)]
-        much = tag != "loss_held_out/data"  # 240 samples do not foretell as many of another motion
-        assert values[-1] < (0.8 if much else 1.0) * values[0], tag
+        unseen = tag in ("loss_held_out/data", "relative_error_test/nullspace")  # little, after 240 samples
+        assert values[-1] < (0.97 if unseen else 0.9) * values[0], tag
     total = [event.value for event in events.Scalars("loss/total")]
     parts = zip(*([event.value for event in events.Scalars(f"loss/{term}")] for term in ("data", "prior")), strict=True)
     assert total == pytest.approx([sum(pair) for pair in parts], rel=1e-6)
