@@ -5,7 +5,7 @@
 
 Three paths:
 - identify: `torchid identify` as a whole, from the command line to the run folder;
-- log to phi: the part of it from the first call into `torchid/logs` until the estimate that it returns exists;
+- log to phi: the part of it from the first call into `torchid/logs` until the parameters that it returns exist;
 - library: from `read_log` to `LeastSquares.solve` by the calls of the README, with the stated noise and without checks.
 
 Named functions are counted; lambdas, comprehensions and what runs while modules are imported are not.
@@ -55,9 +55,10 @@ class Trace:
         return self
 
     def from_log(self) -> Trace:
-        """The part from the first call into `torchid/logs` until the estimate that `identify` returned, if it ran."""
+        """The part from the first call into `torchid/logs` until the parameters that `identify` returned, if it ran."""
         start = next(number for number, call in enumerate(self.calls) if call[0].startswith("logs"))
-        ends = [count for made, count in self.estimates if made is getattr(self.identified, "estimate", None)]
+        found = getattr(getattr(self.identified, "estimate", None), "phi", None)
+        ends = [count for made, count in self.estimates if found is not None and getattr(made, "phi", None) is found]
         return Trace(self.calls[start : min(ends, default=len(self.calls))])
 
     def __str__(self) -> str:
