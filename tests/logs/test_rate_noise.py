@@ -66,3 +66,9 @@ def test_a_gyroscope_counts_as_well() -> None:
     rate = 0.05 * np.sin(2.0 * np.pi * log.time[:, None] + np.arange(3)) + 0.02 * rng.normal(size=(len(log), 3))
     imu = replace(log, imu_frame="base", imu_angular_velocity=rate, imu_specific_force=np.ones((len(log), 3)))
     assert "imu_angular_velocity x (" in said(imu, cutoff_hz=20.0)
+
+
+def test_uneven_stamps_are_no_noise() -> None:
+    time = np.arange(5000) / RATE + np.random.default_rng(2).uniform(-2e-4, 2e-4, 5000)
+    log = Log("jitter.npz", time, ("a",), 0.5 * np.sin(2.0 * np.pi * time[:, None]))
+    assert said(log, cutoff_hz=20.0) == said(log) == ""

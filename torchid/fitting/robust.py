@@ -228,7 +228,7 @@ class Reweighting:
         self._parameters = parameters
         self._lock = threading.Lock()
         self._histogram = np.zeros(_BINS)
-        self._sums = np.zeros(5)  # rows, weights, rho'^2, rho'', rho''^2
+        self._terms: list[list[float]] = []  # rows, weights, rho'^2, rho'', rho''^2 of each chunk, as they come
 
     @torch.no_grad()
     def __call__(self, samples: Samples, support: tuple[int, ...], rows: Tensor) -> Tensor:
@@ -241,14 +241,20 @@ class Reweighting:
         sums = [len(u), *(float(x.sum()) for x in (weight, (weight * u).square(), slope, slope.square()))]
         with self._lock:
             self._histogram += counts
-            self._sums += sums
+            self._terms.append(sums)
         return rows * weight.sqrt()[:, None]
 
     def gather(self) -> None:
         """End the pass, where processes share the work: the statistics are those of all rows from now on."""
         if ranks.world_size() > 1:
-            both = ranks.gather((self._histogram, self._sums), "residuals")
-            self._histogram, self._sums = (np.sum(parts, axis=0) for parts in zip(*both, strict=True))
+            both = ranks.gather((self._histogram, self._terms), "residuals")
+            self._histogram = np.sum([histogram for histogram, _ in both], axis=0)
+            self._terms = [sums for _, terms in both for sums in terms]
+
+    @property
+    def _sums(self) -> Array:
+        """Of all chunks, rounded once, so that their order makes no difference."""
+        return np.array([math.fsum(column) for column in zip(*self._terms, strict=True)] or [0.0] * 5)
 
     @property
     def median_scale(self) -> float:

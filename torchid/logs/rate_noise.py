@@ -9,12 +9,12 @@ import numpy as np
 
 from torchid.errors import join_names, warn_about_file
 from torchid.logs.log import FloatArray, Log, column_labels
-from torchid.logs.timeline import Timeline
+from torchid.logs.timeline import JITTER, Timeline, spline_derivatives
 
 _ORDER = 5  # of the differences that show noise: smooth motion vanishes in them
 _MUCH = 0.1  # share of an acceleration's variance: parameters that rest on it are as much too small
 _LITTLE = 0.03  # share at the cutoff that is proposed
-_FEWEST = 100  # samples
+_FEWEST, _MOST = 100, 5000  # samples
 _FREQUENCIES = 2000
 _NORMAL = 0.6745  # median of |x| of standard normal x
 _NAMED = 4
@@ -71,14 +71,18 @@ def _noise_shares(log: Log, preprocessed: Log, timeline: Timeline) -> Iterator[t
         if not source:
             continue
         gain = _gain(order, step, timeline)
-        variance = np.square(_noise(getattr(log, source))) * gain
-        share = np.divide(variance, derived.var(axis=0), out=np.zeros_like(variance), where=variance > 0.0)
+        variance = np.square(_noise(log.time[:_MOST], getattr(log, source)[:_MOST])) * gain
+        motion = np.array([channel.var() for channel in derived.T])  # one by one: temporaries stay small
+        share = np.divide(variance, motion, out=np.zeros_like(variance), where=variance > 0.0)
         labels = column_labels(source, log.names) or tuple(f"{source} {axis}" for axis in _AXES)
         yield from ((labels[column], min(float(share[column]), 1.0), order) for column in np.flatnonzero(share > _MUCH))
 
 
-def _noise(values: FloatArray) -> FloatArray:
-    """Standard deviation of white noise in smooth channels (N, c), (c,)."""
+def _noise(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Standard deviation of white noise in smooth channels (N, c), (c,), at stamps (N,) [s]."""
+    steps = np.diff(time)
+    if np.ptp(steps) > JITTER * float(np.median(steps)):  # differences between uneven steps are motion
+        values = spline_derivatives(time, values, np.linspace(time[0], time[-1], len(time)), (0,))[0]
     differences = np.diff(values, n=_ORDER, axis=0) / np.sqrt(comb(2 * _ORDER, _ORDER))
     off = np.abs(differences - np.median(differences, axis=0))
     return np.asarray(np.minimum(np.median(off, axis=0) / _NORMAL, differences.std(axis=0)))
