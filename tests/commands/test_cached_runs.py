@@ -7,19 +7,16 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from demo import DEMO, shortened_demo
 from large import experiment, overrides, recorded
-from matplotlib.figure import Figure
-from trainings import FIGURES
+from trainings import without_figures
 
 from torchid.cli import main
 from torchid.commands.cache import FOLDER, content_key
@@ -49,18 +46,8 @@ ESTIMATORS = {
 
 
 @pytest.fixture(autouse=True)
-def _at_once(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Checksums of files that have just been written count; no figures, which take most of the time; one thread.
-
-    Threads add what they know of residuals in the order in which they get there.
-    """
-    monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
-    for figure in FIGURES:
-        monkeypatch.setattr(f"torchid.commands.results.{figure}", lambda *_: Figure(figsize=(1.0, 1.0)))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_figures(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,7 @@ import torch
 import yaml
 from demo import shortened_demo
 from large import assert_same, tensors
-from matplotlib.figure import Figure
-from trainings import FIGURES
+from trainings import without_figures
 
 from torchid.cli import main
 from torchid.commands.cached_reading import CachedReader, open_cache
@@ -33,14 +31,8 @@ FEET = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rea
 
 
 @pytest.fixture(autouse=True)
-def _without_figures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
-    for figure in FIGURES:
-        monkeypatch.setattr(f"torchid.commands.results.{figure}", lambda *_: Figure(figsize=(1.0, 1.0)))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_figures(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -123,6 +123,24 @@ def test_noise_alone_is_no_lack_of_fit() -> None:
         assert 0.8 < fit.scatter.lack_of_fit < 1.25
 
 
+def test_neighbours_of_very_many_blocks_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples, fitter, _, rng = scene(200)
+    log = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))
+    parts = compress_in_blocks(split_into_folds([log], fitter.builder), fitter.builder)
+    all_blocks = fitter.fit(parts).scatter
+    monkeypatch.setattr(block_scatter, "MOST_BLOCKS", 10)
+    fewer = fitter.fit(parts[::-1]).scatter  # whatever order threads leave them in
+    assert all_blocks is not None
+    assert fewer is not None
+    assert (all_blocks.blocks, fewer.blocks) == (20, 10)
+    ratio = fewer.error[fewer.error > 0.0] / all_blocks.error[fewer.error > 0.0]
+    assert 0.7 < np.median(ratio) < 1.5
+    groups = block_scatter._numbered(parts)
+    assert [groups["synthetic.npz", fold, block] for fold in range(5) for block in range(4)] == [
+        n // 2 for n in range(20)
+    ]
+
+
 def test_without_blocks_or_with_few_there_is_no_scatter() -> None:
     samples, fitter, _, rng = scene(200)
     exact = noisy(samples, NOISE * rng.normal(size=(len(samples), 12)))

@@ -143,7 +143,7 @@ def x(*shape: int) -> Tensor:
     ],
 )
 def test_every_kind_of_exchange_is_seen(do: Callable[[], object], found: str) -> None:
-    with DeviceTraffic() as mode, suppress(NotImplementedError, RuntimeError):  # for want of values there
+    with DeviceTraffic() as mode, suppress(RuntimeError):  # what has no values cannot be asked for one
         do()
     assert f"tests: {found}" in mode.found
 

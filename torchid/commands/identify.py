@@ -32,6 +32,7 @@ from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
+from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
@@ -156,6 +157,33 @@ def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _
     return _Data(fleet.experiment, logs, fleet.files, excluded, *same)
 
 
+@dataclass(frozen=True)
+class _Solved:
+    """A fit, how outliers were weighed down and how it was trained, if so, and the total mass."""
+
+    fit: Fit
+    robust: RobustSummary | None
+    training: Training | None
+    mass: TotalMass
+
+
+def _solved(ready: _Prepared, evaluation: Evaluation, bars: Progress, resume: bool) -> _Solved:
+    """The fit of prepared data, which may be that of a robot."""
+    experiment, fitter, logs = ready.experiment, ready.fitter, ready.logs
+    training, solve = None, None
+    if experiment.config.estimator.name == "sgd":
+        require_plausible(fitter.fit(ready.parts), experiment)
+        training = Training(experiment)
+        evaluate = partial(_identified_metrics, evaluation, logs)
+        solve = partial(training.run, builder=fitter.builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
+    fit = fitter.fit(ready.parts, solve)
+    fit, robust = _robust(fit, experiment, fitter, [x for x in ready.blocks if isinstance(x, Samples)], bars)
+    mass = require_plausible(fit, experiment)
+    warn_of_confounded(fit.extras)
+    warn_of_disagreement(fit, fitter)
+    return _Solved(fit, robust, training, mass)
+
+
 def _identify(config: ExperimentConfig, resume: bool) -> Identification:
     clock = _Clock()
     with progress_bars() as bars:
@@ -163,20 +191,10 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
         experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
         builder, stated = fitter.builder, bool(stated_noise(config.sensors.noise))
         evaluation = experiment.evaluation(noise_of_readings(experiment.config, stated))
-        training, solve = None, None
         with clock("solve"):
-            if experiment.config.estimator.name == "sgd":
-                require_plausible(fitter.fit(ready.parts), experiment)
-                training = Training(experiment)
-                evaluate = partial(_identified_metrics, evaluation, logs)
-                solve = partial(training.run, builder=builder, logs=logs, evaluate=evaluate, bars=bars, resume=resume)
-            fit = fitter.fit(ready.parts, solve)
-            fit, robust = _robust(fit, experiment, fitter, [x for x in blocks if isinstance(x, Samples)], bars)
-            ready.parts = []
+            solved = _solved(ready, evaluation, bars, resume)
+            fit, ready.parts = solved.fit, []
             estimate, problem = fit.estimate, fit.assembly.problem
-            mass = require_plausible(fit, experiment)
-            warn_of_confounded(fit.extras)
-            warn_of_disagreement(fit, fitter)
         with clock("identifiability"):
             whole = merge_folds(_with_states(fit.parts, ready.factors), builder)
             alone = _by_state(fitter, whole)
@@ -188,25 +206,26 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
             scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
             scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
-        broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
         run = Identification(
             experiment=experiment,
             estimate=estimate,
             extras=fit.extras,
             noise=ready.noise,
             misfit=misfit(estimate, ready.noise, fit.scatter),
-            robust=robust,
+            robust=solved.robust,
             states=ready.states,
             by_state=alone,
             contributions=added,
             metrics=scores.metrics,
             evaluated=scores.samples,
-            violations=broken,
+            violations=violations(
+                estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions
+            ),
             seconds=clock.seconds,
             samples=sum(map(len, blocks)),
             factors=ready.factors,
             excluded=ready.excluded,
-            mass=mass,
+            mass=solved.mass,
             validation=scores.validation,
             ridge=ready.ridge,
             reused=ready.reused,
@@ -216,7 +235,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
         ready.blocks = blocks = []
         require_not_worse(run.worse, experiment)
         bars.add_task("writing", total=None)
-        ranks.from_first(partial(write_run, run, evaluation, plotted, compared, training), "run folder")
+        ranks.from_first(partial(write_run, run, evaluation, plotted, compared, solved.training), "run folder")
     return run
 
 

@@ -12,6 +12,7 @@ from torchid.commands.check import stretches_to_check
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn_about_file
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
+from torchid.fitting.misfit import beyond_models
 from torchid.identifiability.confounding import TotalMass, total_mass
 from torchid.log_checks import Finding
 from torchid.log_checks.check import check
@@ -28,8 +29,6 @@ LARGEST_FACTOR = 10.0
 
 _GRAVITY = 9.81  # m/s^2
 _CLEAR = 0.5  # correlation of forces of the URDF's bodies with the measured ones, from which on their factor is clear
-_UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
-_SHARE = 0.5  # and of the weighted forces, where the noise was estimated to be as large; recorded logs stay below 0.35
 _GENERAL = ("forces", "weight")  # findings that say that something is off rather than what
 _PART = 0.05  # share of a log's samples from which on a finding may be the reason
 _USUAL = (
@@ -58,7 +57,7 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error
     mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance, block_error)
     reason = implausibility(fit.assembly.problem, estimate.phi, mass, scene.robot)
-    unexplained = _unexplained(fit)
+    unexplained = beyond_models(estimate, fit.assembly.problem)
     if reason is None and unexplained is None:
         return mass
     log, finding = next(_findings(scene), (None, None))
@@ -170,18 +169,6 @@ def _reach(robot: Robot) -> float:
         if body.joint is not None:
             away[number] = away[body.parent] + np.linalg.norm(body.joint.T_parent_joint[:3, 3])
     return float((away + radius).max())
-
-
-def _unexplained(fit: Fit) -> str | None:
-    """By how much residuals exceed the noise, in words; None if they do not."""
-    estimate, problem = fit.estimate, fit.assembly.problem
-    left = np.sqrt(estimate.cost / max(estimate.rows, 1))  # not corrected for the fit, which may be far from the best
-    if left > _UNEXPLAINED:
-        return f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
-    share = np.sqrt(estimate.cost / max(problem.cost(np.zeros_like(estimate.phi)), np.finfo(float).tiny))
-    if share > _SHARE:
-        return f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
-    return None
 
 
 def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:

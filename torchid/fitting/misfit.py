@@ -9,10 +9,14 @@ import numpy as np
 from torchid.estimators import Estimate
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.identifiability.block_scatter import BlockScatter
+from torchid.problem import LinearProblem
 
 _MUCH = 1.5  # times the residual that noise leaves; stated noise is seldom known better
 _ALIKE = 2.0  # times the blocks' part of the residuals if these were noise, which alone gives 0.8 to 1.3
 _NAMED = 3
+
+_UNEXPLAINED = 5.0  # residual in units of the stated noise; recorded logs with honest noise figures stay below 2
+_SHARE = 0.5  # and of the weighted forces, where the noise was estimated to be as large; recorded logs stay below 0.35
 
 
 @dataclass(frozen=True)
@@ -83,3 +87,19 @@ def misfit(estimate: Estimate, noise: NoiseSummary, scatter: BlockScatter | None
         error_growth=growth,
         groups=tuple(sorted(beyond, key=lambda one: -excess[one.group])),
     )
+
+
+def beyond_models(estimate: Estimate, problem: LinearProblem) -> str | None:
+    """Why forces are not those of any robot with noise, in words; None if they may be. Far more than a `Misfit`.
+
+    Args:
+        estimate: of a fit, which may be far from the best.
+        problem: that was solved.
+    """
+    left = np.sqrt(estimate.cost / max(estimate.rows, 1))
+    if left > _UNEXPLAINED:
+        return f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
+    share = np.sqrt(estimate.cost / max(problem.cost(np.zeros_like(estimate.phi)), np.finfo(float).tiny))
+    if share > _SHARE:
+        return f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
+    return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,9 @@ from torchid.problem.elimination import Assembly
 
 LEAST_BLOCKS = 8
 """With fewer blocks their scatter says too little."""
+
+MOST_BLOCKS = 100
+"""Of more, neighbours count as one: the factors of a fleet's logs are more than memory has room for matrices."""
 
 _LEVERAGE = 0.95  # of the information that a block has on a combination, at most: it alone cannot say how it scatters
 _NORMAL = float(stats.norm.ppf(0.975))
@@ -78,21 +81,22 @@ def block_scatter(
         ridge: of the estimate.
         rank_tolerance: as in `LeastSquares`.
     """
-    keys = list(dict.fromkeys(_key(part) for part in parts if not part.unloaded))
-    if len(keys) < LEAST_BLOCKS:
+    numbers = _numbered(parts)
+    count = len({*numbers.values()})
+    if count < LEAST_BLOCKS:
         return None
     problem = assembly.problem
     covariance = ParameterCovariance.of(problem, rank_tolerance)
     basis = np.zeros((len(problem.nominal), covariance.root.shape[1]))  # of unit variance by the rows alone
     basis[problem.free] = covariance.scale[:, None] * covariance.root
     best = problem.nominal + basis @ (basis.T @ (problem.A.T @ (problem.b - problem.A @ problem.nominal)))
-    gradients, shares = _by_block(parts, keys, builder, assembly, best, basis)
+    gradients, shares = _by_block(parts, numbers, builder, assembly, best, basis)
     scores = gradients["bodies"] @ basis
     noise = (
         problem.oversampling * residual_std(problem.cost(best), problem.rows, basis.shape[1], problem.oversampling) ** 2
     )
     expected = noise * (np.trace(shares, axis1=1, axis2=2) - np.square(shares).sum((1, 2))).sum()
-    factor = np.sqrt((len(keys) - 1) / len(keys)) * stats.t.ppf(0.975, len(keys) - 1) / _NORMAL
+    factor = np.sqrt((count - 1) / count) * stats.t.ppf(0.975, count - 1) / _NORMAL
     without_ridge = factor * _left_out(scores, shares) @ basis.T
     with_ridge = without_ridge
     if ridge > 0.0:
@@ -100,7 +104,7 @@ def block_scatter(
         shrunk = values / np.sqrt(values**2 + ridge * problem.rows)
         with_ridge = factor * _left_out(scores * shrunk, shares * np.outer(shrunk, shrunk)) * shrunk @ basis.T
     return BlockScatter(
-        blocks=len(keys),
+        blocks=count,
         deviations=with_ridge,
         without_ridge=without_ridge,
         extras=_of_extras(gradients, without_ridge, assembly, factor),
@@ -108,8 +112,19 @@ def block_scatter(
     )
 
 
-def _key(part: Part) -> tuple[str, int, int]:
+_Key = tuple[str, int, int]
+
+
+def _key(part: Part) -> _Key:
     return part.source, part.fold, part.block
+
+
+def _numbered(parts: Sequence[Part]) -> dict[_Key, int]:
+    """The number of each block, log by log in time; neighbours share one where there are too many."""
+    logs = list(dict.fromkeys(part.source for part in parts))
+    keys = sorted({_key(part) for part in parts if not part.unloaded}, key=lambda key: (logs.index(key[0]), *key[1:]))
+    count = min(len(keys), MOST_BLOCKS)
+    return {key: index * count // len(keys) for index, key in enumerate(keys)}
 
 
 def _left_out(scores: Array, shares: Array) -> Array:
@@ -122,7 +137,7 @@ def _left_out(scores: Array, shares: Array) -> Array:
 
 def _by_block(
     parts: Sequence[Part],
-    keys: Sequence[tuple[str, int, int]],
+    numbers: Mapping[_Key, int],
     builder: RowBuilder,
     assembly: Assembly,
     phi: Array,
@@ -133,14 +148,14 @@ def _by_block(
     Gradients are by "bodies", all parameters with the extra ones at their best, and by the log of each elimination, its
     extra parameters with those of single logs at their best.
     """
-    maps = {source: _Columns.of(builder, assembly, source, phi) for source, _, _ in keys}
-    gradients = {name: np.zeros((len(keys), width)) for name, width in _widths(assembly).items()}
-    shares = np.zeros((len(keys), basis.shape[1], basis.shape[1]))
-    for part in parts:
-        if part.unloaded:
-            continue
-        number, columns = keys.index(_key(part)), maps[part.source]
-        along = columns.by_phi @ basis
+    count = max(numbers.values()) + 1
+    gradients = {name: np.zeros((count, width)) for name, width in _widths(assembly).items()}
+    shares, columns, along = np.zeros((count, basis.shape[1], basis.shape[1])), None, basis
+    for part in sorted((part for part in parts if not part.unloaded), key=lambda part: part.source):
+        if columns is None or columns.source != part.source:
+            columns = _Columns.of(builder, assembly, part.source, phi)
+            along = columns.by_phi @ basis
+        number = numbers[_key(part)]
         for support, block in part.factor.blocks.items():
             rows, at = np.ascontiguousarray(block.cpu().double().numpy()), list(support)  # the same bits from a cache
             residual = rows[:, -1] - rows[:, :-1] @ columns.values[at]
@@ -171,6 +186,7 @@ class _Columns:
     elimination, "" for that of all logs, with the unknowns of single logs at their best.
     """
 
+    source: str
     values: Array
     by_phi: Array
     by_extras: dict[str, Array]
@@ -191,7 +207,7 @@ class _Columns:
             by_extras[log][places, range(len(places))] = 1.0
             if log and "" in own:
                 by_extras[""][places] = -elimination.inverse @ elimination.C[:, len(phi) :]
-        return cls(values, by_phi, by_extras)
+        return cls(source, values, by_phi, by_extras)
 
 
 def _of_extras(gradients: dict[str, Array], bodies: Array, assembly: Assembly, factor: float) -> tuple[Array, ...]:
