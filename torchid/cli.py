@@ -224,6 +224,8 @@ def _print_fit(run: Identification) -> None:
     expected = run.misfit.expected
     rest = "" if expected is None else f"; {expected:.3g} are left by noise alone"
     print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise{rest}")
+    if run.motion_noise.combinations:
+        print(fill(f"motion noise  {run.motion_noise}", 100, subsequent_indent=" " * 14))
     if run.validation is not None:
         _print_validation(run.validation)
     if run.ridge is not None:

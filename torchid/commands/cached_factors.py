@@ -17,7 +17,7 @@ from torchid.problem import RowBuilder, Samples, TriangularFactor
 from torchid.problem.chunks import worker_count
 from torchid.problem.compression import Part
 
-_FORMAT = 2  # of entries
+_FORMAT = 3  # of entries
 _PARTS = TypeAdapter(list[PackedPart])
 
 
@@ -39,6 +39,7 @@ def factors_key(experiment: Experiment, builder: RowBuilder, samples: Sequence[s
             "noise": vars(sensors.noise),
             "terms": vars(experiment.terms),
             "blocks": [[sources.index(block.source), len(block), block.fold] for block in blocks],
+            "surplus": [block.motion_noise is not None for block in blocks],
             "device": builder.device.type,
             "shares": [worker_count(builder.device), ranks.world_size()],  # rows are added up by each
         }
@@ -97,8 +98,11 @@ def _unpacked(entry: Entry, builder: RowBuilder, sources: Sequence[str]) -> list
         _PARTS.validate_python(document["parts"]), document["of"], strict=True
     ):
         part = reader.read(sources[source], packed, unloaded)
-        factor, blocks = part.factor, {x: rows.to(builder.device) for x, rows in part.factor.blocks.items()}
-        moved = TriangularFactor.from_blocks(columns, factor.rows, factor.independent_rows, blocks)
+        factor = part.factor
+        blocks, surplus = (
+            {support: x.to(builder.device) for support, x in by.items()} for by in (factor.blocks, factor.surplus)
+        )
+        moved = TriangularFactor.from_blocks(columns, factor.rows, factor.independent_rows, blocks, surplus)
         parts.append(replace(part, factor=moved, fold=fold, block=block))
     if reader.numbers_left:
         raise ValueError("more numbers than are described")

@@ -26,6 +26,12 @@ from torchid.problem.extras import recorded_components
 from torchid.sensing import SensorSet
 
 
+def open_reader(scene: Scene) -> LogReader:
+    """What reads logs, through the cache beside the output if there is to be one. All processes call this together."""
+    cache = open_cache(scene)
+    return LogReader(scene) if cache is None else CachedReader(scene, cache)
+
+
 def open_cache(scene: Scene) -> Cache | None:
     """The cache beside the output of an experiment; None without one, or where processes have no common folder.
 

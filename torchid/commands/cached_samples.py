@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -18,6 +19,7 @@ from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Scene
 from torchid.problem import Samples
 from torchid.problem.base_motion import BaseMotion
+from torchid.problem.motion_noise import MotionNoise
 from torchid.sensing import SensorSet
 
 NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
@@ -26,7 +28,7 @@ NOT_IN_SAMPLES = ("memory_gb", "cache_gb")
 Said = tuple[type[Warning], str]
 """Class and text of a warning."""
 
-_FORMAT = 1  # of entries
+_FORMAT = 2  # of entries
 _BASE = "base."  # before the names of tensors of the base's motion
 
 
@@ -58,6 +60,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "contacts": [asdict(contact) for contact in scene.contacts],
         "unloaded": fits_contact_offsets(scene),
         "preprocessing": settings,
+        "motion_noise": config.sensors.noise.motion,
         "topics": topics,
     }
 
@@ -78,6 +81,7 @@ def samples_entry(read: ReadLog) -> tuple[dict[str, Any], dict[str, NDArray[Any]
         "source": samples.source,
         "samples": {name: x for name, x in vars(samples).items() if isinstance(x, (bool, int, float))},
         "axes": axes,
+        "motion_noise": _noise_document(samples.motion_noise),
         "recorded": [read.recorded.torque.tolist(), read.recorded.wrench.tolist()],
         "excluded": read.excluded,
         "said": [[category.__name__, message] for category, message in read.said if category in _said_again()],
@@ -101,12 +105,26 @@ def samples_of_entry(entry: Entry, source: str, folder: Path | None) -> ReadLog:
             base[name.removeprefix(_BASE)] = tensor
         else:
             own[name] = tensor
-    samples = Samples(source, base=BaseMotion(**base), folder=folder, **own, **document["samples"])
+    noise = _noise_of_document(document["motion_noise"])
+    samples = Samples(source, base=BaseMotion(**base), folder=folder, motion_noise=noise, **own, **document["samples"])
     torque, wrench = (np.array(mask, dtype=bool) for mask in document["recorded"])
     recorded = SensorSet(torque, wrench.reshape(-1, 6))
     categories = {category.__name__: category for category in _said_again()}
     said = [(categories[name], _about(source, document["source"], text)) for name, text in document["said"]]
     return ReadLog(samples, recorded, document["excluded"], said)
+
+
+def _noise_document(noise: MotionNoise | None) -> dict[str, Any] | None:
+    if noise is None:
+        return None
+    return {name: x.tolist() if isinstance(x, Tensor) else x for name, x in vars(noise).items()}
+
+
+def _noise_of_document(document: dict[str, Any] | None) -> MotionNoise | None:
+    if document is None:
+        return None
+    joints, base = (torch.tensor(document[name], dtype=torch.float64) for name in ("joints", "base"))
+    return MotionNoise(joints.reshape(-1, 3, 3), base.reshape(12, 12), bool(document["turns_force"]))
 
 
 def _about(source: str, before: str, text: str) -> str:

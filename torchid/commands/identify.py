@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from torchid import ranks
 from torchid.commands.cached_factors import cached_parts, factors_key
-from torchid.commands.cached_reading import CachedReader, open_cache
+from torchid.commands.cached_reading import CachedReader, open_reader
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
@@ -24,7 +24,7 @@ from torchid.errors import NumericalWarning, format_count, warn_about_file
 from torchid.estimators import Conditions, Estimate, violations
 from torchid.fitting.calibration import Calibration, Comparison, warn_of_confounded, warn_of_disagreement
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice, Scorer
-from torchid.fitting.experiment import Experiment, set_up, stated_noise, with_noise
+from torchid.fitting.experiment import Experiment, set_up, with_noise
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.fit import Fit, LogFitter
 from torchid.fitting.fleet import read_fleet
@@ -125,7 +125,7 @@ def _prepare(config: ExperimentConfig, clock: _Clock, bars: Progress) -> _Prepar
 def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
     """The logs of an experiment, read and compressed."""
     with clock("read"):
-        reader = _reader(experiment)
+        reader = open_reader(experiment)
         logs = _read(reader, experiment, bars)
     with clock("noise"):
         states = state_reports(logs["train"], experiment.builder(experiment.sensors))
@@ -146,7 +146,7 @@ def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
         fleet = read_fleet(experiment, lambda _: bars.advance(reading))
         require_base(fleet.states, experiment.config.sensors.on_base_lost)
-        reader = _reader(experiment)
+        reader = open_reader(experiment)
         logs = _read(reader, experiment, bars)
     with clock("compress"):
         builder = fleet.experiment.builder(fleet.experiment.sensors)
@@ -189,7 +189,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
     with progress_bars() as bars:
         ready = _prepare(config, clock, bars)
         experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
-        builder, stated = fitter.builder, bool(stated_noise(config.sensors.noise))
+        builder, stated = fitter.builder, bool(config.sensors.noise.forces)
         evaluation = experiment.evaluation(noise_of_readings(experiment.config, stated))
         with clock("solve"):
             solved = _solved(ready, evaluation, bars, resume)
@@ -206,11 +206,13 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             compared, *without_folds = (experiment.calibrations(one, builder) for one in fits)
             scorer, of_blocks = Scorer(evaluation, builder), merge_states(fit.parts, builder)
             scores = _scores(scorer, logs["test"], blocks, of_blocks, compared, without_folds, bars)
+        broken = violations(estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions)
         run = Identification(
             experiment=experiment,
             estimate=estimate,
             extras=fit.extras,
             noise=ready.noise,
+            motion_noise=fit.assembly.noise,
             misfit=misfit(estimate, ready.noise, fit.scatter),
             robust=solved.robust,
             states=ready.states,
@@ -218,9 +220,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             contributions=added,
             metrics=scores.metrics,
             evaluated=scores.samples,
-            violations=violations(
-                estimate.phi.reshape(-1, PER_BODY), problem.scale.reshape(-1, PER_BODY), ready.conditions
-            ),
+            violations=broken,
             seconds=clock.seconds,
             samples=sum(map(len, blocks)),
             factors=ready.factors,
@@ -274,13 +274,9 @@ def _read(reader: LogReader, experiment: Experiment, bars: Progress) -> dict[str
         for name, paths in files.items()
     }
     check_parts(logs)
+    if experiment.config.estimator.name == "sgd":  # it sees samples one by one, not what noise adds on average
+        logs["train"] = [replace(log, motion_noise=None) for log in logs["train"]]
     return logs
-
-
-def _reader(experiment: Experiment) -> LogReader:
-    """Reads logs, through the cache beside the output if there is to be one."""
-    cache = open_cache(experiment)
-    return LogReader(experiment) if cache is None else CachedReader(experiment, cache)
 
 
 def _reused(reader: LogReader) -> list[str]:

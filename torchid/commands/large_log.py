@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from contextvars import copy_context
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from torchid.logs.preprocess import (
     unloaded_readings,
 )
 from torchid.logs.rate_noise import warn_of_noisy_accelerations
+from torchid.logs.signal_noise import MOST_SAMPLES, SignalNoise, signal_noise
 from torchid.logs.spill import Filled, Spill
 from torchid.logs.timeline import SPLINE_BLOCK, Timeline
 from torchid.problem import Samples, bind_log
@@ -59,6 +60,7 @@ class LargeLog:
         contacts: in use.
         required: sensors whose every value must be there, None if gaps are allowed.
         folder: where there is room for the samples; None: in memory.
+        motion_noise: of the recorded motion, as far as it is stated, as `preprocess` takes it.
     """
 
     path: Path
@@ -67,6 +69,7 @@ class LargeLog:
     contacts: Sequence[Contact]
     required: SensorSet | None
     folder: Path | None
+    motion_noise: Mapping[str, float] = field(default_factory=dict)
 
     def samples(self, with_unloaded: bool = True) -> Samples:
         """What reading, preprocessing and binding the log as a whole would give.
@@ -107,7 +110,7 @@ class LargeLog:
             course.follow_signs(start)
             threads = 0 if self.folder is not None else torch.get_num_threads()  # on a disk because memory is short
             read = (_read_block(blocks, piece, course.timeline, course.in_the_air) for piece in mine)
-            with closing(_in_threads(partial(self._bound, course.coverage), read, threads)) as bound:
+            with closing(_in_threads(partial(self._bound, course), read, threads)) as bound:
                 for piece, samples in bound:
                     if course.in_the_air is None:
                         samples = replace(samples, unloaded=None)
@@ -118,14 +121,15 @@ class LargeLog:
 
     def _course(self, blocks: LogBlocks, with_unloaded: bool) -> _Course:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
-        first, settings = blocks.read(slice(0, min(len(blocks), 2))), self.settings
+        first, settings = blocks.read(slice(0, min(len(blocks), MOST_SAMPLES))), self.settings
         timeline = make_timeline(blocks.time, lacks_derivatives(first), settings.cutoff_hz, settings.sample_rate_hz)
         coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
         time = blocks.time if timeline is None else blocks.time[0] + timeline.output_stamps
         contacts = self._contacts(blocks, first)
         kept = None if contacts is None else self._away_from_changes(contacts, time)
         in_the_air = None if contacts is None or not with_unloaded else _in_the_air(contacts)
-        return _Course(blocks, timeline, coverage, time, kept, in_the_air)
+        noise = signal_noise(first, timeline, self.motion_noise)
+        return _Course(blocks, timeline, coverage, time, kept, in_the_air, noise)
 
     def _pieces(self, blocks: LogBlocks, count: int) -> Iterator[slice]:
         """The samples of a log, or of what becomes of them, in parts that fit into memory."""
@@ -161,12 +165,12 @@ class LargeLog:
         margin = self.settings.contact_margin_s
         return None if margin is None else away_from_changes(contacts, time, margin)
 
-    def _bound(self, coverage: Mapping[str, Coverage], block: _Block) -> tuple[slice, Samples]:
+    def _bound(self, course: _Course, block: _Block) -> tuple[slice, Samples]:
         """The numbers of a block's samples, and these; errors count from the beginning."""
-        log = block.log if block.timeline is None else move_to_timeline(block.log, block.timeline, coverage)
-        if block.timeline is not None and not block.piece.start:
-            warn_of_noisy_accelerations(block.log, log, block.timeline)  # the first block stands for all
-        samples = bind_log(log, self.robot, self.contacts)
+        log = block.log if block.timeline is None else move_to_timeline(block.log, block.timeline, course.coverage)
+        if block.timeline is not None and not block.piece.start:  # the first block stands for all
+            warn_of_noisy_accelerations(block.log, log, block.timeline, course.noise)
+        samples = bind_log(replace(log, motion_noise=course.noise), self.robot, self.contacts)
         if self.required is not None:
             try:
                 require_forces(samples, self.robot, self.contacts, self.required)
@@ -185,6 +189,7 @@ class _Course:
     time: FloatArray
     kept: BoolArray | None
     in_the_air: BoolArray | None
+    noise: SignalNoise
 
     @property
     def oversampling(self) -> float:

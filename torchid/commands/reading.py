@@ -88,7 +88,7 @@ class LogReader:
         recorded = read_log(path, topics, allow_gaps=settings.exclude_condemned)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
-        log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
+        log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz, self._stated)
         samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
         if not fits_contact_offsets(self.scene):
             samples = replace(samples, unloaded=None)
@@ -117,7 +117,11 @@ class LogReader:
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
         scene = self.scene
-        return LargeLog(path, scene.config.preprocessing, scene.robot, scene.contacts, required, folder)
+        return LargeLog(path, scene.config.preprocessing, scene.robot, scene.contacts, required, folder, self._stated)
+
+    @property
+    def _stated(self) -> dict[str, float]:
+        return self.scene.config.sensors.noise.motion
 
     def _checked(self, log: Log) -> Checked | None:
         """What the checks of a log say, if condemned samples are to be left out."""

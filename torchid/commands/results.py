@@ -17,7 +17,7 @@ from torchid.errors import during
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate, Violation
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
-from torchid.fitting.experiment import Experiment, stated_noise
+from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import NoiseSummary
@@ -29,6 +29,7 @@ from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, Metrics, Samples
 from torchid.problem.metrics import SETS, WHITENED, WorseThanNominal, describe_worse, worse_than_nominal
 from torchid.problem.predict import force_series, noise_series
+from torchid.problem.surplus import NoiseShares
 from torchid.report import identified_urdf, parameters_document
 from torchid.report.figures import (
     contribution_figure,
@@ -61,6 +62,7 @@ class Identification:
         estimate: the fit.
         extras: offsets, scales and actuator terms.
         noise: that rows were weighed with.
+        motion_noise: what noise of the motion had added to the normal equations.
         misfit: what the fit leaves of the forces, and what noise would leave.
         robust: how outliers were weighed down, if so.
         states: contact states of the training logs.
@@ -83,6 +85,7 @@ class Identification:
     estimate: Estimate
     extras: list[ExtraEstimate]
     noise: NoiseSummary
+    motion_noise: NoiseShares
     misfit: Misfit
     robust: RobustSummary | None
     states: list[StateReport]
@@ -172,7 +175,7 @@ def noise_of_readings(config: ExperimentConfig, stated: bool) -> SensorNoise | N
     Noise that was estimated beside a stated one is in proportion to it. Without any, it comes from the residuals
     themselves, which it could not judge.
     """
-    return SensorNoise.of_known(stated_noise(config.sensors.noise)) if stated else None
+    return SensorNoise.of_known(config.sensors.noise.forces) if stated else None
 
 
 def draw_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[Calibration]) -> Figure:
@@ -215,6 +218,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "rows": estimate.rows,
         "residual_std": estimate.residual_std,
         "misfit": _misfit_document(run.misfit),
+        "motion_noise": asdict(run.motion_noise),
         "total_mass": run.mass.value if run.mass.determined else None,
         "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
         "total_mass_told_from_offsets": run.mass.separable,

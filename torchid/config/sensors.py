@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError
+from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.extras import CHANNELS
 from torchid.settings import NotNegative, Number, Positive
 
@@ -93,9 +94,11 @@ class ContactConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class NoiseConfig:
-    """Standard deviations of the sensors [N m, N, N m], and floors of the base rows [N, N m].
+    """Standard deviations of the sensors [N m, N, N m], floors of the base rows [N, N m], and noise of the motion.
 
-    None: estimated from the training logs (`torchid.fitting.noise`), or those of `SensorNoise` where there are none.
+    None: estimated from the training logs (`torchid.fitting.noise`), or those of `SensorNoise` where there are none;
+    that of the motion, in every recorded sample [rad or m, rad/s or m/s, rad, rad/s, m/s^2], from the high frequencies
+    of each log (`torchid.logs.signal_noise`), 0 for none.
     """
 
     joint_torque: Positive | None = None
@@ -105,6 +108,21 @@ class NoiseConfig:
     base_moment: PerAxis | None = None
     ft_force: Positive | None = None
     ft_moment: Positive | None = None
+    joint_position: NotNegative | None = None
+    joint_velocity: NotNegative | None = None
+    base_orientation: NotNegative | None = None
+    angular_velocity: NotNegative | None = None
+    specific_force: NotNegative | None = None
+
+    @property
+    def forces(self) -> dict[str, Any]:
+        """What is stated of sensors and base rows, by key."""
+        return {name: x for name, x in vars(self).items() if x is not None and name not in STATED_FIELDS}
+
+    @property
+    def motion(self) -> dict[str, float]:
+        """What is stated of the motion, by key."""
+        return {name: x for name, x in vars(self).items() if x is not None and name in STATED_FIELDS}
 
 
 @dataclass(config=STRICT, frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ import torch
 from torchid import parameters
 from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.estimator import EstimatorConfig
-from torchid.config.sensors import ChoiceConfig, NoiseConfig
+from torchid.config.sensors import ChoiceConfig
 from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
@@ -61,7 +61,7 @@ class Scene:
     @property
     def noise(self) -> SensorNoise:
         """Noise of the sensors, as stated; a guess where it is not."""
-        return SensorNoise(**stated_noise(self.config.sensors.noise))
+        return SensorNoise(**self.config.sensors.noise.forces)
 
     @property
     def terms(self) -> ExtraTerms:
@@ -143,7 +143,7 @@ class Scene:
             sensors = recorded_sensors(self.robot, self.contacts, here, self.noise)
         # without conditions: of the estimator, only the ridge and the rank tolerance matter
         fitter = self.fitter(self.builder(sensors), Conditions(names=self.robot.body_names))
-        return estimate_noise(logs, fitter, stated_noise(self.config.sensors.noise).keys())
+        return estimate_noise(logs, fitter, self.config.sensors.noise.forces.keys())
 
     def choose_ridge(
         self, parts: Sequence[Part], blocks: Sequence[Block], fitter: LogFitter, conditions: Conditions
@@ -184,16 +184,11 @@ def with_noise(scene: S, summary: NoiseSummary) -> S:
     config = scene.config
     keys = {one.group.partition(".")[0] for one in summary.groups}
     estimated = {name: x for name, x in vars(summary.noise).items() if name in keys}
-    noise = NoiseConfig(**estimated | stated_noise(config.sensors.noise))
+    noise = replace(config.sensors.noise, **estimated | config.sensors.noise.forces)
     stated = replace(scene, config=replace(config, sensors=replace(config.sensors, noise=noise)))
     if isinstance(stated, Experiment):
         return replace(stated, sensors=replace(stated.sensors, noise=summary.noise))
     return stated
-
-
-def stated_noise(noise: NoiseConfig) -> dict[str, Any]:
-    """The noise that settings state, by key."""
-    return {name: x for name, x in vars(noise).items() if x is not None}
 
 
 def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:

@@ -29,7 +29,7 @@ from torchid.problem.compression import FOLDS, block_spans
 from torchid.settings import NotNegative, Number
 from torchid.staging import atomic_file
 
-FORMAT = 1
+FORMAT = 2
 """Version of the format, a whole number that grows whenever a reader of an older version would be wrong."""
 
 _ACCEPTED = f"a whole {FACTORS} file, as torchid compress writes it"

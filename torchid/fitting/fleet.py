@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchid.errors import ConfigError, LogError, excerpt
-from torchid.fitting.experiment import Experiment, stated_noise, with_noise
+from torchid.fitting.experiment import Experiment, with_noise
 from torchid.fitting.factor_files import FactorFile, read_factors
 from torchid.fitting.noise import GroupNoise, NoiseSummary
 from torchid.fitting.row_model import RowModel, require_same_noise, require_same_rows
@@ -84,7 +84,7 @@ def _require_different_logs(paths: Sequence[Path], files: Sequence[FactorFile]) 
 def _require_stated_noise(experiment: Experiment, model: RowModel, path: Path) -> None:
     """Refuse an experiment that states other noise than factors were weighed with."""
     used, stated = model.noise, std_by_group(experiment.noise)
-    for key in stated_noise(experiment.config.sensors.noise):
+    for key in experiment.config.sensors.noise.forces:
         groups = [name for name in used if name.partition(".")[0] == key]
         if any(abs(used[name] - stated[name]) > 1e-9 * used[name] for name in groups):
             own, theirs = (", ".join(f"{x[name]:g}" for name in groups) for x in (stated, used))

@@ -24,7 +24,8 @@ _Whole = Annotated[int, Field(ge=0, le=2**53)]
 class PackedPart:
     """A part but for the numbers of its triangles, as documents of JSON have it.
 
-    `state`: a digit for each contact; `triangles`: number of the support, rows, whether packed as a triangle.
+    `state`: a digit for each contact; `triangles`: number of the support, rows, whether packed as a triangle;
+    `surplus`: numbers of the supports.
     """
 
     state: str
@@ -33,6 +34,7 @@ class PackedPart:
     independent_rows: NotNegative
     gated: list[_Whole]
     triangles: list[tuple[_Whole, _Whole, bool]]
+    surplus: list[_Whole]
 
 
 class PartPacker:
@@ -61,7 +63,9 @@ class PartPacker:
                 rows = block.cpu().numpy()
                 packed = len(rows) == rows.shape[1] and not np.tril(rows, -1).any()
                 self._values.append(rows[np.triu_indices(len(rows))] if packed else rows.ravel())
-                triangles.append((self._supports.setdefault(support, len(self._supports)), len(rows), packed))
+                triangles.append((self._number(support), len(rows), packed))
+            for x in part.factor.surplus.values():
+                self._values.append(x.cpu().numpy()[np.triu_indices(len(x))])
             out.append(
                 {
                     "state": "".join("01"[active] for active in part.state),
@@ -70,9 +74,13 @@ class PartPacker:
                     "independent_rows": part.factor.independent_rows,
                     "gated": sorted(part.gated),
                     "triangles": triangles,
+                    "surplus": [self._number(support) for support in part.factor.surplus],
                 }
             )
         return out
+
+    def _number(self, support: tuple[int, ...]) -> int:
+        return self._supports.setdefault(support, len(self._supports))
 
 
 class PartReader:
@@ -108,7 +116,7 @@ class PartReader:
 
     def read(self, source: str, one: PackedPart, unloaded: bool = False) -> Part:
         """The next part, of a log of this name."""
-        self._triangles += 1 + len(one.triangles)
+        self._triangles += 1 + len(one.triangles) + len(one.surplus)
         if self._triangles > self._most:
             raise ValueError(f"more than {self._most} triangles")
         if len(one.state) != self._contacts or set(one.state) - {"0", "1"}:
@@ -121,9 +129,14 @@ class PartReader:
         for number, rows, packed in one.triangles:
             support = self._supports[number]
             triangles[support] = self._stream.triangle(len(support) + 1, rows, packed)
-        if len(triangles) != len(one.triangles):
+        surplus = {}
+        for number in one.surplus:
+            width = len(self._supports[number]) + 1
+            half = self._stream.triangle(width, width, packed=True)
+            surplus[self._supports[number]] = half + half.triu(1).T
+        if len(triangles) != len(one.triangles) or len(surplus) != len(one.surplus):
             raise ValueError("the same columns twice")
-        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles)
+        factor = TriangularFactor.from_blocks(self._columns, one.rows, one.independent_rows, triangles, surplus)
         state = tuple(digit == "1" for digit in one.state)
         return Part(source, state, factor, one.samples, unloaded=unloaded, gated=set(one.gated))
 

@@ -19,7 +19,14 @@ from torchid.fitting.fit import Fit, LogFitter, Solve, with_block_errors
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress_parts
 from torchid.problem.chunks import ProgressCallback
-from torchid.problem.compression import Part, compress_in_blocks, merge_factors
+from torchid.problem.compression import (
+    Part,
+    add_surplus,
+    compress_in_blocks,
+    cut_into_blocks,
+    merge_factors,
+    surplus_by_part,
+)
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
 """Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
@@ -166,13 +173,16 @@ def _passes(
 ) -> _Passes:
     """Passes over some logs from a fit and the scale of its residuals on, the first of them with the number given."""
     builder, sources, converged, done = fitter.builder, {samples.source for samples in logs}, False, 0
+    surplus = surplus_by_part(cut_into_blocks(logs, builder), builder)
     while done < loss.passes and not converged:
         current = _loss_of_pass(loss, first_pass + done)
         by_log = {source: fit.columns(builder, source) for source in sources}
         reweighting = Reweighting(current, by_log, max(scale, _TINY))
         before, done = fit, done + 1
-        fit = fitter.fit(compress_in_blocks(logs, builder, progress=progress, weight_rows=reweighting), solve)
+        parts = compress_in_blocks(logs, builder, progress=progress, weight_rows=reweighting)
         reweighting.gather()
+        add_surplus(parts, surplus, reweighting.mean_weight)
+        fit = fitter.fit(parts, solve)
         settled = current == loss and _settled(fit, before, scale, reweighting.median_scale)
         converged = ranks.as_first(settled, "convergence")
         scale = reweighting.median_scale

@@ -159,12 +159,14 @@ def _by_block(
         for support, block in part.factor.blocks.items():
             rows, at = np.ascontiguousarray(block.cpu().double().numpy()), list(support)  # the same bits from a cache
             residual = rows[:, -1] - rows[:, :-1] @ columns.values[at]
-            gradient = rows[:, :-1].T @ residual
-            gradients["bodies"][number] += columns.by_phi[at].T @ gradient
-            for log, by_extras in columns.by_extras.items():
-                gradients[_name(log)][number] += by_extras[at].T @ gradient
+            columns.add_gradient(gradients, number, at, rows[:, :-1].T @ residual)
             projected = rows[:, :-1] @ along[at]
             shares[number] += projected.T @ projected
+        for support, tensor in part.factor.surplus.items():
+            surplus, at = np.ascontiguousarray(tensor.cpu().double().numpy()), list(support)
+            off = surplus[:-1, -1] - surplus[:-1, :-1] @ columns.values[at]
+            columns.add_gradient(gradients, number, at, -off)
+            shares[number] -= along[at].T @ surplus[:-1, :-1] @ along[at]
     return gradients, shares
 
 
@@ -190,6 +192,12 @@ class _Columns:
     values: Array
     by_phi: Array
     by_extras: dict[str, Array]
+
+    def add_gradient(self, gradients: Mapping[str, Array], number: int, at: Sequence[int], gradient: Array) -> None:
+        """Add the gradient by some columns to that of a block."""
+        gradients["bodies"][number] += self.by_phi[at].T @ gradient
+        for log, by_extras in self.by_extras.items():
+            gradients[_name(log)][number] += by_extras[at].T @ gradient
 
     @classmethod
     def of(cls, builder: RowBuilder, assembly: Assembly, source: str, phi: Array) -> _Columns:

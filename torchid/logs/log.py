@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, UnknownNameError, about_file, excerpt, is_plain
 from torchid.guards import MAX_LETTERS
 from torchid.parameters import WRENCH_COMPONENTS
+
+if TYPE_CHECKING:
+    from torchid.logs.signal_noise import SignalNoise
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -127,6 +130,8 @@ class Log:
             sample. No part of a file.
         noise_bandwidth_hz: [Hz], up to where `preprocess` has left the sensors' noise white; None if it did not filter.
             No part of a file.
+        motion_noise: noise of the recorded motion, as `preprocess` found it; None if there was nothing to preprocess
+            and none. No part of a file.
 
     Raises:
         LogError: a field has a wrong shape or type, or both contact wrenches are given.
@@ -161,6 +166,7 @@ class Log:
     contact_share: FloatArray | None = None
     contact_unloaded: FloatArray | None = None
     noise_bandwidth_hz: float | None = None
+    motion_noise: SignalNoise | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and types."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import takewhile
 from typing import Any
 
@@ -23,6 +23,7 @@ from torchid.logs.log import (
 )
 from torchid.logs.quaternion import angular_acceleration_base, angular_velocity_base, make_sign_continuous
 from torchid.logs.rate_noise import warn_of_noisy_accelerations
+from torchid.logs.signal_noise import signal_noise
 from torchid.logs.timeline import JITTER, Timeline, lay_out_timeline, nearest_known
 
 #: Quantities of which each is the derivative of the one before. The first angular one would be the orientation.
@@ -38,7 +39,12 @@ _ANGULAR = DERIVATIVE_CHAINS[2]
 _MIN_QUATERNION_NORM = 0.5
 
 
-def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float | None = None) -> Log:
+def preprocess(
+    log: Log,
+    cutoff_hz: float | None = None,
+    sample_rate_hz: float | None = None,
+    motion_noise: Mapping[str, float] | None = None,
+) -> Log:
     """Fill in velocities and accelerations, after a zero-phase low-pass filter and before resampling, both optional.
 
     Derivatives that the log gives are used. A missing one is that of the nearest quantity before it that the log
@@ -56,15 +62,19 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     In a filtered log a contact is active from 1/cutoff_hz before its recorded start until 1/cutoff_hz after its end, as
     the filter spreads its force over that time: an ignored force would bias the fit, a projected force of 0 would not.
     Readings of contact sensors without contact, their offsets, are kept as recorded (`contact_unloaded`). The sign of
-    the joint velocities, which dry friction goes with, is filtered as its torque is (`joint_direction`).
+    the joint velocities, which dry friction goes with, is filtered as its torque is (`joint_direction`). The noise of
+    the recorded motion, which makes parameters too small, comes with the log (`motion_noise`).
 
     Args:
         log: the log.
         cutoff_hz: cutoff [Hz] of the filter, below half the median sample rate; None for no filter.
         sample_rate_hz: sample rate [Hz] of the result, at most ten times the median one; None for the log's own.
+        motion_noise: standard deviations of the recorded motion by the keys of `STATED_FIELDS`, as far as they are
+            known; others are estimated, see `signal_noise`.
 
     Returns:
-        The preprocessed log, which shares the memory of unchanged fields: `log` itself where nothing has to be done.
+        The preprocessed log, which shares the memory of unchanged fields: `log` itself where nothing has to be done and
+        its motion shows no noise.
 
     Raises:
         InputError: `cutoff_hz` or `sample_rate_hz` does not suit the log.
@@ -76,15 +86,16 @@ def preprocess(log: Log, cutoff_hz: float | None = None, sample_rate_hz: float |
     """
     with about_file(log.source):
         timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
+    noise = log.motion_noise or signal_noise(log, timeline, motion_noise)
     if timeline is None:
-        return log
+        return replace(log, motion_noise=noise) if noise.found else log
     coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, timeline)}
     for name, found in coverage.items():
         warn_of_gaps(log, name, found)
     out = move_to_timeline(log, timeline, coverage)
     with about_file(log.source):
-        warn_of_noisy_accelerations(log, out, timeline)
-    return out
+        warn_of_noisy_accelerations(log, out, timeline, noise)
+    return replace(out, motion_noise=noise)
 
 
 def make_timeline(
@@ -112,7 +123,7 @@ def move_to_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Covera
         coverage: of fields that must have no gap.
     """
     with about_file(log.source):
-        return dataclasses.replace(log, **_fields_on_timeline(log, timeline, coverage))
+        return replace(log, **_fields_on_timeline(log, timeline, coverage))
 
 
 def _fields_on_timeline(log: Log, timeline: Timeline, coverage: Mapping[str, Coverage]) -> dict[str, Any]:

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import comb
 
 import numpy as np
 
 from torchid.errors import join_names, warn_about_file
 from torchid.logs.log import FloatArray, Log, column_labels
-from torchid.logs.timeline import JITTER, Timeline, spline_derivatives
+from torchid.logs.signal_noise import SignalNoise
+from torchid.logs.timeline import Timeline
 
-_ORDER = 5  # of the differences that show noise: smooth motion vanishes in them
-_MUCH = 0.1  # share of an acceleration's variance: parameters that rest on it are as much too small
+_MUCH = 0.1  # share of an acceleration's variance
 _LITTLE = 0.03  # share at the cutoff that is proposed
-_FEWEST, _MOST = 100, 5000  # samples
-_FREQUENCIES = 2000
-_NORMAL = 0.6745  # median of |x| of standard normal x
 _NAMED = 4
 #: Accelerations, and what each is derived from, with the number of derivatives.
 _DERIVED = {
@@ -27,18 +23,19 @@ _DERIVED = {
 _AXES = ("x", "y", "z")
 
 
-def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline) -> None:
-    """Name accelerations that are noise to a large part, which biases what depends on them towards 0.
+def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline, noise: SignalNoise) -> None:
+    """Name accelerations that are noise to a large part, of which a fit learns little.
 
     Args:
         log: as recorded.
         preprocessed: the same with its accelerations.
         timeline: that was used.
+        noise: of the log.
 
     Warns:
         TorchidWarning: one, with a lower cutoff that would do.
     """
-    noisy = sorted(_noise_shares(log, preprocessed, timeline), key=lambda one: -one[1])
+    noisy = sorted(_noise_shares(log, preprocessed, noise), key=lambda one: -one[1])
     if not noisy:
         return
     names = [f"{name} ({100.0 * share:.0f} %)" for name, share, _ in noisy]
@@ -49,7 +46,7 @@ def warn_of_noisy_accelerations(log: Log, preprocessed: Log, timeline: Timeline)
     else:
         lower = cutoff * float(np.median([_slower(share, order) for _, share, order in noisy]))  # some hardly move
         advice = f"a cutoff of {lower:.2g} Hz, if the motion is that slow, or faster motion"
-    warn_about_file(f"{found}: parameters that rest on them come out too small; accepted: {advice}")
+    warn_about_file(f"{found}: parameters that rest on them are uncertain; accepted: {advice}")
 
 
 def _slower(share: float, order: int) -> float:
@@ -58,39 +55,17 @@ def _slower(share: float, order: int) -> float:
     return float(ratio ** (1.0 / (2 * order + 1)))
 
 
-def _noise_shares(log: Log, preprocessed: Log, timeline: Timeline) -> Iterator[tuple[str, float, int]]:
+def _noise_shares(log: Log, preprocessed: Log, noise: SignalNoise) -> Iterator[tuple[str, float, int]]:
     """Channels of accelerations with much noise: its share of the variance, and the number of derivatives."""
-    if len(log) < _FEWEST:
-        return
-    step = float(np.median(np.diff(log.time)))
     for name, sources in _DERIVED.items():
         derived: FloatArray | None = getattr(preprocessed, name)
         if getattr(log, name) is not None or derived is None:
             continue
         source, order = next(((field, order) for field, order in sources if getattr(log, field) is not None), ("", 0))
-        if not source:
+        if source not in noise.std:
             continue
-        gain = _gain(order, step, timeline)
-        variance = np.square(_noise(log.time[:_MOST], getattr(log, source)[:_MOST])) * gain
+        variance = np.square(noise.std[source]) * noise.derivatives[order, order]
         motion = np.array([channel.var() for channel in derived.T])  # one by one: temporaries stay small
         share = np.divide(variance, motion, out=np.zeros_like(variance), where=variance > 0.0)
         labels = column_labels(source, log.names) or tuple(f"{source} {axis}" for axis in _AXES)
         yield from ((labels[column], min(float(share[column]), 1.0), order) for column in np.flatnonzero(share > _MUCH))
-
-
-def _noise(time: FloatArray, values: FloatArray) -> FloatArray:
-    """Standard deviation of white noise in smooth channels (N, c), (c,), at stamps (N,) [s]."""
-    steps = np.diff(time)
-    if np.ptp(steps) > JITTER * float(np.median(steps)):  # differences between uneven steps are motion
-        values = spline_derivatives(time, values, np.linspace(time[0], time[-1], len(time)), (0,))[0]
-    differences = np.diff(values, n=_ORDER, axis=0) / np.sqrt(comb(2 * _ORDER, _ORDER))
-    off = np.abs(differences - np.median(differences, axis=0))
-    return np.asarray(np.minimum(np.median(off, axis=0) / _NORMAL, differences.std(axis=0)))
-
-
-def _gain(order: int, step: float, timeline: Timeline) -> float:
-    """Variance of a filtered derivative of some order of white noise of unit variance, recorded every so many s."""
-    hertz = np.linspace(0.0, 0.5 / step, _FREQUENCIES)
-    passed = np.ones_like(hertz) if timeline.low_pass is None else timeline.low_pass.gain(hertz * step)
-    power = 2.0 * step * (2.0 * np.pi * hertz) ** (2 * order) * np.square(passed)
-    return float(np.trapezoid(power, hertz))

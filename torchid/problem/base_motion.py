@@ -119,8 +119,13 @@ def _links_on_base(robot: Robot) -> list[str]:
     return [name for index in fixed for name in robot.bodies[index].links]
 
 
-def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
-    """Motion of the base from that of an IMU fixed to it: rigid-body kinematics with the lever arm."""
+def imu_pose(log: Log, robot: Robot) -> tuple[Rotation, Array]:
+    """Rotation of the IMU's frame into the base's, and its origin there, (3,) [m].
+
+    Raises:
+        LogError: an IMU that is not on the base.
+        UnknownNameError: a frame that the robot does not have.
+    """
     if log.imu_frame not in robot.links:
         raise UnknownNameError(log.source, "imu_frame", log.imu_frame, _links_on_base(robot))
     body, T_base_imu = robot.links[log.imu_frame]
@@ -129,10 +134,15 @@ def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
     if body != 0:
         found = f"'{log.imu_frame}', which moves with {robot.bodies[body].name}"
         raise LogError(log.source, "imu_frame", found, f"a frame on the base: {', '.join(_links_on_base(robot)[:8])}")
+    return Rotation.from_matrix(T_base_imu[:3, :3]), T_base_imu[:3, 3]
+
+
+def _from_imu(log: Log, robot: Robot, quat: Tensor | None) -> BaseMotion:
+    """Motion of the base from that of an IMU fixed to it: rigid-body kinematics with the lever arm."""
+    rotation, arm = imu_pose(log, robot)
     for name in _IMU_FIELDS:
         if getattr(log, name) is None:
             raise LogError(log.source, name, "missing", f"{name}, or a log passed through preprocess()")
-    rotation, arm = Rotation.from_matrix(T_base_imu[:3, :3]), T_base_imu[:3, 3]
     force, omega, alpha = (rotation.apply(getattr(log, name)) for name in _IMU_FIELDS)
     at_origin: Array = force - np.cross(alpha, arm) - np.cross(omega, np.cross(omega, arm))
     return BaseMotion(quat, *map(torch.from_numpy, (at_origin, omega, alpha)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -18,6 +18,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import LinearProblem, TriangularFactor, parameter_scale
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.problem.surplus import Surplus, compress_surplus, corrected_triangle
 from torchid.problem.unloaded_offsets import unloaded_offset_equations
 from torchid.robot import Robot
 
@@ -79,8 +80,11 @@ def compress_by_state(
     progress: ProgressCallback | None = None,
 ) -> dict[ContactState, TriangularFactor]:
     """As `compress`, but with a factor for every contact state in the logs."""
-    parts = map_chunks(logs, builder, partial(_compress_chunks, builder, by_log=False), chunk, threads, progress)
-    return {part.state: part.factor for part in _merge_parts(parts)}
+    parts = _merge_parts(
+        map_chunks(logs, builder, partial(_compress_chunks, builder, by_log=False), chunk, threads, progress)
+    )
+    add_surplus(parts, compress_surplus(logs, builder, lambda _, state: _key(None, state)))
+    return {part.state: part.factor for part in parts}
 
 
 def compress_parts(
@@ -94,10 +98,12 @@ def compress_parts(
     """As `compress`, but with a factor for every contact state in every log and fold, in the order of the logs.
 
     Logs of one source count as one. Unknown offsets of contact sensors have further parts, of readings in the air.
-    `weight_rows` weights all other rows before they are added.
+    `weight_rows` weights all other rows before they are added; their factors then have no surplus, see `add_surplus`.
     """
     reduce = partial(_compress_chunks, builder, by_log=True, weight_rows=weight_rows)
     parts = _merge_parts(map_chunks(logs, builder, reduce, chunk, threads, progress))
+    if weight_rows is None:
+        add_surplus(parts, surplus_by_part(logs, builder))
     order = list(dict.fromkeys(samples.source for samples in logs))
     return sorted(parts, key=lambda part: order.index(part.source))
 
@@ -116,14 +122,14 @@ def compress_in_blocks(
         progress: called with the number of samples done.
         weight_rows: as in `compress_parts`.
     """
-    pieces = [replace(piece, unloaded=None) for piece in _cut_into_blocks(logs, builder)]
+    pieces = [replace(piece, unloaded=None) for piece in cut_into_blocks(logs, builder)]
     parts = compress_parts(pieces, builder, progress=progress, weight_rows=weight_rows)
     if not any(extra.what == "offset" and extra.contact is not None for extra in builder.extras):
         return parts
     return [*parts, *compress_unloaded(logs, builder)]
 
 
-def _cut_into_blocks(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
+def cut_into_blocks(logs: Sequence[Samples], builder: RowBuilder) -> list[Samples]:
     """The logs in blocks of about equal length, some `BLOCKS` in all; fewer where samples or memory are short."""
     independent = sum(len(log) / log.oversampling for log in logs)
     states = len({(log.source, state) for log in logs for state, _ in chunks_by_state(log)})
@@ -152,8 +158,7 @@ def _compress_chunks(
     workspace = Workspace()
 
     def part(samples: Samples, state: ContactState, unloaded: bool) -> Part:
-        own = samples.source, state, samples.fold, samples.block, unloaded
-        key = own if by_log else ("", state, 0, 0, False)
+        key = _key(samples, state, unloaded) if by_log else _key(None, state)
         source, at, fold, block, in_the_air = key
         return parts.setdefault(key, Part(source, at, TriangularFactor(builder.width), 0, fold, block, in_the_air))
 
@@ -173,6 +178,30 @@ def _compress_chunks(
             else:
                 in_the_air.factor.add(*channel.row(builder), samples.oversampling)
     return list(parts.values())
+
+
+def surplus_by_part(logs: Sequence[Samples], builder: RowBuilder) -> dict[_Key, Surplus]:
+    """The surplus of each part of some logs, to `add_surplus`, from the noise of their motion.
+
+    Args:
+        logs: as `compress_parts` takes them.
+        builder: of their rows.
+    """
+    return compress_surplus(logs, builder, _key)
+
+
+def _key(samples: Samples | None, state: ContactState, unloaded: bool = False) -> _Key:
+    """Which rows a part has: those of a piece of a log in a contact state, or all of a state without samples."""
+    return (
+        ("", state, 0, 0, False) if samples is None else (samples.source, state, samples.fold, samples.block, unloaded)
+    )
+
+
+def add_surplus(parts: Sequence[Part], surplus: Mapping[_Key, Surplus], weight: float = 1.0) -> None:
+    """Add its surplus to the factor of each part, times the mean weight of its rows."""
+    for part in parts:
+        of_part = surplus.get((part.source, part.state, part.fold, part.block, part.unloaded), {})
+        part.factor.add_surplus(of_part, weight)
 
 
 def compress_unloaded(logs: Sequence[Samples], builder: RowBuilder) -> list[Part]:
@@ -214,7 +243,8 @@ def linear_problem(factor: TriangularFactor, builder: RowBuilder, robot: Robot, 
     """
     if builder.extras:
         raise ValueError("builder: found extra terms; accepted: one without, or torchid.assemble")
-    return problem_from_triangle(factor.triangle().numpy(), factor.rows, factor.oversampling, builder, robot, friction)
+    R, _ = corrected_triangle(factor)
+    return problem_from_triangle(R, factor.rows, factor.oversampling, builder, robot, friction)
 
 
 def problem_from_triangle(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from torchid.parameters import Array
 from torchid.problem.chunks import one_thread
-from torchid.problem.compression import Part, linear_problem, merge_factors, problem_from_triangle
+from torchid.problem.compression import Part, merge_factors, problem_from_triangle
 from torchid.problem.extras import Extra
 from torchid.problem.linear import LinearProblem
 from torchid.problem.rows import RowBuilder
+from torchid.problem.surplus import NoiseShares, corrected_triangle
 from torchid.robot import Robot
 from torchid.rounding import RANK_TOLERANCE, UNOBSERVABLE_SHARE, is_significant
 
@@ -51,12 +52,14 @@ class Elimination:
 class Assembly:
     """The problem in the bodies' parameters, and the eliminations: log by log, then of the unknowns of all logs.
 
-    `if_known`: the same problem if all eliminated unknowns were known to be 0.
+    `if_known`: the same problem if all eliminated unknowns were known to be 0. `noise`: what noise of the motion had
+    added to it.
     """
 
     problem: LinearProblem
     eliminations: tuple[Elimination, ...]
     if_known: LinearProblem
+    noise: NoiseShares = field(default_factory=NoiseShares)
 
     def extras_at(self, phi: Array) -> list[Array]:
         """Values of the eliminated unknowns, for each elimination, that fit the rows best at parameters (12 L,)."""
@@ -79,28 +82,27 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     Orthogonal projection eliminates first the unknowns of each log, then those of all logs. It changes neither the
     least-squares solution nor the noise of the rows.
     """
-    sources = dict.fromkeys(part.source for part in parts)
-    factors = {source: [part.factor for part in parts if part.source == source] for source in sources}
     everything = merge_factors((part.factor for part in parts), builder)
+    of_all_logs, noise = corrected_triangle(everything)
     if not builder.extras:
-        problem = linear_problem(everything, builder, robot, friction)
-        return Assembly(problem, (), problem)
+        problem = problem_from_triangle(of_all_logs, everything.rows, everything.oversampling, builder, robot, friction)
+        return Assembly(problem, (), problem, noise)
     count = builder.columns.count
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
-    eliminations, remaining = [], []
-    for source, own in factors.items():
-        R = merge_factors(own, builder).triangle().numpy()
-        rest = np.delete(R, [count + number for number in per_log], axis=1)
-        if per_log:
-            extras = tuple(builder.extras[number] for number in per_log)
+    eliminations, rows = [], of_all_logs
+    if per_log:
+        extras, remaining = tuple(builder.extras[number] for number in per_log), []
+        for source in dict.fromkeys(part.source for part in parts):
+            R, _ = corrected_triangle(merge_factors((p.factor for p in parts if p.source == source), builder))
+            rest = np.delete(R, [count + number for number in per_log], axis=1)
             columns = R[:, [count + number for number in per_log]]
             elimination, rest = _eliminate(source, extras, columns, rest, builder, np.linalg.norm(columns, axis=0))
             eliminations.append(elimination)
-        remaining.append(rest)
-    rows: Array = np.asarray(np.linalg.qr(np.concatenate(remaining), mode="r"))
+            remaining.append(rest)
+        rows = np.asarray(np.linalg.qr(np.concatenate(remaining), mode="r"))
     if of_all:
         extras = tuple(builder.extras[number] for number in of_all)
-        sizes = np.linalg.norm(everything.triangle().numpy()[:, [count + number for number in of_all]], axis=0)
+        sizes = np.linalg.norm(of_all_logs[:, [count + number for number in of_all]], axis=0)
         rest = np.delete(rows, np.s_[count:-1], axis=1)
         elimination, rows = _eliminate("", extras, rows[:, count:-1], rest, builder, sizes)
         eliminations.append(elimination)
@@ -108,10 +110,9 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     spent = everything.oversampling * sum(elimination.inverse.shape[1] for elimination in eliminations)
     rows_left = max(everything.rows - round(spent), 1)
     problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction)
-    known = np.delete(everything.triangle().numpy(), np.s_[count:-1], axis=1)
-    known = np.asarray(np.linalg.qr(known, mode="r"))
+    known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
     if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction)
-    return Assembly(problem, tuple(eliminations), if_known)
+    return Assembly(problem, tuple(eliminations), if_known, noise)
 
 
 def _eliminate(

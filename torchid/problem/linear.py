@@ -106,6 +106,12 @@ class TriangularFactor:
     Rows that are zero outside a few columns are factorized in a block with just these columns. Memory grows with the
     square of the columns, not with the rows. Householder factorizations keep the full accuracy of the rows (a Gram
     matrix would square the condition number). Factors of parts of the data merge into the factor of all of it.
+
+    Attributes:
+        columns: of the rows, without the right-hand side.
+        rows, independent_rows: that were added.
+        surplus: what noise of the motion adds to X^T X on average, by the columns of the rows that have it,
+            (len(support) + 1, len(support) + 1); an estimate, see `torchid.problem.surplus`.
     """
 
     def __init__(self, columns: int) -> None:
@@ -114,14 +120,21 @@ class TriangularFactor:
         self.rows = 0
         self.independent_rows = 0.0
         self._blocks: dict[tuple[int, ...], Tensor] = {}
+        self.surplus: dict[tuple[int, ...], Tensor] = {}
 
     @classmethod
     def from_blocks(
-        cls, columns: int, rows: int, independent_rows: float, blocks: Mapping[tuple[int, ...], Tensor]
+        cls,
+        columns: int,
+        rows: int,
+        independent_rows: float,
+        blocks: Mapping[tuple[int, ...], Tensor],
+        surplus: Mapping[tuple[int, ...], Tensor] | None = None,
     ) -> TriangularFactor:
-        """The factor that has these `blocks`, of so many rows."""
+        """The factor that has these `blocks`, of so many rows, and this surplus."""
         out = cls(columns)
         out.rows, out.independent_rows, out._blocks = rows, independent_rows, dict(blocks)
+        out.surplus = dict(surplus or {})
         return out
 
     @property
@@ -131,13 +144,13 @@ class TriangularFactor:
 
     def __getstate__(self) -> dict[str, object]:
         """What another process gets: on the CPU, as it may have another device."""
-        blocks = {support: block.cpu().numpy() for support, block in self._blocks.items()}
-        return vars(self) | {"_blocks": blocks}
+        tensors = {"_blocks": self._blocks, "surplus": self.surplus}
+        return vars(self) | {name: {at: x.cpu().numpy() for at, x in by.items()} for name, by in tensors.items()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take over what another process sent."""
-        blocks = {support: torch.from_numpy(block) for support, block in state["_blocks"].items()}
-        vars(self).update(state | {"_blocks": blocks})
+        arrays = {name: {at: torch.from_numpy(x) for at, x in state[name].items()} for name in ("_blocks", "surplus")}
+        vars(self).update(state | arrays)
 
     @property
     def oversampling(self) -> float:
@@ -190,11 +203,19 @@ class TriangularFactor:
         self.independent_rows += other.independent_rows
         for support, block in other._blocks.items():
             self._absorb(support, block)
+        self.add_surplus(other.surplus)
+
+    def add_surplus(self, surplus: Mapping[tuple[int, ...], Tensor], weight: float = 1.0) -> None:
+        """Add to the surplus, by columns, times the weight of rows."""
+        for support, x in surplus.items():
+            before = self.surplus.get(support)
+            self.surplus[support] = weight * x if before is None else before + weight * x
 
     def scaled(self, factor: float) -> TriangularFactor:
         """The factor of the same rows times a number."""
         blocks = {support: factor * block for support, block in self._blocks.items()}
-        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks)
+        surplus = {support: factor**2 * x for support, x in self.surplus.items()}
+        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, surplus)
 
     def compact(self) -> TriangularFactor:
         """The factor on the CPU, as one triangle in all columns if that has fewer numbers than its blocks."""
@@ -202,9 +223,12 @@ class TriangularFactor:
         numbers = sum(rows * width - (rows * (rows - 1) // 2 if rows == width else 0) for rows, width in sizes)
         if numbers <= (self.columns + 1) * (self.columns + 2) // 2:
             blocks = {support: block.to("cpu", torch.float64) for support, block in self._blocks.items()}
+            surplus = {support: x.to("cpu", torch.float64) for support, x in self.surplus.items()}
         else:
-            blocks = {tuple(range(self.columns)): self.triangle().triu()}
-        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks)
+            every = tuple(range(self.columns))
+            blocks = {every: self.triangle().triu()}
+            surplus = {every: self.whole_surplus()} if self.surplus else {}
+        return TriangularFactor.from_blocks(self.columns, self.rows, self.independent_rows, blocks, surplus)
 
     def triangle(self) -> Tensor:
         """Upper triangular R, (columns + 1, columns + 1), float64 on the CPU."""
@@ -215,6 +239,14 @@ class TriangularFactor:
             wide[:, [*support, self.columns]] = block.to("cpu", torch.float64)
             scattered.append(wide)
         return torch.linalg.qr(torch.cat(scattered), mode="r").R
+
+    def whole_surplus(self) -> Tensor:
+        """The surplus of X^T X, (columns + 1, columns + 1), float64 on the CPU."""
+        total = torch.zeros(self.columns + 1, self.columns + 1, dtype=torch.float64)
+        for support, x in self.surplus.items():
+            at = torch.tensor([*support, self.columns])
+            total[at[:, None], at] += x.to("cpu", torch.float64)
+        return total
 
     @torch.no_grad()
     def _absorb(self, support: tuple[int, ...], rows: Tensor) -> None:

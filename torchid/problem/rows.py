@@ -158,13 +158,17 @@ class RowBuilder(nn.Module):
         Yields:
             (columns, stacked): (len(columns) + 1 + M, len(columns) + 1), columns contiguous.
         """
+        return ((rows.block.support, rows.stacked.T) for rows, _ in self.blocks(samples, state, workspace))
+
+    def blocks(
+        self, samples: Samples, state: ContactState, workspace: Workspace | None = None
+    ) -> Iterator[tuple[BlockRows, Tensor | slice]]:
+        """The same with the samples that each block is of, in order."""
         workspace, dynamics = workspace or Workspace(), self.dynamics(samples, workspace)
         layout = self._layouts.layout(state, dynamics.recorded_normals)
-        for _, _, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
-            for rows in blocks:
-                yield rows.block.support, rows.stacked.T
-        for _, rows in self._uncoupled_rows(samples, layout, dynamics, workspace):
-            yield rows.block.support, rows.stacked.T
+        for index, _, blocks in self._coupled_rows(samples, layout, dynamics, workspace):
+            yield from ((rows, index) for rows in blocks)
+        yield from ((rows, slice(None)) for _, rows in self._uncoupled_rows(samples, layout, dynamics, workspace))
 
     def rows_by_sample(self, samples: Samples, state: ContactState) -> tuple[Tensor, Tensor]:
         """The same rows sample by sample, for samples that share a contact state.

@@ -16,8 +16,9 @@ from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS
-from torchid.problem.base_motion import BaseMotion, base_motion
+from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose
 from torchid.problem.extras import recorded_components
+from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.regressor import Motion
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.robot import Robot
@@ -54,6 +55,7 @@ class Samples:
         fold: number of the cross-validation fold of these samples, see `split_into_folds`.
         block: number of the block in which they are compressed, see `compress_in_blocks`.
         has_force_normal: whether the log has forces along the ground's normal, which contacts may be read along.
+        motion_noise: noise of the motion, None without any.
     """
 
     source: str
@@ -75,6 +77,7 @@ class Samples:
     fold: int = 0
     block: int = 0
     has_force_normal: bool = False
+    motion_noise: MotionNoise | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -151,6 +154,18 @@ class Samples:
         )
 
 
+def concatenate(pieces: Sequence[Samples]) -> Samples:
+    """Pieces of one log as one, with whatever else of the first."""
+    if len(pieces) == 1:
+        return pieces[0]
+
+    def joined(parts: Sequence[Any]) -> dict[str, Any]:
+        tensors = [name for name, x in vars(parts[0]).items() if isinstance(x, Tensor)]
+        return {name: torch.cat([getattr(part, name) for part in parts]) for name in tensors}
+
+    return replace(pieces[0], base=BaseMotion(**joined([piece.base for piece in pieces])), **joined(pieces))
+
+
 def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: SensorSet | None = None) -> Samples:
     """Order a preprocessed log by the robot's joints and the contacts, and check it.
 
@@ -174,6 +189,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
     normals = _contact_normals(log, robot, contacts, base, chosen, active)
     wrench = _wrenches(log, contacts, chosen)
     unloaded = unloaded_readings(log) if contacts else None
+    imu = imu_pose(log, robot) if log.imu_frame and not robot.fixed_base else None
     samples = Samples(
         log.source,
         torch.from_numpy(log.time),
@@ -191,6 +207,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         None if unloaded is None else torch.from_numpy(_unloaded(_columns(unloaded, chosen), contacts)),
         None if log.joint_direction is None else torch.from_numpy(_columns(log.joint_direction, order)),
         has_force_normal=log.contact_force_normal is not None,
+        motion_noise=bind_motion_noise(log, order, robot.fixed_base, imu),
     )
     if required is not None:
         _require_limb_sensors(log, robot, required)

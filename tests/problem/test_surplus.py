@@ -1,0 +1,217 @@
+"""What noise of the motion adds to the normal equations, by samples with noise drawn again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from arms import ARMS
+from torch import Tensor
+
+import torchid
+from torchid.problem import RowBuilder, Samples, TriangularFactor, assemble, compress, compress_parts
+from torchid.problem.base_motion import BaseMotion
+from torchid.problem.compression import compress_in_blocks, merge_factors, split_into_folds
+from torchid.problem.motion_noise import MotionNoise
+from torchid.problem.surplus import LEAST_SIGNAL, NoiseShares, corrected_triangle
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorNoise, named_sensors
+
+NOISE = 0.05
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    path: Path = tmp_path_factory.mktemp("robot") / "arms.urdf"
+    path.write_text(ARMS)
+    return torchid.load_robot(path)
+
+
+@pytest.fixture(scope="module")
+def builder(robot: Robot) -> RowBuilder:
+    contacts = [Contact("b", "point"), Contact("a", "line")]
+    return RowBuilder(robot, contacts, named_sensors("joints", robot.n, 2, SensorNoise(0.1, 1.0, 0.1)))
+
+
+def unit_noise(size: float) -> MotionNoise:
+    generator = torch.Generator().manual_seed(3)
+    joints, base = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in ((2, 3, 3), (12, 12)))
+    return MotionNoise(size * joints, 0.3 * size * base, turns_force=True)
+
+
+def motion(robot: Robot, count: int, size: float = NOISE) -> Samples:
+    """Random motion in four contact states."""
+    generator = torch.Generator().manual_seed(1)
+
+    def draw(width: int) -> Tensor:
+        return torch.randn(count, width, generator=generator, dtype=torch.float64)
+
+    quat = torch.nn.functional.normalize(draw(4), dim=1)
+    active = torch.arange(count)[:, None] // torch.tensor([30, 50]) % 2 == 0
+    return Samples(
+        "random.npz",
+        torch.arange(count, dtype=torch.float64) / 100.0,
+        0.6 + 0.2 * draw(2),
+        draw(2),
+        draw(2),
+        BaseMotion(quat, 9.0 + draw(3), draw(3), draw(3)),
+        draw(2),
+        None,
+        False,
+        active,
+        motion_noise=unit_noise(size),
+    )
+
+
+def gram(factor: TriangularFactor) -> np.ndarray:
+    R = factor.triangle().numpy()
+    return np.asarray(R.T @ R)
+
+
+def draws(samples: Samples, count: int) -> Iterator[Samples]:
+    """The samples with Gaussian noise."""
+    noise, generator = samples.motion_noise, torch.Generator().manual_seed(2)
+    assert noise is not None
+    for _ in range(count):
+        z = torch.randn(len(samples), 18, generator=generator, dtype=torch.float64)
+        q, v, a = torch.einsum("jkl,bjl->kbj", noise.joints, z[:, :6].unflatten(1, (2, 3)))
+        base = z[:, 6:] @ noise.base.T
+        shaken = noise.shaken(samples, torch.zeros(len(samples), 1, dtype=torch.float64))
+        moved = shaken.base
+        if moved.specific_force is not None:
+            turn = torch.linalg.cross(base[:, :3], samples.base.specific_force)
+            moved = replace(
+                moved,
+                specific_force=samples.base.specific_force - turn + base[:, 9:],
+                angular_velocity=samples.base.angular_velocity + base[:, 3:6],
+                angular_acceleration=samples.base.angular_acceleration + base[:, 6:9],
+            )
+        yield replace(
+            samples,
+            joint_position=samples.joint_position + q,
+            joint_velocity=samples.joint_velocity + v,
+            joint_acceleration=samples.joint_acceleration + a,
+            base=moved,
+            motion_noise=None,
+        )
+
+
+def test_the_surplus_is_what_noise_adds_on_average(robot: Robot, builder: RowBuilder) -> None:
+    samples = motion(robot, 2000, 0.04)
+    found = compress([samples], builder)
+    plain = gram(compress([replace(samples, motion_noise=None)], builder))
+    assert np.array_equal(gram(found), plain), "the factor itself stays"
+    noisy = [gram(compress([one], builder)) for one in draws(samples, 40)]
+    size = np.sqrt(np.diag(plain)).clip(1e-9)
+    expected, scatter, surplus = (
+        x / np.outer(size, size)
+        for x in (np.mean(noisy, axis=0) - plain, np.std(noisy, axis=0), found.whole_surplus().numpy())
+    )
+    chance = np.linalg.norm(scatter) / np.sqrt(40)
+    assert np.linalg.norm(surplus - expected) < 2.0 * chance + 0.1 * np.linalg.norm(expected)
+    assert np.linalg.norm(expected) > 3.0 * chance, "or nothing is shown"
+
+
+def test_parts_and_blocks_have_their_own_and_together_that_of_all(robot: Robot, builder: RowBuilder) -> None:
+    samples = motion(robot, 2000)
+    whole = compress([samples], builder).whole_surplus()
+    parts = compress_in_blocks(split_into_folds([samples], builder), builder)
+    assert len({(part.fold, part.block) for part in parts}) > 10
+    assert all(part.factor.surplus for part in parts)
+    together = merge_factors((part.factor for part in parts), builder).whole_surplus()
+    assert torch.allclose(together, whole, rtol=0.0, atol=1e-12 * float(whole.norm()))
+    one = next(part for part in parts if part.fold == 2 and part.block == 1)
+    own = [x for x in split_into_folds([samples], builder) if x.fold == 2]
+    cut = [x[int(len(x) * k / 4) : int(len(x) * (k + 1) / 4)] for x in own for k in (1,)]
+    alone = {part.state: part.factor.whole_surplus() for part in compress_parts(cut, builder)}
+    assert torch.allclose(one.factor.whole_surplus(), alone[one.state], rtol=0.0, atol=1e-9)
+
+
+def test_contacts_of_different_rank_are_told_apart(robot: Robot, builder: RowBuilder) -> None:
+    samples = motion(robot, 400)
+    straight = samples.joint_position.clone()
+    straight[::3] = 0.0  # contacts on one axis
+    mixed = replace(samples, joint_position=straight, active=torch.ones_like(samples.active))
+    whole = compress([mixed], builder).whole_surplus()
+    alone = [compress([replace(mixed[k : k + 1])], builder).whole_surplus() for k in range(len(mixed))]
+    assert torch.allclose(whole, torch.stack(alone).sum(0), rtol=0.0, atol=1e-10 * float(whole.norm()))
+
+
+def test_long_logs_are_sampled(robot: Robot, builder: RowBuilder, monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = motion(robot, 6000)
+    whole = compress([samples], builder).whole_surplus().numpy()
+    monkeypatch.setattr("torchid.problem.surplus._SHAKEN", 1500)
+    sampled = compress([samples], builder).whole_surplus().numpy()
+    size = np.sqrt(np.diag(gram(compress([samples], builder))).clip(1e-9))
+    off, scaled = ((x / np.outer(size, size)) for x in (sampled - whole, whole))
+    assert 0.0 < np.linalg.norm(off) < 0.3 * np.linalg.norm(scaled)
+
+
+def test_a_corrected_factor_is_that_of_the_rows_without_their_surplus(robot: Robot, builder: RowBuilder) -> None:
+    factor = compress([motion(robot, 2000, 0.01)], builder)
+    R, noise = corrected_triangle(factor)
+    plain, surplus = gram(factor), factor.whole_surplus().numpy()
+    assert 0.0 < noise.largest < 1.0 - LEAST_SIGNAL
+    assert noise.lost == 0
+    corrected = R.T @ R
+    size = np.sqrt(np.diag(plain))[:-1].clip(1e-9)
+    off = (corrected - (plain - surplus)) / np.outer(np.append(size, size.max()), np.append(size, size.max()))
+    assert np.abs(off[:-1]).max() < 1e-9, "all but the square of the right-hand side"
+    best = np.linalg.lstsq(R[:-1, :-1], R[:-1, -1], rcond=1e-9)[0]
+    rows = factor.triangle().numpy()
+    residual = np.square(rows[:, -1] - rows[:, :-1] @ best).sum()
+    assert np.square(R[:, -1] - R[:, :-1] @ best).sum() == pytest.approx(residual, rel=1e-9), "of the rows as they are"
+
+
+def test_no_more_is_taken_off_than_leaves_a_third(robot: Robot, builder: RowBuilder) -> None:
+    factor = compress([motion(robot, 500, 1.0)], builder)
+    R, noise = corrected_triangle(factor)
+    assert 0 < noise.lost <= noise.combinations
+    assert noise.largest > 1.0 - LEAST_SIGNAL
+    assert "remain too small" in str(noise)
+    plain = factor.triangle().numpy()[:, :-1]
+    U, values, Vh = np.linalg.svd(plain, full_matrices=False)
+    kept = values > 1e-9 * values[0]
+    left = np.linalg.svd(R[:, :-1] @ (Vh[kept].T / values[kept]), compute_uv=False)
+    assert left.min() == pytest.approx(np.sqrt(LEAST_SIGNAL), rel=1e-6)
+
+
+def test_without_noise_nothing_changes(robot: Robot, builder: RowBuilder) -> None:
+    factor = compress([replace(motion(robot, 300), motion_noise=None)], builder)
+    assert not factor.surplus
+    R, noise = corrected_triangle(factor)
+    assert np.allclose(R, factor.triangle().numpy(), rtol=1e-12)
+    assert noise == NoiseShares()
+    little = compress([motion(robot, 300, 1e-9)], builder)
+    assert np.allclose(corrected_triangle(little)[0], little.triangle().numpy(), rtol=1e-12), "far below all errors"
+
+
+def test_scaled_merged_and_compact_factors_take_their_surplus_along(robot: Robot, builder: RowBuilder) -> None:
+    one, two = (compress([motion(robot, count)], builder) for count in (300, 700))
+    expected = 4.0 * one.whole_surplus() + two.whole_surplus()
+    both = one.scaled(2.0)
+    both.merge(two)
+    assert torch.allclose(both.whole_surplus(), expected, rtol=1e-12)
+    assert torch.allclose(both.compact().whole_surplus(), expected, rtol=1e-12)
+    assert not one.surplus.keys() - both.surplus.keys()
+
+
+def test_parameters_of_noisy_motion_are_no_more_too_small(robot: Robot) -> None:
+    bolted = torchid.load_robot(robot.path, fixed_base=True)
+    builder = RowBuilder(bolted, [], named_sensors("joints", bolted.n, 0, SensorNoise(0.1, 1.0, 0.1)))
+    moving = motion(bolted, 4000, 0.1)
+    noise = replace(unit_noise(0.1), base=torch.zeros(12, 12, dtype=torch.float64), turns_force=False)
+    clean = replace(moving, base=BaseMotion(), active=torch.zeros(4000, 0, dtype=torch.bool), motion_noise=noise)
+    forces = torchid.Regressor(bolted)(*clean.coordinates()) @ torch.from_numpy(bolted.nominal.flatten())
+    noisy, errors = next(draws(replace(clean, torque=forces), 1)), []
+    for known in (None, noise):
+        problem = assemble(compress_parts([replace(noisy, motion_noise=known)], builder), builder, bolted).problem
+        found = np.linalg.lstsq(problem.A, problem.b, rcond=1e-9)[0]
+        truth = problem.A @ bolted.nominal.flatten()
+        errors.append(np.linalg.norm(problem.A @ found - truth) / np.linalg.norm(truth))
+    assert errors[0] > 0.02
+    assert errors[1] < 0.3 * errors[0]

@@ -1,0 +1,130 @@
+"""White noise in the recorded motion: its size, and what a filter and derivatives make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import comb
+
+import numpy as np
+
+from torchid.logs.log import FloatArray, Log
+from torchid.logs.quaternion import make_sign_continuous
+from torchid.logs.timeline import JITTER, SPLINE_OVERLAP, Timeline, spline_derivatives
+
+STATED_FIELDS = {
+    "joint_position": ("joint_position",),
+    "joint_velocity": ("joint_velocity",),
+    "base_orientation": ("base_quat_xyzw",),
+    "angular_velocity": ("imu_angular_velocity", "base_angular_velocity_base"),
+    "specific_force": ("imu_specific_force",),
+}
+"""Fields of a log by the keys under which their noise can be stated [rad or m, rad/s or m/s, rad, rad/s, m/s^2]."""
+
+MOTION_FIELDS = (
+    "joint_position",
+    "joint_velocity",
+    "joint_acceleration",
+    "base_quat_xyzw",
+    "base_position_world",
+    "base_linear_velocity_world",
+    "base_linear_acceleration_world",
+    "base_angular_velocity_base",
+    "base_angular_acceleration_base",
+    "imu_specific_force",
+    "imu_angular_velocity",
+    "imu_angular_acceleration",
+)
+MOST_SAMPLES = 5000
+"""From the start of a log, that its noise is estimated from."""
+
+_FEWEST = 100
+_ORDERS = (7, 9)  # of the differences that show noise: smooth motion vanishes in them
+_WHITE = 0.7  # least ratio of the estimates by both orders: less, and what is there is motion or was filtered
+_NORMAL = 0.6745  # median of |x| of standard normal x
+_LEAST = 1e-12  # share of a channel's largest value: less is rounding
+_ORIENTATION = "base_quat_xyzw"
+
+
+@dataclass(frozen=True)
+class SignalNoise:
+    """White noise of the recorded motion of a log, in every sample.
+
+    Attributes:
+        std: standard deviation of each channel of the recorded fields, (c,), 0 where it shows none; of the orientation
+            along the base's axes, (3,) [rad].
+        derivatives: (3, 3), covariance of a preprocessed channel of unit noise [1] and its first two derivatives [1/s,
+            1/s^2] where they are derived from it.
+    """
+
+    std: Mapping[str, FloatArray]
+    derivatives: FloatArray = field(default_factory=lambda: np.diag([1.0, 0.0, 0.0]))
+
+    @property
+    def found(self) -> bool:
+        """Whether there is any."""
+        return any(bool(x.any()) for x in self.std.values())
+
+
+def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float] | None = None) -> SignalNoise:
+    """The noise of a log's motion, as stated, or as the high frequencies of its start show.
+
+    Args:
+        log: as recorded.
+        timeline: that it is preprocessed to; None where nothing is filtered, derived or resampled.
+        stated: standard deviations by `STATED_FIELDS`' keys, 0 for none.
+    """
+    known = {name: value for key, value in (stated or {}).items() for name in STATED_FIELDS[key]}
+    start, std = log.select(slice(0, MOST_SAMPLES)), dict[str, FloatArray]()
+    for name in MOTION_FIELDS:
+        values: FloatArray | None = getattr(start, name)
+        if values is None or not values.size:
+            continue
+        width = 3 if name == _ORIENTATION else values.shape[1]
+        std[name] = np.full(width, known[name]) if name in known else _estimate(name, start.time, values)
+    noise = SignalNoise(std)
+    if timeline is None or not noise.found:
+        return noise
+    return SignalNoise(std, _derivatives(float(np.median(np.diff(log.time))), timeline))
+
+
+def _estimate(name: str, time: FloatArray, values: FloatArray) -> FloatArray:
+    """Standard deviation of the noise in a field (N, c), by channel."""
+    if len(time) < _FEWEST or not np.isfinite(values).all():
+        return np.zeros(values.shape[1])
+    if name != _ORIENTATION:
+        return white_noise(time, values)
+    components = white_noise(time, make_sign_continuous(values))
+    return np.full(3, np.sqrt(4.0 / 3.0 * np.square(components).sum()))  # half angles, of three axes in four components
+
+
+def white_noise(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Standard deviation of white noise in smooth channels (N, c), (c,), at stamps (N,) [s]; 0 if what is there is not.
+
+    Differences of a high order leave of smooth motion less and less, of white noise always the same.
+    """
+    steps = np.diff(time)
+    if np.ptp(steps) > JITTER * float(np.median(steps)):  # differences between uneven steps are motion
+        values = spline_derivatives(time, values, np.linspace(time[0], time[-1], len(time)), (0,))[0]
+    lower, higher = (_left_by_differences(values, order) for order in _ORDERS)
+    is_noise = (higher > _WHITE * lower) & (higher > _LEAST * np.abs(values).max(axis=0))
+    return np.where(is_noise, lower, 0.0)
+
+
+def _left_by_differences(values: FloatArray, order: int) -> FloatArray:
+    differences = np.diff(values, n=order, axis=0) / np.sqrt(comb(2 * order, order))
+    off = np.abs(differences - np.median(differences, axis=0))
+    return np.asarray(np.minimum(np.median(off, axis=0) / _NORMAL, differences.std(axis=0)))
+
+
+def _derivatives(step: float, timeline: Timeline) -> FloatArray:
+    """Covariance of what becomes of unit white noise, recorded every so many seconds, and of its derivatives."""
+    around = SPLINE_OVERLAP
+    if timeline.low_pass is not None:
+        around += timeline.low_pass.settling + timeline.low_pass.padding
+    impulse = np.zeros((2 * around + 1, 1))
+    impulse[around] = 1.0
+    time = step * np.arange(len(impulse), dtype=np.float64)
+    passed = impulse if timeline.low_pass is None else timeline.low_pass(impulse)
+    responses = np.hstack(spline_derivatives(time, passed, time, (0, 1, 2)))
+    return np.asarray(responses.T @ responses)

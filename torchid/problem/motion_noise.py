@@ -1,0 +1,183 @@
+"""Noise in the motion of bound samples, and samples with more of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from torchid.logs import Log
+from torchid.logs.signal_noise import SignalNoise
+from torchid.parameters import Array
+
+if TYPE_CHECKING:
+    from torchid.problem.samples import Samples
+
+_JOINTS = ("joint_position", "joint_velocity", "joint_acceleration")
+_TURNING = ("base_quat_xyzw", "base_angular_velocity_base", "base_angular_acceleration_base")
+_LINEAR = ("base_position_world", "base_linear_velocity_world", "base_linear_acceleration_world")
+_GYRO, _ACCELEROMETER = ("imu_angular_velocity", "imu_angular_acceleration"), ("imu_specific_force",)
+_ANGLE, _OMEGA, _ALPHA, _FORCE = (slice(3 * k, 3 * k + 3) for k in range(4))  # of the base's 12 quantities
+
+# of splitmix64, as signed numbers: a hash of which every bit looks random
+_GOLDEN, _FIRST, _SECOND = -0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15
+_BITS = 48  # taken of each hash
+
+
+@dataclass(frozen=True)
+class MotionNoise:
+    """Noise of the motion of some samples of one log: Gaussian at each instant, whatever neighbours have.
+
+    Attributes:
+        joints: (n, 3, 3), square roots of the covariances of position, velocity and acceleration, S S^T.
+        base: (12, 12), that of the base's orientation (a small rotation in the base frame), angular velocity, angular
+            acceleration and specific force [rad, rad/s, rad/s^2, m/s^2].
+        turns_force: whether the specific force comes from an acceleration in the world, which is turned by the
+            orientation that was measured.
+    """
+
+    joints: Tensor
+    base: Tensor
+    turns_force: bool = False
+
+    def shaken(self, samples: Samples, size: Tensor) -> Samples:
+        """Samples with as much noise of the motion again, times a `size`, (B, 1).
+
+        Each of some independent sources has one standard deviation, to one side or the other, which is drawn by the
+        time stamp: samples get the same noise wherever they are.
+        """
+        count = self.joints.shape[0]
+        side = size * _sides(samples.time, 3 * count + len(self.base))
+        joints, base = self.joints.to(side), self.base.to(side)
+        q, v, a = torch.einsum("jkl,bjl->kbj", joints, side[:, : 3 * count].unflatten(1, (count, 3)))
+        off = side[:, 3 * count :] @ base.T
+        motion, angle = samples.base, off[:, _ANGLE]
+        force = motion.specific_force
+        if force is not None and self.turns_force:
+            turn = torch.linalg.cross(angle, force)
+            force = force - turn + 0.5 * torch.linalg.cross(angle, turn)
+        moved = replace(
+            motion,
+            quat_xyzw=None if motion.quat_xyzw is None else _turned(motion.quat_xyzw, angle),
+            specific_force=None if force is None else force + off[:, _FORCE],
+            angular_velocity=_plus(motion.angular_velocity, off[:, _OMEGA]),
+            angular_acceleration=_plus(motion.angular_acceleration, off[:, _ALPHA]),
+        )
+        return replace(
+            samples,
+            joint_position=samples.joint_position + q,
+            joint_velocity=samples.joint_velocity + v,
+            joint_acceleration=samples.joint_acceleration + a,
+            base=moved,
+        )
+
+
+def bind_motion_noise(
+    log: Log, joints: Sequence[int], fixed_base: bool, imu: tuple[Rotation, Array] | None
+) -> MotionNoise | None:
+    """The noise of a preprocessed log's motion, None if it has none.
+
+    Args:
+        log: the log.
+        joints: its joints' columns, in the robot's order.
+        fixed_base: whether the base is bolted down.
+        imu: rotation of the IMU's frame into the base's and its origin there, (3,) [m]; None without one.
+    """
+    noise = log.motion_noise
+    if noise is None or not noise.found:
+        return None
+    ordered = {name: std[joints] for name, std in noise.std.items() if name in _JOINTS}
+    of_joints = _chain(ordered, _JOINTS, noise.derivatives, len(joints))
+    base = np.zeros((12, 12))
+    turning = _chain(noise.std, _TURNING, noise.derivatives, 3)
+    if imu is not None:
+        turning[:, 1:] = turning[:, :, 1:] = 0.0
+        base = _of_imu(noise, *imu)
+    for axis, covariance in enumerate(turning):
+        base[axis:9:3, axis:9:3] += covariance
+    if imu is None:
+        base[_FORCE, _FORCE] = np.eye(3) * _chain(noise.std, _LINEAR, noise.derivatives, 3)[:, 2, 2].mean()
+    if fixed_base:
+        base[3:] = base[:, 3:] = 0.0
+    joint_roots, base_root = (torch.from_numpy(_square_root(x)) for x in (of_joints, base))
+    return MotionNoise(joint_roots, base_root, turns_force=imu is None and not fixed_base)
+
+
+def _chain(std: Mapping[str, Array], names: Sequence[str], derivatives: Array, count: int) -> Array:
+    """Covariances, (count, 3, 3), of quantities by name, of which each that was not recorded is derived from the last.
+
+    Args:
+        std: of the recorded ones, (count,).
+        names: at most 3, each the derivative of the one before.
+        derivatives: as `SignalNoise` has them.
+        count: of channels.
+    """
+    out = np.zeros((count, 3, 3))
+    recorded = [index for index, name in enumerate(names) if name in std]
+    for first, after in pairwise([*recorded, len(names)]):
+        own = derivatives[: after - first, : after - first]
+        out[:, first:after, first:after] = np.square(std[names[first]])[:, None, None] * own
+    return out
+
+
+def _of_imu(noise: SignalNoise, rotation: Rotation, arm: Array) -> Array:
+    """Covariance (12, 12) of the base's motion by an IMU with a lever arm; centripetal acceleration aside."""
+    sources = np.zeros((9, 9))  # angular velocity, angular acceleration, specific force
+    for axis, covariance in enumerate(_chain(noise.std, _GYRO, noise.derivatives, 3)):
+        sources[axis:6:3, axis:6:3] = covariance[:2, :2]
+    sources[6:, 6:] = np.diag(_chain(noise.std, _ACCELEROMETER, noise.derivatives, 3)[:, 0, 0])
+    R = rotation.as_matrix()
+    x, y, z = arm
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    T = np.zeros((12, 9))
+    T[_OMEGA, :3] = T[_ALPHA, 3:6] = T[_FORCE, 6:] = R
+    T[_FORCE, 3:6] = cross @ R  # - alpha x arm
+    return np.asarray(T @ sources @ T.T)
+
+
+def _square_root(covariance: Array) -> Array:
+    """S with S S^T = covariance, (..., k, k), which need not have full rank."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+def _sides(time: Tensor, count: int) -> Tensor:
+    """+1 or -1 for each sample and source, (B, count), drawn by the samples' stamps (B,), at random to all appearances.
+
+    Source: splitmix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
+    """
+    stamp, bits = time.double().contiguous().view(torch.int64), torch.arange(_BITS, device=time.device)
+    words = []
+    for _ in range(-(-count // _BITS)):
+        stamp = stamp + _GOLDEN
+        words.append((_hash(stamp)[:, None] >> bits) & 1)
+    drawn = torch.cat(words, dim=1)
+    return (2 * drawn[:, :count] - 1).to(time.dtype)
+
+
+def _hash(x: Tensor) -> Tensor:
+    x = (x ^ _shift(x, 30)) * _FIRST
+    x = (x ^ _shift(x, 27)) * _SECOND
+    return x ^ _shift(x, 31)
+
+
+def _shift(x: Tensor, bits: int) -> Tensor:
+    """The bits of integers moved to the right, zeros after them."""
+    return (x >> bits) & (2 ** (64 - bits) - 1)
+
+
+def _turned(quat_xyzw: Tensor, angle: Tensor) -> Tensor:
+    """Rotations (B, 4) after small ones (B, 3) about their own axes."""
+    axis, w, half = quat_xyzw[:, :3], quat_xyzw[:, 3:], 0.5 * angle
+    vector = axis + w * half + torch.linalg.cross(axis, half)
+    return torch.nn.functional.normalize(torch.cat([vector, w - (axis * half).sum(1, keepdim=True)], dim=1), dim=1)
+
+
+def _plus(x: Tensor | None, off: Tensor) -> Tensor | None:
+    return None if x is None else x + off

@@ -1,0 +1,180 @@
+"""What noise of the motion adds to the normal equations, and factors without it.
+
+Noise of positions, velocities and accelerations makes a regressor larger on average: X^T X grows by the covariance of
+the noise in X, and parameters that rest on noisy columns come out too small. Samples with as much noise again show by
+how much it grows, pairs of opposite noise without what is linear in it. Taken off, the normal equations are those of
+the true motion on average (corrected least squares).
+
+Source: Fuller, "Measurement Error Models", 1987, section 2.2; the noise that is added as in simulation extrapolation
+(Cook, Stefanski, JASA 89, 1994), to the sufficient statistics instead of to the estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid import ranks
+from torchid.parameters import Array
+from torchid.problem.chunk_dynamics import Workspace
+from torchid.problem.chunks import map_chunks, one_thread
+from torchid.problem.contact_state import ContactState
+from torchid.problem.linear import TriangularFactor
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples, concatenate
+from torchid.rounding import is_significant
+
+LEAST_SIGNAL = 1.0 / 3.0
+"""Share of the information on a combination of parameters that remains at least: all but that may be noise.
+
+Beyond, the size of what is taken off decides on the combination; it stays too small.
+"""
+
+_MOST_SIGNAL = 2.0  # beyond, it is rounding, of combinations that the rows hardly determine
+_SHAKEN = 20_000  # samples of all logs, evenly spread; as many again say little more of averages
+_NEGLIGIBLE = 1e-5  # share of noise in any combination: far below all standard errors
+_RESOLVED = 1e-5  # least singular value, of columns of unit size, along which a difference of squares is no rounding
+
+Support = tuple[int, ...]
+Surplus = dict[Support, Tensor]
+Key = TypeVar("Key", bound=Hashable)
+
+
+@dataclass(frozen=True)
+class NoiseShares:
+    """How much of the information on combinations of parameters was noise of the motion, and has been taken off.
+
+    Attributes:
+        combinations: that the rows determine, 0 of motion without noise.
+        largest: share of noise in any of them.
+        lost: combinations of which more than `LEAST_SIGNAL` leaves is noise, which remain too small.
+    """
+
+    combinations: int = 0
+    largest: float = 0.0
+    lost: int = 0
+
+    @classmethod
+    def of(cls, shares: Array) -> NoiseShares:
+        """Of the share of each combination."""
+        return cls(len(shares), max(float(shares.max(initial=0.0)), 0.0), int((shares > 1.0 - LEAST_SIGNAL).sum()))
+
+    def __str__(self) -> str:
+        text = f"up to {100.0 * self.largest:.2g} % of the information on a combination was noise, taken off"
+        if self.lost:
+            text += f" but for {self.lost} of {self.combinations}, which are mostly noise and remain too small"
+        return text
+
+
+def compress_surplus(
+    pieces: Sequence[Samples], builder: RowBuilder, key: Callable[[Samples, ContactState], Key]
+) -> dict[Key, Surplus]:
+    """The surplus of the rows of some logs by the noise of their motion; none of logs without noise.
+
+    Args:
+        pieces: of bound logs, in the order of their samples.
+        builder: of the rows.
+        key: which rows belong together.
+    """
+    step = ranks.as_first(max(1, sum(map(len, pieces)) // _SHAKEN), "samples with noise")
+    by_log: dict[str, list[Samples]] = {}
+    for piece in pieces:
+        if piece.motion_noise is not None and len(piece):
+            by_log.setdefault(piece.source, []).append(piece)
+    logs = [concatenate([_spread(piece, step) for piece in of_log]) for of_log in by_log.values()]
+    total: dict[Key, Surplus] = {}
+    if not logs:
+        return total
+    for of_worker in map_chunks(logs, builder, partial(_surplus_of_chunks, builder, by_log)):
+        for (source, number, state), surplus in of_worker.items():
+            _add(total.setdefault(key(by_log[source][number], state), {}), surplus, float(step))
+    return total
+
+
+def _add(total: Surplus, surplus: Surplus, weight: float) -> None:
+    for support, x in surplus.items():
+        total[support] = total[support] + weight * x if support in total else weight * x
+
+
+def _spread(piece: Samples, step: int) -> Samples:
+    """One in so many samples, drawn so that they are in phase with nothing."""
+    if step == 1:
+        return piece
+    starts = np.arange(0, len(piece), step)
+    width = np.minimum(step, len(piece) - starts)
+    at = starts + (np.random.default_rng(0).uniform(size=len(starts)) * width).astype(int)
+    return piece[torch.from_numpy(at)]
+
+
+_Place = tuple[str, int, ContactState]
+
+
+@torch.no_grad()
+def _surplus_of_chunks(
+    builder: RowBuilder, pieces: Mapping[str, Sequence[Samples]], chunks: Iterator[tuple[Samples, ContactState]]
+) -> dict[_Place, Surplus]:
+    """The surplus by log, number of the piece and contact state: half of what pairs of samples with noise have more."""
+    out: dict[_Place, Surplus] = {}
+    workspace = Workspace()
+    for samples, state in chunks:
+        noise, count, own = samples.motion_noise, len(samples), pieces[samples.source]
+        if noise is None:
+            continue
+        of_piece = torch.searchsorted(torch.stack([piece.time[0] for piece in own]).to(samples.time), samples.time,
+                                      right=True)  # fmt: skip
+        ends = torch.bincount(of_piece - 1, minlength=len(own)).cumsum(0).tolist()
+        spans = [(number, start, end) for number, (start, end) in enumerate(pairwise([0, *ends])) if end > start]
+        side = torch.tensor([0.0, 1.0, -1.0]).to(samples.time).repeat_interleave(count)
+        shaken = noise.shaken(samples[torch.arange(count, device=samples.time.device).repeat(3)], side[:, None])
+        for rows, index in builder.blocks(shaken, state, workspace):
+            for number, start, end in spans:
+                sums = out.setdefault((samples.source, number, state), {})
+                for copy, weight in enumerate((-1.0, 0.5, 0.5)):
+                    first, last = (copy * count + x for x in (start, end))
+                    if isinstance(index, Tensor):  # of samples whose contacts have one rank
+                        first, last = torch.searchsorted(index, torch.tensor([first, last]).to(index)).tolist()
+                    X = rows.values[:, :, first:last].flatten(1)
+                    _add(sums, {rows.block.support: X @ X.T}, weight)
+    return out
+
+
+@one_thread()
+def corrected_triangle(factor: TriangularFactor) -> tuple[Array, NoiseShares]:
+    """Upper triangular R of a factor without its surplus, right-hand side last, and the noise in it.
+
+    Residuals remain those of the rows at the parameters that fit R best.
+
+    Args:
+        factor: of some rows.
+
+    Returns:
+        R, (columns + 1, columns + 1), and what has been taken off.
+    """
+    R = factor.triangle().numpy()
+    if not factor.surplus:
+        return R, NoiseShares()
+    rows, rhs, surplus = R[:, :-1], R[:, -1], factor.whole_surplus().numpy()
+    size = np.linalg.norm(rows, axis=0)
+    scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    U, values, Vh = np.linalg.svd(rows * scale, full_matrices=False)
+    kept = is_significant(values, _RESOLVED)
+    whitening = scale[:, None] * Vh[kept].T / values[kept]  # rows @ whitening has orthonormal columns
+    noise = whitening.T @ surplus[:-1, :-1] @ whitening
+    shares, turn = np.linalg.eigh(0.5 * (noise + noise.T))
+    if np.abs(shares).max(initial=0.0) < _NEGLIGIBLE:
+        return R, NoiseShares.of(shares)
+    left = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
+    rhs_along, rows_along = U.T @ rhs, values[:, None] * Vh * size
+    target = turn.T @ (rhs_along[kept] - whitening.T @ surplus[:-1, -1])
+    best = whitening @ (turn @ (target / left))
+    rhs_along[kept], rows_along[kept] = target / np.sqrt(left), np.sqrt(left)[:, None] * (turn.T @ rows_along[kept])
+    bottom = np.append(np.zeros(rows.shape[1]), np.linalg.norm(rhs - rows @ best))
+    stacked = np.vstack([np.column_stack([rows_along, rhs_along]), bottom])
+    return np.asarray(np.linalg.qr(stacked, mode="r")), NoiseShares.of(shares)
