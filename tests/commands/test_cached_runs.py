@@ -30,6 +30,7 @@ from torchid.config.sensors import NoiseConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up, with_noise
 from torchid.fitting.noise import NoiseSummary
+from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.compression import split_into_folds
 
 NONE = "preprocessing.cache_gb=0"
@@ -200,7 +201,8 @@ def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, t
     assert key("estimator.ridge=3.0", "estimator.friction=false", "preprocessing.memory_gb=3") == same
     values = {x.name: 0.77 for x in fields(NoiseConfig) if not x.name.startswith(("base", "ft"))}
     values |= {"base_force": [1.0, 2.0, 3.0], "base_moment": [1.0, 2.0, 3.0], "ft_force": 0.3, "ft_moment": 0.3}
-    assert values.keys() == {x.name for x in fields(NoiseConfig)}
+    assert values.keys() | STATED_FIELDS.keys() == {x.name for x in fields(NoiseConfig)}
+    values = {name: x for name, x in values.items() if name not in STATED_FIELDS}  # change samples
     terms = {"armature": True, "torque_offset": True, "asymmetric_coulomb": True, "sign_width": 0.01}
     assert terms.keys() == {x.name for x in fields(ActuatorsConfig)}
     others = [f"sensors.noise.{name}={json.dumps(x)}" for name, x in values.items()]
@@ -209,6 +211,14 @@ def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, t
     found = {key(other) for other in others}
     assert same not in found
     assert len(found) == len(others)
+
+
+def test_stated_noise_of_the_motion_changes_the_name_of_samples(demo: Path, tmp_path: Path) -> None:
+    def key(*more: str) -> str:
+        return content_key(content_of_scene(set_up(load_config(demo, (f"output={tmp_path / 'run'}", *more)))))
+
+    names = [key(f"sensors.noise.{name}={x}") for name in STATED_FIELDS for x in (0.0, 0.1)]
+    assert len({key(), key("sensors.noise.base_force=1.5"), *names}) == 1 + len(names)
 
 
 def test_a_log_with_other_content_is_read_whatever_its_size_and_time_say(

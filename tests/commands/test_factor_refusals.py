@@ -17,7 +17,7 @@ from hostile_logs import mutated
 from refusals import refusal
 
 from torchid.cli import main
-from torchid.fitting.factor_files import read_factors
+from torchid.fitting.factor_files import FORMAT, read_factors
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning"),
@@ -201,7 +201,7 @@ def first_part(description: dict[str, Any]) -> dict[str, Any]:
 
 
 HOSTILE: dict[str, Callable[[dict[str, Any], dict[str, Any]], Any]] = {
-    "a later format": lambda d, a: d.update(format=2),
+    "a later format": lambda d, a: d.update(format=FORMAT + 1),
     "no format": lambda d, a: d.pop("format"),
     "another key": lambda d, a: d.update(more=1),
     "no pieces": lambda d, a: d.update(pieces=[]),
@@ -249,7 +249,7 @@ def test_hostile_files_are_refused_in_one_line(
     assert message.startswith(f"torchid: {path}: "), message
     assert len(message) < 600
     if case == "a later format":
-        assert f"{path}: format: 2, of another version of torchid; accepted: 1" in message
+        assert f"{path}: format: {FORMAT + 1}, of another version of torchid; accepted: {FORMAT}" in message
 
 
 def test_damaged_files_give_a_fit_or_one_line(fleet: Path, tmp_path: Path) -> None:

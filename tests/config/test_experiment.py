@@ -31,6 +31,8 @@ ALL: dict[str, Any] = {
         "noise": {
             **{"joint_torque": 0.1, "contact_force": 3.0, "contact_moment": 0.3},
             **{"base_force": 1.5, "base_moment": 0.25, "ft_force": 1.0, "ft_moment": 0.1},
+            **{"joint_position": 0.001, "joint_velocity": 0.0, "base_orientation": 0.002},
+            **{"angular_velocity": 0.01, "specific_force": 0.05},
         },
         "offsets": {"joint_torque": "all", "contact_force": "log"},
         "scales": {"ft_force": "log"},

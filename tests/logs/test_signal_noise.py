@@ -102,3 +102,10 @@ def test_short_logs_and_gaps_say_nothing() -> None:
     assert not signal_noise(replace(log, joint_position=position), None).found
     assert not SignalNoise({}).found
     assert make_timeline(TIME, False, None, None) is None
+
+
+def test_postures_one_after_the_other_are_no_noise() -> None:
+    rng = np.random.default_rng(3)
+    log = Log("postures.npz", TIME[:500], ("a", "b"), rng.normal(size=(500, 2)), rng.normal(size=(500, 2)))
+    assert not signal_noise(log, None).found
+    assert signal_noise(log, None, {"joint_velocity": 0.1}).std["joint_velocity"].tolist() == [0.1, 0.1]

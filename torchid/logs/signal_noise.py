@@ -43,6 +43,7 @@ _ORDERS = (7, 9)  # of the differences that show noise: smooth motion vanishes i
 _WHITE = 0.7  # least ratio of the estimates by both orders: less, and what is there is motion or was filtered
 _NORMAL = 0.6745  # median of |x| of standard normal x
 _LEAST = 1e-12  # share of a channel's largest value: less is rounding
+_LARGEST = 0.02  # [rad, m] noise of joint positions; beyond, successive samples are postures, not motion
 _ORIENTATION = "base_quat_xyzw"
 
 
@@ -69,6 +70,8 @@ class SignalNoise:
 def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float] | None = None) -> SignalNoise:
     """The noise of a log's motion, as stated, or as the high frequencies of its start show.
 
+    None is found where samples do not follow a path, such as postures one after the other.
+
     Args:
         log: as recorded.
         timeline: that it is preprocessed to; None where nothing is filtered, derived or resampled.
@@ -78,10 +81,12 @@ def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float
     start, std = log.select(slice(0, MOST_SAMPLES)), dict[str, FloatArray]()
     for name in MOTION_FIELDS:
         values: FloatArray | None = getattr(start, name)
-        if values is None or not values.size:
+        if values is None or not values.size and name != "joint_position":
             continue
         width = 3 if name == _ORIENTATION else values.shape[1]
         std[name] = np.full(width, known[name]) if name in known else _estimate(name, start.time, values)
+    if (std["joint_position"] > _LARGEST).any() and "joint_position" not in known:  # no path: samples of their own
+        std = {name: np.full_like(x, known.get(name, 0.0)) for name, x in std.items()}
     noise = SignalNoise(std)
     if timeline is None or not noise.found:
         return noise
@@ -90,12 +95,17 @@ def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float
 
 def _estimate(name: str, time: FloatArray, values: FloatArray) -> FloatArray:
     """Standard deviation of the noise in a field (N, c), by channel."""
-    if len(time) < _FEWEST or not np.isfinite(values).all():
+    if len(time) < _FEWEST or not values.size or not np.isfinite(values).all():
         return np.zeros(values.shape[1])
     if name != _ORIENTATION:
-        return white_noise(time, values)
-    components = white_noise(time, make_sign_continuous(values))
-    return np.full(3, np.sqrt(4.0 / 3.0 * np.square(components).sum()))  # half angles, of three axes in four components
+        return _rounded(white_noise(time, values))
+    components = white_noise(time, make_sign_continuous(values))  # half angles, of three axes in four components
+    return _rounded(np.full(3, np.sqrt(4.0 / 3.0 * np.square(components).sum())))
+
+
+def _rounded(values: FloatArray) -> FloatArray:
+    """To three digits, so that the last bits of a log make no difference."""
+    return np.array([float(f"{x:.3g}") for x in values])
 
 
 def white_noise(time: FloatArray, values: FloatArray) -> FloatArray:

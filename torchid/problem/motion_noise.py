@@ -28,6 +28,7 @@ _ANGLE, _OMEGA, _ALPHA, _FORCE = (slice(3 * k, 3 * k + 3) for k in range(4))  # 
 # of splitmix64, as signed numbers: a hash of which every bit looks random
 _GOLDEN, _FIRST, _SECOND = -0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15
 _BITS = 48  # taken of each hash
+_TICK = 1e-5  # [s] of stamps, whose last bits differ between formats of files
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class MotionNoise:
     """Noise of the motion of some samples of one log: Gaussian at each instant, whatever neighbours have.
 
     Attributes:
-        joints: (n, 3, 3), square roots of the covariances of position, velocity and acceleration, S S^T.
+        joints: (n, 3, 3), symmetric square roots of the covariances of position, velocity and acceleration.
         base: (12, 12), that of the base's orientation (a small rotation in the base frame), angular velocity, angular
             acceleration and specific force [rad, rad/s, rad/s^2, m/s^2].
         turns_force: whether the specific force comes from an acceleration in the world, which is turned by the
@@ -142,9 +143,9 @@ def _of_imu(noise: SignalNoise, rotation: Rotation, arm: Array) -> Array:
 
 
 def _square_root(covariance: Array) -> Array:
-    """S with S S^T = covariance, (..., k, k), which need not have full rank."""
+    """Symmetric S with S S = covariance, (..., k, k), which need not have full rank; others would hang on rounding."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :] @ np.swapaxes(vectors, -1, -2))
 
 
 def _sides(time: Tensor, count: int) -> Tensor:
@@ -152,7 +153,7 @@ def _sides(time: Tensor, count: int) -> Tensor:
 
     Source: splitmix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
     """
-    stamp, bits = time.double().contiguous().view(torch.int64), torch.arange(_BITS, device=time.device)
+    stamp, bits = (time.double() / _TICK).round().long(), torch.arange(_BITS, device=time.device)
     words = []
     for _ in range(-(-count // _BITS)):
         stamp = stamp + _GOLDEN

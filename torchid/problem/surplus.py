@@ -29,7 +29,7 @@ from torchid.problem.contact_state import ContactState
 from torchid.problem.linear import TriangularFactor
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, concatenate
-from torchid.rounding import is_significant
+from torchid.rounding import RANK_TOLERANCE, is_significant
 
 LEAST_SIGNAL = 1.0 / 3.0
 """Share of the information on a combination of parameters that remains at least: all but that may be noise.
@@ -94,7 +94,9 @@ def compress_surplus(
         return total
     for of_worker in map_chunks(logs, builder, partial(_surplus_of_chunks, builder, by_log)):
         for (source, number, state), surplus in of_worker.items():
-            _add(total.setdefault(key(by_log[source][number], state), {}), surplus, float(step))
+            halves = {support: x.triu() for support, x in surplus.items()}
+            both = {support: x + x.triu(1).T for support, x in halves.items()}  # to the last bit, as files have one
+            _add(total.setdefault(key(by_log[source][number], state), {}), both, float(step))
     return total
 
 
@@ -165,16 +167,22 @@ def corrected_triangle(factor: TriangularFactor) -> tuple[Array, NoiseShares]:
     scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
     U, values, Vh = np.linalg.svd(rows * scale, full_matrices=False)
     kept = is_significant(values, _RESOLVED)
+    other = is_significant(values, RANK_TOLERANCE) & ~kept
     whitening = scale[:, None] * Vh[kept].T / values[kept]  # rows @ whitening has orthonormal columns
     noise = whitening.T @ surplus[:-1, :-1] @ whitening
     shares, turn = np.linalg.eigh(0.5 * (noise + noise.T))
     if np.abs(shares).max(initial=0.0) < _NEGLIGIBLE:
         return R, NoiseShares.of(shares)
     left = np.clip(1.0 - shares, LEAST_SIGNAL, _MOST_SIGNAL)
-    rhs_along, rows_along = U.T @ rhs, values[:, None] * Vh * size
-    target = turn.T @ (rhs_along[kept] - whitening.T @ surplus[:-1, -1])
+    target = turn.T @ (U[:, kept].T @ rhs - whitening.T @ surplus[:-1, -1])
     best = whitening @ (turn @ (target / left))
-    rhs_along[kept], rows_along[kept] = target / np.sqrt(left), np.sqrt(left)[:, None] * (turn.T @ rows_along[kept])
-    bottom = np.append(np.zeros(rows.shape[1]), np.linalg.norm(rhs - rows @ best))
-    stacked = np.vstack([np.column_stack([rows_along, rhs_along]), bottom])
-    return np.asarray(np.linalg.qr(stacked, mode="r")), NoiseShares.of(shares)
+    rest = U[:, other].T @ rhs
+    residual = np.linalg.norm(rhs - rows @ best - U[:, other] @ rest)
+    along = np.sqrt(left)[:, None] * (turn.T @ (values[kept, None] * Vh[kept] * size))
+    stacked = [
+        np.column_stack([along, target / np.sqrt(left)]),
+        np.column_stack([values[other, None] * Vh[other] * size, rest]),
+        np.append(np.zeros_like(size), residual)[None],
+        np.zeros((len(R) - 1 - len(target) - len(rest), R.shape[1])),
+    ]
+    return np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r")), NoiseShares.of(shares)
