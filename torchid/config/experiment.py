@@ -15,8 +15,10 @@ from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_l
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
+    COMPONENTS_ACCEPTED,
     SCOPES_ACCEPTED,
     STRICT,
+    WRENCHES_ACCEPTED,
     Choice,
     ContactConfig,
     Device,
@@ -171,7 +173,11 @@ _EXPERIMENT = FileKind(
     outputs=("output",),
     prepare=_spelled_out,
     accepted={
+        "contacts": "a list of mappings: [{frame: l_sole, type: flat}]",
+        "contacts.*.frame": "the name of a frame in the URDF",
         "sensors": CHOICE_ACCEPTED,
+        **{f"{where}.contact_wrenches": WRENCHES_ACCEPTED for where in ("sensors", "analysis.compare.*")},
+        **{f"{where}.contact_wrenches.*": COMPONENTS_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         "sensors.offsets": SCOPES_ACCEPTED,
         "sensors.scales": SCOPES_ACCEPTED,
         "analysis.compare.*": CHOICE_ACCEPTED,
