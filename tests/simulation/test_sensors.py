@@ -281,7 +281,7 @@ def test_noise_bias_and_gain_of_a_force_along_the_normal_are_as_large_as_stated(
 
 
 def test_it_touches_while_it_reads_more_than_the_threshold() -> None:
-    force = np.array([0.0, 29.0, 31.0, 500.0, -500.0, -31.0])[:, None] * [1.0, np.nan]
+    force = np.array([0.0, 29.0, 31.0, 500.0, -900.0, -31.0])[:, None] * [1.0, np.nan]
     active = value(sensor_log(truth(6, contact_force_normal=force), NONE, seed=0).contact_active)
     assert active[:, 0].astype(int).tolist() == [0, 0, 1, 1, 0, 0]
     assert active[:, 1].all()
