@@ -40,7 +40,10 @@ ALL: dict[str, Any] = {
     "estimator": {"name": "least_squares", "ridge": 1e-5, "rank_tolerance": 1e-7, "friction": False},
     "analysis": {
         "scenarios": {"stand": [["l_sole", "r_sole"]], "step": [["l_sole"], ["r_sole"], []]},
-        "candidates": {"joint_torques": ["hip", "knee"], "contacts": "axis", "ft_sensors": ["l_ankle"]},
+        "candidates": {
+            **{"joint_torques": ["hip", "knee"], "contacts": "axis", "ft_sensors": ["l_ankle"]},
+            "normal_forces": ["r_sole"],
+        },
         "keep": ["knee"],
         "exclude": ["l_sole.fx"],
         "costs": {"joint_torque": 2.0, "l_sole.fz": 0.5},

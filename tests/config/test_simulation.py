@@ -21,7 +21,10 @@ LEAST: dict[str, Any] = {
 }  # fmt: skip
 ALL: dict[str, Any] = {
     "robot": {"urdf": "models/robot.urdf"},
-    "feet": [{"frame": "l_sole", "points": [[0.1, 0.05, 0.0], [-0.1, 0.0, 0.0]]}, {"frame": "r_sole", "points": []}],
+    "feet": [
+        {"frame": "l_sole", "points": [[0.1, 0.05, 0.0], [-0.1, 0.0, 0.0]], "sensor": "fn"},
+        {"frame": "r_sole", "points": [], "sensor": "wrench"},
+    ],
     "motions": [
         {
             "name": "squat_0.5hz",
