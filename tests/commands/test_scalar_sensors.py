@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid.cli import main
 from torchid.logs import read_log, write_log
+from torchid.report.figures import tree_figure
 from torchid.robot import load_robot
 
 FEET = tuple(f"{end}_{side}_foot" for end in ("front", "rear") for side in ("left", "right"))
@@ -134,13 +136,23 @@ def analyzed(experiment: Path, name: str, *overrides: str) -> dict[str, Any]:
 
 
 def test_analyze_plans_with_scalar_sensors_and_measures_the_plan(
-    experiment: Path, capsys: pytest.CaptureFixture[str]
+    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each leg needs three readings, of which the cheap one at the foot is one."""
+    drawn: list[tuple[Any, ...]] = []
+
+    def draw(*shown: Any) -> Any:
+        drawn.append(shown)
+        return tree_figure(*shown)
+
+    monkeypatch.setattr(import_module("torchid.commands.analyze"), "tree_figure", draw)
     answers = analyzed(experiment, "planned")
     (plan,) = answers["scenarios"].values()
     assert (plan["cost"], plan["proven"]) == (10.0, True)
     assert [name for name in plan["sensors"] if "foot" in name] == [f"{foot}.fn" for foot in FEET]
+    [(title, _, _, _, wrenches, _)] = drawn
+    assert title == "logs: 12 of 24 sensor channels", "12 torques, 3 forces at each foot, one of which fn reads too"
+    assert wrenches == {foot: ["fn"] for foot in FEET}
     assert {"name": f"{FEET[0]}.fn", "channels": 1, "cost": 0.5} in plan["candidates"]
     for part in plan["parts"]:
         assert len(part["minimal_sets"]) == 5

@@ -87,6 +87,8 @@ def test_a_scalar_sensor_is_one_channel_named_and_priced_by_itself() -> None:
     assert (alone.name, alone.cost) == ("left_ankle_roll_link.fn", 0.3)
     assert read_along_normals(contacts, candidates(robot, contacts)) == contacts
     assert [contact.along_normal for contact in read_along_normals(contacts, [alone])] == [True, False]
+    axes = candidates(robot, read_along_normals(contacts, choice)[1:], [], "axis")
+    assert [c.name for c in axes] == [f"right_rubber_hand.{k}" for k in ("fx", "fy", "fn")]
     with pytest.raises(UnknownNameError, match=r"candidates.normal_forces: unknown name 'left_foot'; accepted: left_"):
         candidates(robot, contacts, normal_forces=["left_foot"])
     with pytest.raises(
