@@ -1,4 +1,4 @@
-"""Tolerances of numerical rank, and the functions that apply them."""
+"""Numbers of numerical practice that packages share: tolerances of rank with what applies them, and a robust scale."""
 
 from __future__ import annotations
 
@@ -23,6 +23,12 @@ UNOBSERVABLE_SHARE = 1e-6
 
 The value is far above rounding (1e-10 on a humanoid) and below all components found in robots (1e-4).
 """
+
+MAD_PER_STD = 0.6745
+"""Median of |x| of a standard normal x: a median absolute deviation over it is a robust standard deviation."""
+
+STD_PER_MAD = 1.4826
+"""Its inverse, as rounded in the literature on outliers."""
 
 
 def relative_tolerance(tolerance: float, shape: tuple[int, ...], eps: float = float(np.finfo(float).eps)) -> float:

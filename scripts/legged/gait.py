@@ -13,6 +13,7 @@ from scipy.linalg import solve_banded
 from scipy.spatial.transform import Rotation
 
 from legged.robots import Legged, TrueRobot, sphere_radius
+from legged.trajectories import BaseMotion, Swing, quintic, waves
 from torchid.parameters import Array
 
 _KNOTS_HZ = 50.0
@@ -22,18 +23,6 @@ _LOWERED = 0.015  # m: legs keep away from being straight
 _ITERATIONS, _REACHED = 20, 1e-9
 _GRAVITY = 9.81
 _CORRECTIONS = 2  # of the base, to have the centre of mass where it balances
-
-
-def quintic(x: Array) -> Array:
-    """From 0 to 1 on [0, 1] with two continuous derivatives."""
-    x = np.clip(x, 0.0, 1.0)
-    return x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
-
-
-def _waves(rng: np.random.Generator, time: Array, count: int, slow: float, fast: float) -> Array:
-    """Sums of two sines, (N, count), of size about 1, between two frequencies [Hz]."""
-    hz, phase = rng.uniform(slow, fast, (2, count)), rng.uniform(0.0, 2.0 * np.pi, (2, count))
-    return np.sin(2.0 * np.pi * time[:, None, None] * hz + phase).sum(axis=1) / np.sqrt(2.0)
 
 
 @dataclass(frozen=True)
@@ -70,13 +59,11 @@ class Steps:
         place = np.repeat(self.home[None], len(time), axis=0)
         ready = np.ones((len(time), len(self.home)))
         for (start, swing, feet), stride in zip(self.swings, self.strides, strict=True):
-            x = (time - start) / swing
-            up = self.legged.lift * np.where((x > 0.0) & (x < 1.0), 64.0 * (x * (1.0 - x)) ** 3, 0.0)
-            away, back = quintic((start - time) / _RAMP), quintic((time - start - swing) / _RAMP)
+            progress, height, carries = Swing.at(time, start, swing, self.legged.lift, _RAMP)
             for foot in feet:
-                place[:, foot] += quintic(x)[:, None] * stride[foot]
-                place[:, foot, 2] += up
-                ready[:, foot] = np.minimum(ready[:, foot], np.maximum(away, back))
+                place[:, foot] += progress[:, None] * stride[foot]
+                place[:, foot, 2] += height
+                ready[:, foot] = np.minimum(ready[:, foot], carries)
         return place, ready
 
     def support(self, time: Array) -> Array:
@@ -129,14 +116,14 @@ class Reference:
         home, com, height = legs.stand(posture)
         groups = [feet for feet in legged.lifted if not static or legged.holds(feet)]
         self.steps = Steps.plan(legged, home, float(knots[-1]), groups, rng)
-        waves = _waves(rng, knots, 6, 0.2, 1.2) * quintic(knots / _START)[:, None]
+        swaying = waves(rng, knots, 6, 0.2, 1.2) * quintic(knots / _START)[:, None]
         place, _ = self.steps.feet(knots)
-        base = 4.0 * legged.sway * waves
+        base = 4.0 * legged.sway * swaying
         base[:, :3] = 0.0
-        base[:, 2] = height - _LOWERED - legged.sway + legged.sway * waves[:, 2]
-        centre = balanced_path(self.steps.support(knots), com[2]) + 0.3 * legged.sway * waves[:, :2]
+        base[:, 2] = height - _LOWERED - legged.sway + legged.sway * swaying[:, 2]
+        centre = balanced_path(self.steps.support(knots), com[2]) + 0.3 * legged.sway * swaying[:, :2]
         base[:, :2] = centre - com[:2]
-        joints = posture + legged.waving * _waves(rng, knots, robot.n, 0.15, 0.9)
+        joints = posture + legged.waving * waves(rng, knots, robot.n, 0.15, 0.9)
         for _ in range(_CORRECTIONS):
             reached, found = legs.reach(base, joints, place)
             base[:, :2] += centre - found[:, :2]
@@ -145,27 +132,12 @@ class Reference:
 
     def at(self, time: Array) -> Motion:
         """The motion at stamps (N,) [s]."""
-        h = 1e-5
-        R, linear, omega = self._twist(time)
-        (_, after, spin), (_, before, was) = self._twist(time + h), self._twist(time - h)
-        quat = R.as_quat()[:, [3, 0, 1, 2]]
+        base = BaseMotion.along(self._base, time)
+        quat = base.rotation.as_quat()[:, [3, 0, 1, 2]]
         q = np.hstack([self._base(time)[:, :3], quat, self._joints(time)])
-        v = np.hstack([linear, omega, self._joints(time, 1)])
-        rates = (after - before) / (2.0 * h), (spin - was) / (2.0 * h)
-        a = np.hstack([*rates, self._joints(time, 2)])
+        v = np.hstack([base.linear, base.angular, self._joints(time, 1)])
+        a = np.hstack([base.linear_rate, base.angular_rate, self._joints(time, 2)])
         return Motion(time, q, v, a, self.steps.feet(time)[1])
-
-    def _twist(self, time: Array) -> tuple[Rotation, Array, Array]:
-        """Rotation, velocity along world axes and angular velocity along base axes, of z-y-x angles."""
-        value, rate = self._base(time), self._base(time, 1)
-        _, pitch, roll = value[:, 3:].T
-        yaw_rate, pitch_rate, roll_rate = rate[:, 3:].T
-        omega = [
-            roll_rate - yaw_rate * np.sin(pitch),
-            pitch_rate * np.cos(roll) + yaw_rate * np.sin(roll) * np.cos(pitch),
-            -pitch_rate * np.sin(roll) + yaw_rate * np.cos(roll) * np.cos(pitch),
-        ]
-        return Rotation.from_euler("ZYX", value[:, 3:]), rate[:, :3], np.stack(omega, axis=1)
 
 
 class _Legs:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid.cli import main
 from torchid.logs import read_log, write_log
+from torchid.report.figures import tree_figure
 from torchid.robot import load_robot
 
 FEET = tuple(f"{end}_{side}_foot" for end in ("front", "rear") for side in ("left", "right"))
@@ -98,6 +101,11 @@ def test_factors_of_scalar_sensors_are_not_those_of_others(
          f"sensors.contact_wrenches.{FEET[0]}: 'fz' of a contact whose force is read along the ground's normal, 'fn'; "
          "accepted: [fn] alone, or components of the wrench without it"),
         ("identify", "sensors.contact_wrenches={paw: [fn]}", "sensors.contact_wrenches: unknown name 'paw'"),
+        ("analyze", "analysis.candidates.normal_forces=[paw]",
+         "analysis.candidates.normal_forces: unknown name 'paw'; accepted: "),
+        ("analyze", f"analysis.candidates={{contacts: axis, normal_forces: [{FEET[0]}]}}",
+         f"analysis.candidates.normal_forces: {FEET[0]}, beside single axes of the contacts' frames; accepted: "
+         "candidates.contacts: device or none"),
         ("analyze", "analysis.compare={left: {contact_wrenches: {front_left_foot: [fx]}}}",
          "analysis.compare.left.contact_wrenches.front_left_foot: 'fx' of a contact whose force is read along"),
     ],
@@ -115,3 +123,62 @@ def test_analyze_takes_a_set_with_scalar_sensors_as_proposed(experiment: Path) -
     accuracy = json.loads((output.with_name("analysis.analysis") / "analysis.json").read_text())["accuracy"]
     assert accuracy["proposed"]["rank"] == 118
     assert accuracy["proposed"]["channels"] == 16
+
+
+def analyzed(experiment: Path, name: str, *overrides: str) -> dict[str, Any]:
+    """The document of an analysis with cheap scalar sensors among the candidates."""
+    output = experiment.parent / "runs" / name
+    offered = f"analysis.candidates.normal_forces=[{', '.join(FEET)}]"
+    costs = "analysis.costs.normal_force=0.5"
+    assert main(["analyze", str(experiment), offered, costs, *overrides, f"output={output}"]) == 0
+    answers: dict[str, Any] = json.loads((output.with_name(f"{name}.analysis") / "analysis.json").read_text())
+    return answers
+
+
+def test_analyze_plans_with_scalar_sensors_and_measures_the_plan(
+    experiment: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each leg needs three readings, of which the cheap one at the foot is one."""
+    drawn: list[tuple[Any, ...]] = []
+
+    def draw(*shown: Any) -> Any:
+        drawn.append(shown)
+        return tree_figure(*shown)
+
+    monkeypatch.setattr(import_module("torchid.commands.analyze"), "tree_figure", draw)
+    answers = analyzed(experiment, "planned")
+    (plan,) = answers["scenarios"].values()
+    assert (plan["cost"], plan["proven"]) == (10.0, True)
+    assert [name for name in plan["sensors"] if "foot" in name] == [f"{foot}.fn" for foot in FEET]
+    [(title, _, _, _, wrenches, _)] = drawn
+    assert title == "logs: 12 of 24 sensor channels", "12 torques, 3 forces at each foot, one of which fn reads too"
+    assert wrenches == {foot: ["fn"] for foot in FEET}
+    assert {"name": f"{FEET[0]}.fn", "channels": 1, "cost": 0.5} in plan["candidates"]
+    for part in plan["parts"]:
+        assert len(part["minimal_sets"]) == 5
+        assert len(part["cheapest"]) == 3
+    assert {check["random_postures"]["rank"] for check in plan["checks"]} == {6}
+    found = answers["accuracy"]
+    assert set(found) == {"proposed", "planned for logs"}
+    assert (found["proposed"]["channels"], found["planned for logs"]["channels"]) == (16, 12)
+    for one in found.values():
+        assert one["expected"]["nullspace"] / 3.0 < one["measured"]["nullspace"] < 3.0 * one["expected"]["nullspace"]
+    assert f"{FEET[0]}.fn" in capsys.readouterr().out
+    joints = ", ".join(name for name in plan["sensors"] if "foot" not in name)
+    again = analyzed(experiment, "as_planned", f"sensors.joint_torques=[{joints}]")
+    (scenario,) = again["scenarios"].values()
+    assert set(again["accuracy"]) == {"proposed"}, "it is the plan"
+    assert scenario["proposed"] == scenario["checks"]
+
+
+def test_a_plan_with_scalar_sensors_is_not_measured_on_logs_that_are_read_as_wrenches(
+    experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (DEMO / "quadruped.yaml").read_text().replace("quadruped.urdf", str(DEMO / "quadruped.urdf"))
+    (tmp_path / "run.yaml").write_text(text.replace("sway_", str(DEMO / "sway_")))
+    answers = analyzed(tmp_path / "run.yaml", "planned")
+    (plan,) = answers["scenarios"].values()
+    assert plan["cost"] == 10.0
+    assert set(answers["accuracy"]) == {"proposed"}
+    warned = f"do not read {', '.join(FEET)} along the normal (sensors.contact_wrenches: {{{FEET[0]}: [fn]}})"
+    assert f"{warned}; no accuracy of the sensors planned for logs" in capsys.readouterr().err

@@ -21,7 +21,10 @@ LEAST: dict[str, Any] = {
 }  # fmt: skip
 ALL: dict[str, Any] = {
     "robot": {"urdf": "models/robot.urdf"},
-    "feet": [{"frame": "l_sole", "points": [[0.1, 0.05, 0.0], [-0.1, 0.0, 0.0]]}, {"frame": "r_sole", "points": []}],
+    "feet": [
+        {"frame": "l_sole", "points": [[0.1, 0.05, 0.0], [-0.1, 0.0, 0.0]], "sensor": "fn"},
+        {"frame": "r_sole", "points": [], "sensor": "wrench"},
+    ],
     "motions": [
         {
             "name": "squat_0.5hz",
@@ -184,7 +187,7 @@ def test_an_unknown_key_is_refused_by_its_place_and_the_nearest_that_exists(
         (changed(feet=["sole"]), "feet.0", "'sole'"),
         (changed(feet=[{"frame": "a", "points": [[0, 0, "up"]]}]), "feet.0.points.0.2", "'up'"),
         (changed(motions=[]), "motions", "an empty list"),
-        (changed(motions={"name": "m"}), "motions", "a mapping"),
+        (changed(motions={"name": "m"}), "motions", "found {'name': 'm'}"),
         (motion(duration_s=0), "motions.0.duration_s", "0"),
         (motion(waves=[WAVE | {"hz": -1}]), "motions.0.waves.0.hz", "-1"),
         (motion(waves=[WAVE | {"amplitude": float("nan")}]), "motions.0.waves.0.amplitude", "nan"),

@@ -23,6 +23,7 @@ from torchid.parameters import MASS, PER_BODY
 from torchid.problem import RowBuilder, Samples, bind_log, compress_parts
 from torchid.problem.base_motion import levelled_base_axes
 from torchid.problem.sampled_rows import std_by_group
+from torchid.rounding import MAD_PER_STD, STD_PER_MAD
 from torchid.sensing import SensorNoise
 from torchid.sensing.projection import whitened_null_space
 
@@ -32,6 +33,11 @@ SAMPLES = 300
 HORIZONTAL, VERTICAL = 2.3, 0.1  # N: of differentiated odometry, 0.9 and 0.04 m/s^2 of a robot of 2.5 kg
 TRUE = SensorNoise(0.1, 0.2, 0.02, (HORIZONTAL, HORIZONTAL, VERTICAL), (0.1, 0.2, 0.05))
 QUICK, MANY = 8, 200
+
+
+def test_a_median_deviation_over_its_constant_is_the_standard_deviation_of_normal_numbers() -> None:
+    assert pytest.approx(stats.norm.ppf(0.75), abs=2e-5) == MAD_PER_STD
+    assert pytest.approx(1.0 / stats.norm.ppf(0.75), abs=3e-5) == STD_PER_MAD
 
 
 # ------------------------------------------------------------------------------------------------------- axes and rows

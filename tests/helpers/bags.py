@@ -17,13 +17,14 @@ from torchid.logs import Log, Topics, read_log
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 #: One message: topic, receipt [ns], type and content.
 Entry = tuple[str, int, str, Mapping[str, Any]]
-JOINT_STATE, IMU, ODOMETRY, WRENCH, PLAIN_WRENCH, FLAG = (
+JOINT_STATE, IMU, ODOMETRY, WRENCH, PLAIN_WRENCH, FLAG, NUMBERS = (
     "sensor_msgs/msg/JointState",
     "sensor_msgs/msg/Imu",
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/WrenchStamped",
     "geometry_msgs/msg/Wrench",
     "std_msgs/msg/Bool",
+    "std_msgs/msg/Float64MultiArray",
 )
 
 
@@ -132,6 +133,8 @@ def _said(log: Log, i: int, stamp: int) -> Iterator[tuple[str, str, dict[str, An
     for topic, wrenches, column, frame in sensors:
         if wrenches is not None:
             yield topic, WRENCH, wrench(stamp, wrenches[i, column], frame)
+    if log.contact_force_normal is not None:
+        yield "/foot_forces", NUMBERS, {"data": log.contact_force_normal[i]}
     if log.contact_active is not None:
         for name, active in zip(log.contact_names, log.contact_active[i], strict=True):
             yield f"/touch/{name}", FLAG, {"data": bool(active)}
@@ -146,6 +149,9 @@ def topics_of(log: Log) -> dict[str, Any]:
         topics["imu"] = "/imu"
     if log.contact_wrench_local is not None:
         topics["contact_wrenches"] = {name: f"/wrench/{name}" for name in log.contact_names}
+    if log.contact_force_normal is not None:
+        forces = {name: {"topic": "/foot_forces", "index": index} for index, name in enumerate(log.contact_names)}
+        topics["contact_force_normal"] = forces
     if log.contact_names:
         topics["contact_active"] = {name: f"/touch/{name}" for name in log.contact_names}
     if log.ft_names:

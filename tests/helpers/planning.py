@@ -80,7 +80,7 @@ def sees_the_base(
         q = random_states(np.random.default_rng(number), robot.n, 1)[0]
         torque = np.eye(6 + robot.n_dofs)[6:]
         rows = [(c, k) for c, active in enumerate(state) if active for k in contacts[c].components]
-        J = {c: oracle.jacobian(q, contacts[c].frame)[0] for c in {c for c, _ in rows}}
+        J = {c: _along_axes(oracle, q, contacts[c]) for c in {c for c, _ in rows}}
         A = np.vstack([torque, *(J[c][[k]] for c, k in rows)])
         measured = np.array([[*s.torque, *(s.wrench[c, k] for c, k in rows)] for s in sets])
         unmeasured = torch.from_numpy(A * ~measured[..., None])
@@ -88,6 +88,15 @@ def sees_the_base(
             rank = base_rank(base_singular_values(V)).numpy()
             result[np.arange(len(sets))[index]] &= rank == 6
     return result
+
+
+def _along_axes(oracle: Oracle, q: np.ndarray, contact: Contact) -> np.ndarray:
+    """Jacobian (6, n_rows) of a contact along its frame's axes, the force of a scalar sensor along the vertical."""
+    J: np.ndarray = oracle.jacobian(q, contact.frame)[0]
+    if contact.along_normal:
+        rotation = oracle.pose(q, contact.frame)[0][0]
+        J = np.vstack([rotation @ J[:3], J[3:]])
+    return J
 
 
 def sufficient_sets(machine: Machine, robot: Robot, choice: Sequence[Candidate]) -> np.ndarray:

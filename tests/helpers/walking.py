@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from legged.trajectories import BaseMotion, Swing, waves
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
@@ -102,17 +103,6 @@ class Truth:
     share: Array  # (N, C), of the load that a foot is ready to take
 
 
-def _waves(rng: np.random.Generator, time: Array, count: int, slow: float, fast: float) -> Array:
-    """Sums of two sines (N, count) of size about 1, between two frequencies [Hz]."""
-    hz, phase = rng.uniform(slow, fast, (2, count)), rng.uniform(0.0, 2.0 * np.pi, (2, count))
-    return np.sin(2.0 * np.pi * time[:, None, None] * hz + phase).sum(axis=1) / np.sqrt(2.0)
-
-
-def _quintic(x: Array) -> Array:
-    x = np.clip(x, 0.0, 1.0)
-    return x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
-
-
 class Gait:
     """Where the feet are and what they carry, at any time."""
 
@@ -133,12 +123,10 @@ class Gait:
         place = np.repeat(self.home[None], len(time), axis=0)
         ready = np.ones((len(time), len(self.home)))
         for (start, foot), stride in zip(self.swings, self.strides, strict=True):
-            x = (time - start) / self.machine.swing
-            place[:, foot] += _quintic(x)[:, None] * stride
-            place[:, foot, 2] += self.machine.lift * np.where((x > 0) & (x < 1), 64 * (x * (1 - x)) ** 3, 0.0)
-            away = np.minimum(_quintic((start - time) / RAMP), 1.0)
-            back = _quintic((time - start - self.machine.swing) / RAMP)
-            ready[:, foot] = np.minimum(ready[:, foot], np.maximum(away, back))
+            swing = Swing.at(time, start, self.machine.swing, self.machine.lift, RAMP)
+            place[:, foot] += swing.progress[:, None] * stride
+            place[:, foot, 2] += swing.height
+            ready[:, foot] = np.minimum(ready[:, foot], swing.ready)
         return place, ready
 
     def sway(self, time: Array) -> Array:
@@ -194,27 +182,6 @@ def _reach(oracle: Oracle, machine: Machine, q: Array, targets: Array, turn: Arr
     return np.hstack([out[:, :7], out[:, places]])
 
 
-def _base_rates(path: Any, time: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Quaternions, body twist parts and their rates, of a spline of position and z-y-x angles."""
-
-    def twist(t: Array) -> tuple[Rotation, Array, Array]:
-        value, rate = path(t), path(t, 1)
-        R = Rotation.from_euler("ZYX", value[:, 3:])
-        _, pitch, roll = value[:, 3:].T
-        yaw_rate, pitch_rate, roll_rate = rate[:, 3:].T
-        omega = [
-            roll_rate - yaw_rate * np.sin(pitch),
-            pitch_rate * np.cos(roll) + yaw_rate * np.sin(roll) * np.cos(pitch),
-            -pitch_rate * np.sin(roll) + yaw_rate * np.cos(roll) * np.cos(pitch),
-        ]
-        return R, R.inv().apply(rate[:, :3]), np.stack(omega, axis=1)
-
-    h = 1e-5
-    R, linear, omega = twist(time)
-    (_, after, spin), (_, before, was) = twist(time + h), twist(time - h)
-    return R.as_quat(), linear, omega, (after - before) / (2 * h), (spin - was) / (2 * h)
-
-
 def _carried(J: Array, needed: Array, ready: Array, kind: str) -> Array:
     """Wrenches (N, C, 6) that hold the base: the least sum of squares, feet that are not ready taking less."""
     size = np.array([1.0, 1.0, 1.0, 0.08, 0.08, 0.08] if kind == "flat" else [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) ** 2
@@ -237,19 +204,19 @@ def truth(
     time = np.arange(round(seconds * rate)) / rate
     n = robot.n
     posture = np.array([machine.posture.get(name, 0.0) for name in robot.joint_names])
-    joints = posture + (0.5 if machine.bolted else 0.15) * _waves(rng, knots, n, 0.15, 0.7)
+    joints = posture + (0.5 if machine.bolted else 0.15) * waves(rng, knots, n, 0.15, 0.7)
     if machine.bolted:
         path = make_interp_spline(knots, joints, k=5)
         q, v, a = path(time), path(time, 1), path(time, 2)
         wrench, ready, J = np.zeros((len(time), 0, 6)), np.ones((len(time), 0)), np.zeros((len(time), 0, 6, n))
     else:
         path, gait = _walked(machine, robot, oracle, knots, joints, rng)
-        quat, linear, omega, linear_rate, omega_rate = _base_rates(path[0], time)
+        base = BaseMotion.along(path[0], time, in_base=True)
         legs = path[1]
-        q = np.hstack([path[0](time)[:, :3], quat, legs(time)])
+        q = np.hstack([path[0](time)[:, :3], base.rotation.as_quat(), legs(time)])
         v, a = (
-            np.hstack([linear, omega, legs(time, 1)]),
-            np.hstack([linear_rate, omega_rate, legs(time, 2)]),
+            np.hstack([base.linear, base.angular, legs(time, 1)]),
+            np.hstack([base.linear_rate, base.angular_rate, legs(time, 2)]),
         )
         ready = gait.feet(time)[1]
         J = np.stack([oracle.jacobian(q, foot) for foot in machine.feet], axis=1)
@@ -274,14 +241,14 @@ def _walked(
     placed = [oracle.pose(stand[None], foot) for foot in machine.feet]
     home, turn = np.stack([p[0] for _, p in placed]), np.stack([R[0] for R, _ in placed])
     gait = Gait(machine, home, float(knots[-1]) + 0.5, rng)
-    waves = _waves(rng, knots, 6, 0.3, 1.5)
+    swaying = waves(rng, knots, 6, 0.3, 1.5)
     base = np.zeros((len(knots), 6))
     lean = 0.4 if len(machine.feet) == 2 else 0.6  # what is left where the zero-moment point is to stay over the feet
     ideal = gait.sway(knots) - gait.home[:, :2].mean(axis=0)
     base[:, :2] = ideal * [1.0, lean]
-    base[:, :3] += machine.size * waves[:, :3]
+    base[:, :3] += machine.size * swaying[:, :3]
     base[:, 2] -= 0.01
-    base[:, 3:] = 4.0 * machine.size * waves[:, 3:]
+    base[:, 3:] = 4.0 * machine.size * swaying[:, 3:]
     turned = Rotation.from_euler("ZYX", base[:, 3:]).as_quat()
     q = _reach(oracle, machine, np.hstack([base[:, :3], turned, joints]), gait.feet(knots)[0], turn)
     return (make_interp_spline(knots, base, k=5), make_interp_spline(knots, q[:, 7:], k=5)), gait

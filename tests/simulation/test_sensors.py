@@ -225,3 +225,63 @@ def test_flags_of_late_feet_are_late(biped_folder: Path) -> None:
 def test_a_foot_that_is_never_loaded_is_never_active() -> None:
     exact = truth(50, contact_wrench_local=np.zeros((50, 2, 6)))
     assert not value(sensor_log(exact, NONE, seed=0).contact_active).any()
+
+
+# ------------------------------------------------------------------------------------- feet that read along the normal
+
+
+def scalar_foot(samples: int = 200) -> tuple[Log, Log]:
+    """An exact log whose first foot reads along the normal, and the same log with wrenches alone."""
+    exact = truth(samples)
+    force = 250.0 + 150.0 * np.sin(0.1 * np.arange(samples))
+    normal = np.stack([force, np.full(samples, np.nan)], axis=1)
+    return dataclasses.replace(exact, contact_force_normal=normal), exact
+
+
+def test_a_foot_that_reads_along_the_normal_reads_nothing_else() -> None:
+    exact, _ = scalar_foot()
+    log = sensor_log(exact, NONE, seed=3)
+    np.testing.assert_array_equal(value(log.contact_force_normal), value(exact.contact_force_normal))
+    wrench = value(log.contact_wrench_local)
+    assert np.isnan(wrench[:, 0]).all()
+    np.testing.assert_array_equal(wrench[:, 1], value(exact.contact_wrench_local)[:, 1])
+    alone = dataclasses.replace(exact, contact_force_normal=value(exact.contact_force_normal)[:, [0, 0]])
+    log = sensor_log(alone, NONE, seed=3)
+    assert log.contact_wrench_local is None
+    np.testing.assert_array_equal(value(log.contact_force_normal), value(alone.contact_force_normal))
+
+
+@pytest.mark.parametrize(
+    "sensors", [SensorImperfectionsConfig(noise=NOISE), SensorImperfectionsConfig(NOISE, BIAS, DelayConfig(True))]
+)
+def test_it_has_the_errors_of_a_force_and_leaves_those_of_all_others_as_they_are(
+    sensors: SensorImperfectionsConfig,
+) -> None:
+    exact, wrenches = scalar_foot()
+    log, other = (sensor_log(one, sensors, seed=2) for one in (exact, wrenches))
+    for name in ("joint_position", "joint_torque", "base_position_world", "base_quat_xyzw"):
+        np.testing.assert_array_equal(value(getattr(log, name)), value(getattr(other, name)), err_msg=name)
+    np.testing.assert_array_equal(value(log.contact_wrench_local)[:, 1], value(other.contact_wrench_local)[:, 1])
+    as_fz = value(wrenches.contact_wrench_local).copy()
+    as_fz[:, 0, 2] = value(exact.contact_force_normal)[:, 0]
+    read = value(sensor_log(dataclasses.replace(wrenches, contact_wrench_local=as_fz), sensors, seed=2).contact_wrench)
+    np.testing.assert_array_equal(value(log.contact_force_normal)[:, 0], read[:, 0, 2])
+    assert np.isnan(value(log.contact_force_normal)[:, 1]).all()
+
+
+def test_noise_bias_and_gain_of_a_force_along_the_normal_are_as_large_as_stated() -> None:
+    force = np.full((10000, 200), 100.0)
+    exact = truth(len(force), feet=200, contact_force_normal=force)
+    noisy = value(sensor_log(exact, SensorImperfectionsConfig(noise=NOISE), seed=0).contact_force_normal) - force
+    np.testing.assert_allclose(noisy.std(axis=0), NOISE.contact_force, rtol=4.0 / np.sqrt(2 * len(force)))
+    exact = truth(2, feet=200, contact_force_normal=np.repeat([[0.0], [100.0]], 200, axis=1))
+    biased = value(sensor_log(exact, SensorImperfectionsConfig(bias=BIAS), seed=0).contact_force_normal)
+    assert biased[0].std() == pytest.approx(BIAS.contact_force, rel=0.15)
+    assert ((biased[1] - biased[0]) / 100.0).std() == pytest.approx(BIAS.gain, rel=0.15)
+
+
+def test_it_touches_while_it_reads_more_than_the_threshold() -> None:
+    force = np.array([0.0, 29.0, 31.0, 500.0, -900.0, -31.0])[:, None] * [1.0, np.nan]
+    active = value(sensor_log(truth(6, contact_force_normal=force), NONE, seed=0).contact_active)
+    assert active[:, 0].astype(int).tolist() == [0, 0, 1, 1, 0, 0]
+    assert active[:, 1].all()

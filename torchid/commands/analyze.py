@@ -18,7 +18,7 @@ from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
-from torchid.errors import ConfigError, SensorError, UnknownNameError, during
+from torchid.errors import ConfigError, SensorError, UnknownNameError, during, warn
 from torchid.fitting.experiment import Scene, set_up_scene, with_noise
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parameters import WRENCH_COMPONENTS
@@ -39,7 +39,8 @@ from torchid.report.analysis import (
 from torchid.report.figures import save_figure, tree_figure
 from torchid.report.tables import progress_bars
 from torchid.sensing import Contact, SensorSet
-from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
+from torchid.sensing.sensors import NORMAL_FORCE
+from torchid.sensor_planning.demands import Candidate, candidates, count_channels, sensor_set
 from torchid.sensor_planning.observability import BaseObservability
 from torchid.sensor_planning.planner import PlanningProblem, SensorPlan, plan_sensors
 
@@ -106,7 +107,13 @@ class AnalysisRequest:
         choice = settings.candidates
         with _errors_at("analysis"):
             offered = candidates(
-                scene.robot, scene.contacts, choice.joint_torques, choice.contacts, settings.costs, choice.ft_sensors
+                robot=scene.robot,
+                contacts=scene.contacts,
+                joint_torques=choice.joint_torques,
+                per=choice.contacts,
+                costs=settings.costs,
+                ft_sensors=choice.ft_sensors,
+                normal_forces=choice.normal_forces,
             )
         proposed = None if config.sensors.empty else scene.sensors_of(config.sensors)
         return cls(
@@ -226,20 +233,15 @@ def _analyze_scenario(
     with _errors_at("analysis"):
         plan = plan_sensors(problem, progress)
     progress("base parameters", 0, 1)
-    planned, proposed = sensor_set(robot, contacts, plan.chosen), None
+    proposed, at_best = None, problem.stack.problem(sensor_set(robot, contacts, plan.chosen))
     if request.proposed is not None:
-        proposed = _assess_proposed(problem, request.proposed, planned, plan.observability)
-    at_best = problem.stack.problem(planned if request.proposed is None else request.proposed)
+        proposed = plan.observability
+        if not is_planned(plan, request.proposed, contacts):
+            proposed = tuple(problem.assess(request.proposed, contacts))
+        at_best = problem.stack.problem(request.proposed, contacts=contacts)
     base = base_parameters(replace(at_best, free=free))
     progress("done", 1, 1)
     return ScenarioAnalysis(name, states, plan, proposed, base)
-
-
-def _assess_proposed(
-    problem: PlanningProblem, proposed: SensorSet, planned: SensorSet, of_planned: tuple[BaseObservability, ...]
-) -> tuple[BaseObservability, ...]:
-    """Observability of the base with the proposed set, which may be the planned one."""
-    return of_planned if same_sensors(proposed, planned, problem.contacts) else tuple(problem.assess(proposed))
 
 
 def _sets_to_compare(
@@ -249,18 +251,36 @@ def _sets_to_compare(
     scene, sets = request.scene, dict(request.compared)
     recorded = {state for samples in train for state, _ in chunks_by_state(samples)}
     for scenario in results:
-        planned = sensor_set(scene.robot, scene.contacts, scenario.plan.chosen, scene.noise)
-        if recorded & set(scenario.states) and not any(
-            same_sensors(planned, other, scene.contacts) for other in sets.values()
-        ):
-            sets[f"planned for {scenario.name}"] = planned
+        plan = scenario.plan
+        planned = sensor_set(scene.robot, scene.contacts, plan.chosen, scene.noise)
+        known = any(is_planned(plan, other, scene.contacts) for other in sets.values())
+        if known or not recorded & set(scenario.states):
+            continue
+        if scalar := planned_along_normals(plan, scene.contacts):
+            needed = f"sensors.contact_wrenches: {{{scalar[0]}: [{NORMAL_FORCE}]}}"
+            bound = f"the file's sensors do not read {', '.join(scalar)} along the normal ({needed})"
+            warn(f"{bound}; no accuracy of the sensors planned for {scenario.name}")
+            continue
+        sets[f"planned for {scenario.name}"] = planned
     return sets
 
 
-def same_sensors(a: SensorSet, b: SensorSet, contacts: Sequence[Contact]) -> bool:
-    """Whether two sets measure the same; what a contact cannot exert does not count."""
-    wrench_a, wrench_b = (measured_components(contacts, sensors) for sensors in (a, b))
-    return np.array_equal(a.torque, b.torque) and np.array_equal(wrench_a, wrench_b)
+def planned_along_normals(plan: SensorPlan, contacts: Sequence[Contact]) -> tuple[str, ...]:
+    """Frames of contacts at which a plan has a scalar sensor alone, while others of the same frames read wrenches."""
+    wrench = sensor_set(plan.problem.robot, contacts, plan.chosen).wrench
+    return tuple(
+        planned.frame
+        for planned, contact, row in zip(plan.problem.contacts, contacts, wrench, strict=True)
+        if planned.along_normal != contact.along_normal and row.any() and not row[list(contact.components)].all()
+    )
+
+
+def is_planned(plan: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]) -> bool:
+    """Whether a set, read along the axes of these contacts, is that of a plan; what none can exert does not count."""
+    planned = sensor_set(plan.problem.robot, contacts, plan.chosen)
+    wrench, other = (measured_components(contacts, one) for one in (planned, sensors))
+    same = np.array_equal(planned.torque, sensors.torque) and np.array_equal(wrench, other)
+    return same and not planned_along_normals(plan, contacts)
 
 
 def write_analysis(analysis: Analysis) -> None:
@@ -294,13 +314,15 @@ def _picture(scene: Scene, scenario: ScenarioAnalysis) -> Figure:
     sensors = sensor_set(robot, scene.contacts, plan.chosen)
     used = [c for c, *active in zip(scene.contacts, *scenario.states, strict=True) if any(active)]
     wrenches = {
-        contact.frame: [WRENCH_COMPONENTS[k] for k in np.flatnonzero(row)]
-        for contact, row in zip(scene.contacts, sensors.wrench, strict=True)
+        contact.frame: [
+            WRENCH_COMPONENTS[k] if row[0] else contact.component_name(k) for k in np.flatnonzero(row).tolist()
+        ]
+        for contact, row in zip(plan.problem.contacts, sensors.wrench, strict=True)
     }
     measured = [name for name, taken in zip(robot.dof_names, sensors.torque, strict=True) if taken]
     constrained = [joint for branch in plan.branches if branch.constrained for joint in branch.joints]
-    channels = sum(candidate.channels for candidate in plan.chosen)
-    title = f"{scenario.name}: {channels} of {sum(c.channels for c in plan.problem.candidates)} sensor channels"
+    channels, possible = count_channels(plan.chosen), count_channels(plan.problem.candidates)
+    title = f"{scenario.name}: {channels} of {possible} sensor channels"
     return tree_figure(title, robot, used, measured, wrenches, constrained)
 
 

@@ -15,8 +15,10 @@ from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_l
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
+    COMPONENTS_ACCEPTED,
     SCOPES_ACCEPTED,
     STRICT,
+    WRENCHES_ACCEPTED,
     Choice,
     ContactConfig,
     Device,
@@ -44,11 +46,13 @@ class CandidatesConfig:
     """Sensors that could be mounted: torques of `joint_torques` (None: all), and at the contacts devices or axes.
 
     `ft_sensors`: fixed joints that could carry a force/torque sensor, a device unless `contacts` are axes.
+    `normal_forces`: contacts that could carry a scalar sensor, `fn`, beside a device or alone.
     """
 
     joint_torques: list[str] | None = None
     contacts: Literal["device", "axis", "none"] = "device"
     ft_sensors: list[str] = dataclasses.field(default_factory=list)
+    normal_forces: list[str] = dataclasses.field(default_factory=list)
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -57,11 +61,11 @@ class AnalysisConfig:
 
     `scenarios`: contact states by scenario, each a list of the frames in contact; None: the states of the training
     logs, or, without logs, all contacts at once. `keep`: candidates that every plan has, `exclude`: that none has;
-    `costs` per channel, by candidate or by kind (joint_torque, contact, ft_sensor). `criterion`: per_sample, the base
-    survives the projection of every sample (None, for a floating base); stack, many samples together determine all that
-    full sensing would (None, for a fixed one). `compare`: sensor sets whose accuracy is predicted from the training
-    logs and measured on the test logs; `prior_error`: standard deviation of the URDF's parameters, as a share of the
-    size of each body.
+    `costs` per channel, by candidate or by kind (joint_torque, contact, normal_force, ft_sensor). `criterion`:
+    per_sample, the base survives the projection of every sample (None, for a floating base); stack, many samples
+    together determine all that full sensing would (None, for a fixed one). `compare`: sensor sets whose accuracy is
+    predicted from the training logs and measured on the test logs; `prior_error`: standard deviation of the URDF's
+    parameters, as a share of the size of each body.
     """
 
     scenarios: Annotated[Scenarios, Field(min_length=1)] | None = None
@@ -171,7 +175,11 @@ _EXPERIMENT = FileKind(
     outputs=("output",),
     prepare=_spelled_out,
     accepted={
+        "contacts": "a list of mappings: [{frame: l_sole, type: flat}]",
+        "contacts.*.frame": "the name of a frame in the URDF",
         "sensors": CHOICE_ACCEPTED,
+        **{f"{where}.contact_wrenches": WRENCHES_ACCEPTED for where in ("sensors", "analysis.compare.*")},
+        **{f"{where}.contact_wrenches.*": COMPONENTS_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         "sensors.offsets": SCOPES_ACCEPTED,
         "sensors.scales": SCOPES_ACCEPTED,
         "analysis.compare.*": CHOICE_ACCEPTED,

@@ -311,15 +311,13 @@ def _in_one_line(kind: FileKind[T], error: ValidationError) -> ConfigError | Unk
     if first["type"] == "too_short" and not first["input"]:
         empty = "an empty mapping" if isinstance(first["input"], Mapping) else "an empty list"
         return ConfigError.at_field(field, empty, "at least one item")
-    value = first["input"]
-    shown = "a mapping" if isinstance(value, Mapping) else "a list" if isinstance(value, list) else _repr(value)
     if first["type"] == "dataclass_type":
         accepted = f"a mapping with {', '.join(_keys_at(kind.settings, key))}"
     else:
         accepted = accepted_values(first)
-    if first["type"] in ("dataclass_type", "dict_type"):
+    if first["type"] in ("dataclass_type", "dict_type", "list_type", "string_type"):
         accepted = kind.accepted_at(key, accepted)
-    return ConfigError.at_field(field, f"found {shown}", accepted)
+    return ConfigError.at_field(field, f"found {_repr(first['input'])}", accepted)
 
 
 def _repr(value: object) -> str:

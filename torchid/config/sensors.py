@@ -34,6 +34,9 @@ Device = Annotated[str, AfterValidator(_torch_device)]
 
 
 Component = Literal["fx", "fy", "fz", "mx", "my", "mz", "fn"]
+COMPONENTS_ACCEPTED = "a list of components: [fx, fy, fz], or [fn] for a force along the ground's normal"
+WRENCHES_ACCEPTED = "a mapping from frames of contacts to components: {l_sole: [fx, fy, fz]}"
+"""Accepted for measured components of a contact, and of all contacts, in messages."""
 
 
 def _per_axis(value: object) -> float | tuple[float, float, float]:

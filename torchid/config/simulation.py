@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -27,10 +27,14 @@ class SimulatedRobotConfig:
 
 @dataclass(config=STRICT, frozen=True)
 class FootConfig:
-    """A URDF frame that touches the floor at `points` [m], by default its link's collision spheres."""
+    """A URDF frame that touches the floor at `points` [m], by default its link's collision spheres.
+
+    `sensor`: what the foot reads, its whole wrench, or `fn`, the force along the floor's normal alone.
+    """
 
     frame: str
     points: list[Point] = dataclasses.field(default_factory=list)
+    sensor: Literal["wrench", "fn"] = "wrench"
 
 
 @dataclass(config=STRICT, frozen=True)

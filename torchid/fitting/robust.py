@@ -27,13 +27,13 @@ from torchid.problem.compression import (
     merge_factors,
     surplus_by_part,
 )
+from torchid.rounding import MAD_PER_STD
 
 TUNING = {"huber": 1.345, "tukey": 4.685}
 """Tuning constants with 95 % efficiency on Gaussian noise; source: Huber, "Robust Statistics", 1981."""
 
 _DECADES, _BINS = (-12.0, 12.0), 4800  # of the histogram that the median of |residual| is read from: 1.2 % a bin
 _LEAST_SLOPE = 0.05  # mean of rho'' below which the loss is flat where the rows are: no standard error
-_NORMAL = 0.6745  # median of |x| of standard normal x
 _CONVERGED = 0.03  # rms change of the predicted rows, in their standard errors
 _STEADY = 0.02  # relative change of the scale, whose histogram has bins of 1.2 %
 _EXACT = 1e-11  # of the predicted rows: less is rounding
@@ -274,7 +274,7 @@ class Reweighting:
         index = int(np.searchsorted(counts, half))
         inside = (half - (counts[index - 1] if index else 0.0)) / max(self._histogram[index], 1.0)
         low, high = _DECADES
-        return float(self.scale * 10.0 ** (low + (high - low) * (index + inside) / _BINS) / _NORMAL)
+        return float(self.scale * 10.0 ** (low + (high - low) * (index + inside) / _BINS) / MAD_PER_STD)
 
     @property
     def mean_weight(self) -> float:

@@ -13,7 +13,6 @@ from torchid.errors import InputError, format_count
 from torchid.log_checks.findings import (
     CONDEMNED,
     NOTE,
-    STD_PER_MAD,
     SUSPICIOUS,
     Finding,
     Skipped,
@@ -37,6 +36,7 @@ from torchid.problem import RowBuilder
 from torchid.problem.predict import force_series
 from torchid.robot import Robot
 from torchid.robot.rolling import rolled_distance
+from torchid.rounding import STD_PER_MAD
 from torchid.sensing import Contact, named_sensors
 
 # ------------------------------------------------------------------------------------------------- flags against forces

@@ -99,10 +99,6 @@ def find_spans(where: BoolArray | NDArray[np.intp], channel: str = "") -> Iterat
             yield Span(int(run[0]), int(run[-1]), channel)
 
 
-#: Standard deviation of a normal distribution over its median absolute deviation.
-STD_PER_MAD = 1.4826
-
-
 def neighbours_of(series: FloatArray, at: NDArray[np.intp], direction: int, count: int) -> FloatArray:
     """The `count` items before (-1) or after (1) some indices `at` (P,) of a series (M, ...), nearest first.
 

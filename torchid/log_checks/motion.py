@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchid.errors import join_names
-from torchid.log_checks.findings import CONDEMNED, STD_PER_MAD, SUSPICIOUS, Finding, Skipped, channel_names
+from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped, channel_names
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
@@ -21,6 +21,7 @@ from torchid.logs.quaternion import (
 )
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
+from torchid.rounding import STD_PER_MAD
 
 # ---------------------------------------------------------------------------------------------- unit of joint positions
 

@@ -13,7 +13,6 @@ from torchid.errors import format_count, join_names
 from torchid.log_checks.findings import (
     CONDEMNED,
     NOTE,
-    STD_PER_MAD,
     SUSPICIOUS,
     ChannelGroup,
     Finding,
@@ -27,6 +26,7 @@ from torchid.log_checks.findings import (
 from torchid.logs import Log
 from torchid.logs.log import CONTACT_READINGS, BoolArray, FloatArray
 from torchid.logs.preprocess import near_contact_changes
+from torchid.rounding import STD_PER_MAD
 
 POSITION_FIELDS = ("joint_position", "base_quat_xyzw", "base_position_world")
 #: Fields whose lasting steps are reported; those of velocities and accelerations are caused by impacts and commands.

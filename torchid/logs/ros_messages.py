@@ -213,6 +213,51 @@ class Wrench:
         return {"wrench": rows if self._sign == 1 else -rows}
 
 
+class NormalForce:
+    """A force along the ground's normal: a number, one of an array of numbers, or one component of a wrench."""
+
+    numbers: tuple[str, ...] = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
+    arrays: tuple[str, ...] = tuple(f"std_msgs/msg/{of}MultiArray" for of in ("Float32", "Float64", "Int16", "Int32"))
+    types: tuple[str, ...] = (*numbers, *arrays, *Wrench.types)
+
+    def __init__(self, topic: str, index: int | None, component: str | None, sign: int) -> None:
+        """With the place of the number in an array, or the component of a wrench; `sign` turns it upwards."""
+        self._topic, self._index, self._component, self._sign = topic, index, component, sign
+
+    def check_options(self, field: str, kind: str) -> None:
+        """Refuse an index or a component, of a field of the settings, that messages of a type do not have.
+
+        Raises:
+            LogError: either; an array without an index.
+        """
+        if kind in self.arrays and self._index is None:
+            found = f"missing, though {self._topic} carries {kind}"
+            raise LogError.at_field(f"{field}.index", found, "which of its numbers is this contact's, from 0 on")
+        for option, value, fits in (
+            ("index", self._index, kind in self.arrays),
+            ("component", self._component, kind in Wrench.types),
+        ):
+            if value is not None and not fits:
+                found = f"{value!r}, though {self._topic} carries {kind}"
+                raise LogError.at_field(f"{field}.{option}", found, f"no {option} of such a message")
+
+    def row(self, message: Any) -> FloatArray:
+        """The force."""
+        if not hasattr(message, "data"):
+            wrench = message.wrench if hasattr(message, "header") else message
+            return np.array([getattr(wrench.force, (self._component or "fz")[1:])])
+        if self._index is None:
+            return np.array([float(message.data)])
+        if self._index >= len(message.data):
+            found = f"an array of {len(message.data)} numbers, without index {self._index}"
+            raise LogError.at_field(self._topic, found, "an index below that, from 0 on")
+        return np.array([float(message.data[self._index])])
+
+    def fields(self, rows: FloatArray) -> dict[str, FloatArray]:
+        """Forces (N, 1)."""
+        return {"force": rows if self._sign == 1 else -rows}
+
+
 class ContactFlag:
     """`std_msgs/Bool`."""
 

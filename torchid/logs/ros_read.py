@@ -21,6 +21,7 @@ from torchid.logs.ros_messages import (
     Decoder,
     Imu,
     JointStates,
+    NormalForce,
     Odometry,
     Stamps,
     TopicMessages,
@@ -28,7 +29,7 @@ from torchid.logs.ros_messages import (
     Wrench,
     make_deserializer,
 )
-from torchid.logs.ros_topics import ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
+from torchid.logs.ros_topics import ForceTopic, ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
 from torchid.logs.timeline import LONGEST_STEP, spline_derivatives
 
 if TYPE_CHECKING:
@@ -155,6 +156,8 @@ class _Bag:
             decoder, given = _decoder(topic), self.channels[name].type
             if given not in decoder.types:
                 raise LogError.at_field(field, f"{name} carries {given}", " or ".join(decoder.types))
+            if isinstance(decoder, NormalForce):
+                decoder.check_options(field, given)
             self.decoders[role], self.rows[role] = decoder, TopicMessages(name, decoder)
 
 
@@ -242,6 +245,8 @@ def _decoder(topic: object) -> Decoder:
         return Imu(topic.topic)
     if isinstance(topic, OdometryTopic):
         return Odometry(topic.topic, topic.twist)
+    if isinstance(topic, ForceTopic):
+        return NormalForce(topic.topic, topic.index, topic.component, topic.sign)
     return Wrench(topic.topic, topic.sign) if isinstance(topic, WrenchTopic) else ContactFlag()
 
 
@@ -282,7 +287,7 @@ def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -
 
 
 def _contacts(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
-    """Contacts in the order of `Topics.contacts`; NaN for the wrench of one without a topic."""
+    """Contacts in the order of `Topics.contacts`; NaN for the wrench, or force, of one without a topic."""
     names = bag.topics.contacts
     if not names:
         return {}
@@ -294,6 +299,11 @@ def _contacts(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries])
         out["contact_wrench_local"] = np.stack(wrenches, axis=1)
         for name, topic in bag.topics.contact_wrenches.items():
             _check_frame(bag, f"contact_wrenches.{name}", topic.frame or name)
+    if bag.topics.contact_force_normal:
+        out["contact_force_normal"] = np.full(active.shape, np.nan)
+        for name in bag.topics.contact_force_normal:
+            force = clock.align(series[f"contact_force_normal.{name}"])["force"]
+            out["contact_force_normal"][:, names.index(name)] = force[:, 0]
     return out
 
 
@@ -304,9 +314,14 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
         if flags is None:
             return np.ones(len(clock.stamps), dtype=np.bool_)
         return clock.hold(flags, flags.fields["active"])[:, 0] != 0.0
-    measured, threshold = series[f"contact_wrenches.{name}"], bag.topics.contact_force_threshold
-    with np.errstate(over="ignore"):  # infinite is above any threshold
-        force = np.linalg.norm(measured.fields["wrench"][:, :3], axis=1)
+    threshold = bag.topics.contact_force_threshold
+    if name in bag.topics.contact_wrenches:
+        measured = series[f"contact_wrenches.{name}"]
+        with np.errstate(over="ignore"):  # infinite is above any threshold
+            force = np.linalg.norm(measured.fields["wrench"][:, :3], axis=1)
+    else:
+        measured = series[f"contact_force_normal.{name}"]
+        force = measured.fields["force"][:, 0]
     if np.isnan(force).any() or threshold is None:
         accepted = "forces to compare with contact_force_threshold, or contact_active"
         raise LogError.at_field(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)

@@ -58,6 +58,21 @@ class WrenchTopic:
 
 
 @dataclass(config=_STRICT, frozen=True)
+class ForceTopic:
+    """A force along the ground's normal: a number of `std_msgs`, one of an array, or one component of a wrench.
+
+    `index`, from 0 on, is that of the contact in an array such as `std_msgs/Float32MultiArray`; `component` that of a
+    `geometry_msgs/WrenchStamped` or `Wrench` whose others the sensor does not read, fz by default. `sign` is -1 where
+    a foot that is pressed on the ground reads less than 0.
+    """
+
+    topic: _Name
+    index: Annotated[int, Field(ge=0, strict=True)] | None = None
+    component: Literal["fx", "fy", "fz"] | None = None
+    sign: Literal[1, -1] = 1
+
+
+@dataclass(config=_STRICT, frozen=True)
 class ContactTopic:
     """`std_msgs/Bool`, or a contact that is `always` active."""
 
@@ -74,6 +89,7 @@ def _contact(value: object) -> object:
 
 
 _Wrenches = dict[str, Annotated[WrenchTopic, BeforeValidator(_topic)]]
+_Forces = dict[str, Annotated[ForceTopic, BeforeValidator(_topic)]]
 _Contacts = dict[str, Annotated[ContactTopic, BeforeValidator(_contact)]]
 
 
@@ -86,7 +102,8 @@ class Topics:
         imu: specific force and angular velocity.
         odometry: pose and twist of the base link.
         contact_wrenches: by contact, the environment's action on the robot at the contact frame, along its axes.
-        contact_active: by contact, its flag; optional for contacts with a wrench.
+        contact_force_normal: by contact, the force along the ground's normal, of scalar sensors.
+        contact_active: by contact, its flag; optional for contacts with a wrench or such a force.
         contact_force_threshold: [N], force above which a contact that is not in `contact_active` is active.
         ft_wrenches: by fixed joint, the wrench of the parent side on the child side, in the joint's child frame.
         rate_topic: topic whose stamps the log takes: `joint_states`, `contact_wrenches.l_sole`, ...
@@ -96,18 +113,19 @@ class Topics:
     imu: Annotated[ImuTopic, BeforeValidator(_topic)] | None = None
     odometry: Annotated[OdometryTopic, BeforeValidator(_topic)] | None = None
     contact_wrenches: _Wrenches = dataclasses.field(default_factory=dict)
+    contact_force_normal: _Forces = dataclasses.field(default_factory=dict)
     contact_active: _Contacts = dataclasses.field(default_factory=dict)
     contact_force_threshold: _Force | None = None
     ft_wrenches: _Wrenches = dataclasses.field(default_factory=dict)
     rate_topic: str = "joint_states"
 
     @property
-    def by_role(self) -> dict[str, JointTopic | ImuTopic | OdometryTopic | WrenchTopic | ContactTopic]:
+    def by_role(self) -> dict[str, JointTopic | ImuTopic | OdometryTopic | WrenchTopic | ForceTopic | ContactTopic]:
         """The topics by their role, such as `imu` or `ft_wrenches.l_ankle_ft`."""
         single = {"joint_states": self.joint_states, "imu": self.imu, "odometry": self.odometry}
         several = {
             f"{key}.{name}": topic
-            for key in ("contact_wrenches", "contact_active", "ft_wrenches")
+            for key in ("contact_wrenches", "contact_force_normal", "contact_active", "ft_wrenches")
             for name, topic in getattr(self, key).items()
         }
         return {role: topic for role, topic in {**single, **several}.items() if topic is not None}
@@ -115,7 +133,7 @@ class Topics:
     @property
     def contacts(self) -> tuple[str, ...]:
         """Names of all contacts."""
-        return tuple(dict.fromkeys((*self.contact_wrenches, *self.contact_active)))
+        return tuple(dict.fromkeys((*self.contact_wrenches, *self.contact_force_normal, *self.contact_active)))
 
 
 def check_topics(topics: Topics) -> None:
@@ -129,7 +147,7 @@ def check_topics(topics: Topics) -> None:
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
             raise ConfigError.at_field(f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
-    unflagged = [name for name in topics.contact_wrenches if name not in topics.contact_active]
+    unflagged = [name for name in topics.contacts if name not in topics.contact_active]
     if unflagged and topics.contact_force_threshold is None:
         found = f"missing, though nothing else says when {unflagged[0]} touches"
         raise ConfigError.at_field("logs.topics.contact_force_threshold", found, "a force [N], or contact_active")

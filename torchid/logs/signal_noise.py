@@ -11,6 +11,7 @@ import numpy as np
 from torchid.logs.log import FloatArray, Log
 from torchid.logs.quaternion import make_sign_continuous
 from torchid.logs.timeline import JITTER, SPLINE_OVERLAP, Timeline, spline_derivatives
+from torchid.rounding import MAD_PER_STD
 
 STATED_FIELDS = {
     "joint_position": ("joint_position",),
@@ -41,7 +42,6 @@ MOST_SAMPLES = 5000
 _FEWEST = 100
 _ORDERS = (7, 9)  # of the differences that show noise: smooth motion vanishes in them
 _WHITE = 0.7  # least ratio of the estimates by both orders: less, and what is there is motion or was filtered
-_NORMAL = 0.6745  # median of |x| of standard normal x
 _LEAST = 1e-12  # share of a channel's largest value: less is rounding
 _LARGEST = 0.02  # [rad, m] noise of joint positions; beyond, successive samples are postures, not motion
 _ORIENTATION = "base_quat_xyzw"
@@ -124,7 +124,7 @@ def white_noise(time: FloatArray, values: FloatArray) -> FloatArray:
 def _left_by_differences(values: FloatArray, order: int) -> FloatArray:
     differences = np.diff(values, n=order, axis=0) / np.sqrt(comb(2 * order, order))
     off = np.abs(differences - np.median(differences, axis=0))
-    return np.asarray(np.minimum(np.median(off, axis=0) / _NORMAL, differences.std(axis=0)))
+    return np.asarray(np.minimum(np.median(off, axis=0) / MAD_PER_STD, differences.std(axis=0)))
 
 
 def _derivatives(step: float, timeline: Timeline) -> FloatArray:

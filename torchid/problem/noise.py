@@ -22,10 +22,9 @@ from torchid.problem.chunks import one_thread
 from torchid.problem.linear import LinearProblem
 from torchid.problem.rows import RowBuilder
 from torchid.problem.sampled_rows import CLIP, SampledRows
-from torchid.rounding import is_significant
+from torchid.rounding import MAD_PER_STD, is_significant
 
 _THINNED = 4  # leverage is computed from one in so many of these
-_NORMAL = 0.6745  # median of |x| of standard normal x
 _CLIPPED = 0.99501  # E[min(x^2, 9)] of standard normal x
 _HELD = 0.005  # weight of the previous variances against the residuals: determines confounded ones
 _LEAST_STEP = 0.05  # least factor of a variance in one step
@@ -212,7 +211,7 @@ def _fitted_directions(problem: LinearProblem, builder: RowBuilder) -> Tensor:
 
 def _clipped_variance(z: Array, weights: Array) -> float:
     """Variance of readings with outliers clipped; for Gaussian ones the same as without clipping."""
-    limit = CLIP * float(np.median(np.abs(z))) / _NORMAL
+    limit = CLIP * float(np.median(np.abs(z))) / MAD_PER_STD
     if limit == 0.0:
         limit = np.inf
     return float(weights @ np.minimum(np.square(z), limit**2) / (_CLIPPED if limit < np.inf else 1.0) / weights.sum())

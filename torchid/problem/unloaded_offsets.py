@@ -10,13 +10,13 @@ from torch import Tensor
 
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
+from torchid.rounding import MAD_PER_STD
 
 _LEAST_READINGS = 16  # readings for one equation
 _BATCHES = 8  # batches of successive readings, whose means show drift
 _MASKED_SHARE = 0.01  # readings are masked or clamped, not measured, if more than this share is exactly 0 ...
 _ONE_SIDED = 0.05  # ... and less than this share has one of the signs (else 0 is one step of a coarse sensor)
 _OUTLYING = 4.0  # standard deviations; of Gaussian readings 6e-5 are dropped
-_NORMAL = 0.6745  # median of |x| of standard normal x
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def _is_masked(y: Tensor) -> bool:
 def _robust_mean(y: Tensor, noise: float, oversampling: float) -> tuple[float, float]:
     """Mean of successive readings (M,) without outliers, and its standard deviation without oversampling."""
     deviation = (y - y.median()).abs()
-    y = y[deviation <= _OUTLYING * max(float(deviation.median()) / _NORMAL, noise)]
+    y = y[deviation <= _OUTLYING * max(float(deviation.median()) / MAD_PER_STD, noise)]
     batches = y[: len(y) // _BATCHES * _BATCHES].view(_BATCHES, -1).mean(1)
     scatter = max(float(y.var()) / len(y), float(batches.var()) / _BATCHES) / oversampling
     return float(y.mean()), max(noise**2 / len(y), scatter) ** 0.5

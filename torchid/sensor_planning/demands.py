@@ -18,8 +18,9 @@ from torchid.problem.extras import measured_components
 from torchid.robot import Robot
 from torchid.rounding import BASE_RANK_TOLERANCE
 from torchid.sensing import Contact, SensorNoise, SensorSet
+from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX
 
-KINDS = ("joint_torque", "contact", "ft_sensor")
+KINDS = ("joint_torque", "contact", "normal_force", "ft_sensor")
 PER = ("device", "axis", "none")
 TOLERANCE = 1e-6
 """A share of unit vectors below this counts as zero, as in the rank of S_b V_x that this predicts.
@@ -33,8 +34,10 @@ class Candidate:
     """A sensor that may be chosen.
 
     `kind`: one of `KINDS`. `dofs`: indices in the robot's `dof_names` that a torque sensor, or a force/torque sensor in
-    a limb, measures. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a sensor there.
-    `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it.
+    a limb, measures. `contact`: index of the contact, and `components`, in `WRENCH_COMPONENTS`, of a sensor there; that
+    of a scalar sensor is the one along the ground's normal of a contact with such axes, see `read_along_normals`.
+    `name`: the joint; the contact's frame for a whole device, "l_sole.fx" for one axis of it, "l_sole.fn" for a scalar
+    sensor.
     """
 
     name: str
@@ -47,7 +50,17 @@ class Candidate:
     @property
     def channels(self) -> int:
         """Number of measured components."""
-        return len(self.components) + len(self.dofs)
+        return len(self.readings)
+
+    @property
+    def readings(self) -> tuple[tuple[int | None, int], ...]:
+        """What it measures: None and an index in `dof_names`, or the contact and a component."""
+        return (*((None, dof) for dof in self.dofs), *((self.contact, k) for k in self.components))
+
+
+def count_channels(chosen: Iterable[Candidate]) -> int:
+    """Number of measured components of some candidates together."""
+    return len({channel for candidate in chosen for channel in candidate.readings})
 
 
 def total_cost(chosen: Iterable[Candidate]) -> float:
@@ -62,6 +75,7 @@ def candidates(
     per: str = "device",
     costs: Mapping[str, float] | None = None,
     ft_sensors: Sequence[str] = (),
+    normal_forces: Sequence[str] = (),
 ) -> tuple[Candidate, ...]:
     """All candidate sensors: joint torques in the robot's order, then the contacts', then those in limbs.
 
@@ -73,10 +87,12 @@ def candidates(
             In limbs, too, a candidate per component with "axis".
         costs: by name of a candidate, or by kind and then per channel; 1 per channel by default.
         ft_sensors: fixed joints that can carry a force/torque sensor, among those that the robot was loaded with.
+        normal_forces: frames of contacts that can carry a scalar sensor of the force along the ground's normal, beside
+            a device or alone.
 
     Raises:
-        UnknownNameError: a joint, or a name in `costs`, that does not exist.
-        SensorError: `per` is not in `PER`, or a cost is not a positive number.
+        UnknownNameError: a joint, a contact, or a name in `costs`, that does not exist.
+        SensorError: `per` is not in `PER`, or "axis" with scalar sensors; a cost is not a positive number.
     """
     if per not in PER:
         raise SensorError("sensors", "candidates.per", f"'{per}'", ", ".join(PER))
@@ -87,17 +103,30 @@ def candidates(
     offered = [
         Candidate(name, "joint_torque", 1.0, dofs=(j,)) for j, name in enumerate(robot.joint_names) if name in chosen
     ]
+    limbs = _in_limbs(robot, ft_sensors, per == "axis")
+    return _with_costs([*offered, *_at_contacts(contacts, per, normal_forces), *limbs], costs or {})
+
+
+def _at_contacts(contacts: Sequence[Contact], per: str, normal_forces: Sequence[str]) -> list[Candidate]:
+    """Sensors of contacts, as devices or axis by axis, and scalar ones."""
+    frames, offered = [contact.frame for contact in contacts], []
+    for name in normal_forces:
+        if name not in frames:
+            raise UnknownNameError("sensors", "candidates.normal_forces", name, frames)
+    if normal_forces and per == "axis":
+        found = f"{', '.join(normal_forces)}, beside single axes of the contacts' frames"
+        raise SensorError("sensors", "candidates.normal_forces", found, "candidates.contacts: device or none")
     for index, contact in enumerate(contacts):
         if per == "device":
             components = tuple(contact.components)
             offered.append(Candidate(contact.frame, "contact", 1.0, contact=index, components=components))
         elif per == "axis":
-            names = zip(contact.component_names, contact.components, strict=True)
-            offered += [
-                Candidate(f"{contact.frame}.{name}", "contact", 1.0, contact=index, components=(k,))
-                for name, k in names
-            ]
-    return _with_costs([*offered, *_in_limbs(robot, ft_sensors, per == "axis")], costs or {})
+            names = [(f"{contact.frame}.{contact.component_name(k)}", k) for k in contact.components]
+            offered += [Candidate(name, "contact", 1.0, contact=index, components=(k,)) for name, k in names]
+        if contact.frame in normal_forces:
+            name = f"{contact.frame}.{NORMAL_FORCE}"
+            offered.append(Candidate(name, "normal_force", 1.0, contact=index, components=(NORMAL_INDEX,)))
+    return offered
 
 
 def _in_limbs(robot: Robot, names: Sequence[str], by_axis: bool) -> list[Candidate]:
@@ -123,6 +152,21 @@ def _with_costs(offered: Sequence[Candidate], costs: Mapping[str, float]) -> tup
             raise SensorError("sensors", f"costs.{name}", str(cost), "a positive number")
     prices = [costs.get(c.name, c.channels * costs.get(c.kind, 1.0)) for c in offered]
     return tuple(replace(c, cost=float(price)) for c, price in zip(offered, prices, strict=True))
+
+
+def read_along_normals(
+    contacts: Sequence[Contact], candidates: Iterable[Candidate], sensors: SensorSet | None = None
+) -> tuple[Contact, ...]:
+    """The contacts, those at which there are candidates of kind "normal_force" with the ground's axes.
+
+    Readings of all components are the same along any axes. A contact of which the sensors read some along its frame's
+    axes keeps these: it cannot have a scalar sensor beside them.
+    """
+    along = {candidate.contact for candidate in candidates if candidate.kind == "normal_force"}
+    if sensors is not None:
+        measured = measured_components(contacts, sensors)
+        along -= {c for c, contact in enumerate(contacts) if 0 < measured[c].sum() < len(contact.components)}
+    return tuple(replace(x, along_normal=True) if c in along else x for c, x in enumerate(contacts))
 
 
 def sensor_set(

@@ -25,6 +25,7 @@ from torchid.sensor_planning.demands import (
     contained_candidates,
     demands,
     orthonormal_basis,
+    read_along_normals,
 )
 
 _ZERO = 1e-5  # share of a unit vector that counts as zero
@@ -110,13 +111,17 @@ def assess_sensors(
         contacts: all contacts.
         states: contact states.
         sensors: the set.
-        choice: candidates for remedies.
+        choice: candidates for remedies; scalar sensors only where the set reads no single axes of the contact.
         samples: number of random postures.
         seed: of these.
         postures: recorded joint positions (N, n) by state [rad or m].
     """
     if robot.fixed_base:
         return []
+    contacts = read_along_normals(contacts, choice, sensors)
+    choice = [
+        c for c in choice if c.kind != "normal_force" or (c.contact is not None and contacts[c.contact].along_normal)
+    ]
     builder, postures = RowBuilder(robot, contacts, sensors), postures or {}
     drawn = random_postures(robot, samples, np.random.default_rng(seed))
     channels = candidates(robot, contacts, per="axis", ft_sensors=robot.ft_names)

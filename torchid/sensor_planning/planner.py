@@ -19,7 +19,7 @@ from torchid.regressor.tree import KinematicTree
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.projection import base_rank
-from torchid.sensor_planning.demands import Candidate, candidates, demands, sensor_set, total_cost
+from torchid.sensor_planning.demands import Candidate, candidates, demands, read_along_normals, sensor_set, total_cost
 from torchid.sensor_planning.observability import BaseObservability, assess_sensors, base_values
 from torchid.sensor_planning.ranking import (
     MotionStack,
@@ -45,7 +45,8 @@ class PlanningProblem:
     """A scenario whose sensors are to be planned.
 
     Attributes:
-        robot, contacts, states: the scenario.
+        robot, contacts, states: the scenario. Contacts at which there are scalar sensors among the candidates are given
+            the ground's axes, along which sensor sets of the plan are then to be read.
         candidates: sensors to choose from; `keep`: those in every set; `exclude`: those in none.
         noise: of the sensors.
         logs: motion for which information is computed; if empty, random motion in the scenario's states.
@@ -66,19 +67,26 @@ class PlanningProblem:
     criterion: str = "per_sample"
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Give contacts the axes that scalar sensors read along."""
+        object.__setattr__(self, "contacts", read_along_normals(self.contacts, self.candidates))
+
     @cached_property
     def stack(self) -> MotionStack:
         """Random motion in the scenario's states, drawn once."""
         return MotionStack(self.robot, self.contacts, self.states, self.candidates, self.seed)
 
-    def assess(self, sensors: SensorSet) -> list[BaseObservability]:
-        """Observability of the base with a sensor set, by contact state, over the postures of the logs as well."""
+    def assess(self, sensors: SensorSet, contacts: Sequence[Contact] | None = None) -> list[BaseObservability]:
+        """Observability of the base with a sensor set, by contact state, over the postures of the logs as well.
+
+        `contacts`: with the axes that the set is read along, if they are not the problem's.
+        """
         pieces: dict[ContactState, list[Array]] = {}
         for samples, state, _ in subsample_states(self.logs, _POSTURES):
             pieces.setdefault(state, []).append(samples.joint_position.numpy())
         return assess_sensors(
             robot=self.robot,
-            contacts=self.contacts,
+            contacts=self.contacts if contacts is None else contacts,
             states=self.states,
             sensors=sensors,
             choice=self.candidates,

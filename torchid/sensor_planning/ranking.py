@@ -56,9 +56,12 @@ class MotionStack:
         self.candidates = tuple(candidates)
         self.samples = structural_samples(robot, contacts, states, seed=seed)
 
-    def problem(self, sensors: SensorSet, friction: bool = True) -> LinearProblem:
-        """The problem of the samples with a sensor set, as `structural_problem`."""
-        return structural_problem(self.robot, self.contacts, sensors, self.states, friction, self.samples)
+    def problem(
+        self, sensors: SensorSet, friction: bool = True, contacts: Sequence[Contact] | None = None
+    ) -> LinearProblem:
+        """The problem of the samples with a sensor set, as `structural_problem`; `contacts` with other axes."""
+        contacts = self.contacts if contacts is None else contacts
+        return structural_problem(self.robot, contacts, sensors, self.states, friction, self.samples)
 
     def rank(self, chosen: Iterable[Candidate]) -> int:
         """Independent combinations of inertial parameters that a set of sensors determines."""
@@ -136,6 +139,7 @@ class SetRanking:
             prior: (12 L,), prior standard deviation of the parameters about the nominal ones, 0 where they are known.
         """
         self.candidates = tuple(candidates)
+        self._always = {reading for other in others for reading in other.readings}
         sensors = sensor_set(robot, contacts, [*candidates, *others], noise)
         builder = RowBuilder(robot, contacts, sensors)
         directions = torch.from_numpy(prior_directions(builder, prior))
@@ -153,20 +157,25 @@ class SetRanking:
 
     def _channel_directions(
         self, builder: RowBuilder, samples: Samples, state: ContactState
-    ) -> tuple[list[int], Tensor]:
-        """Candidate of each channel by index, and its direction in the generalized force, (B, c, n_rows)."""
+    ) -> tuple[list[set[int]], Tensor]:
+        """Candidates by index that alone read each channel, and its direction in the generalized force.
+
+        Directions are (B, c, n_rows); channels that the other sensors read too have none.
+        """
         J = builder.contact_jacobian(samples)
-        base, owners, ways = builder.tree.base_rows, [], []
+        base, owners, ways = builder.tree.base_rows, dict[tuple[int | None, int], set[int]](), []
         for number, candidate in enumerate(self.candidates):
-            for dof in candidate.dofs:
-                way = J.new_zeros(len(samples), J.shape[-1])
-                way[:, base + dof] = 1.0
-                ways.append(way)
-                owners.append(number)
-            if candidate.contact is not None and state[candidate.contact]:
-                ways += [J[:, candidate.contact, k] for k in candidate.components]
-                owners += [number] * len(candidate.components)
-        return owners, torch.stack(ways, dim=1) if ways else J.new_zeros(len(samples), 0, J.shape[-1])
+            for contact, k in candidate.readings:
+                if (contact, k) in self._always or (contact is not None and not state[contact]):
+                    continue
+                if (contact, k) not in owners:
+                    way = J.new_zeros(len(samples), J.shape[-1]) if contact is None else J[:, contact, k]
+                    if contact is None:
+                        way[:, base + k] = 1.0
+                    ways.append(way)
+                owners.setdefault((contact, k), set()).add(number)
+        directions = torch.stack(ways, dim=1) if ways else J.new_zeros(len(samples), 0, J.shape[-1])
+        return list(owners.values()), directions
 
     @one_thread()
     @torch.no_grad()
@@ -175,7 +184,7 @@ class SetRanking:
         kept = {self.candidates.index(candidate) for candidate in chosen}
         information = self._information
         for rows in self._states:
-            left_out = [row for row, owner in enumerate(rows.owners) if owner not in kept]
+            left_out = [row for row, owners in enumerate(rows.owners) if owners.isdisjoint(kept)]
             if left_out:
                 Q = rows.Q[:, left_out]
                 gram = Q @ Q.mT
@@ -250,7 +259,7 @@ class _StateRows:
     """Of B samples with all sensors: Q (B, c, n_rows) and Q R (B, c, P) of the channels, and their candidates."""
 
     weight: float
-    owners: list[int]
+    owners: list[set[int]]
     Q: Tensor
     QR: Tensor
 

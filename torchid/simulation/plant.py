@@ -13,6 +13,7 @@ from torchid.config import FootConfig
 from torchid.errors import ConfigError, InputError, UnknownNameError, UrdfError, how_to_install
 from torchid.parameters import Array
 from torchid.robot.urdf import parse_xml
+from torchid.sensing.sensors import NORMAL_FORCE
 
 try:
     import mujoco
@@ -32,11 +33,15 @@ _SLIP_RATIO = 10.0  # friction's stiffness over the normal one's: soft friction 
 
 @dataclass(frozen=True)
 class Foot:
-    """A link that touches the floor with spheres about points, (k, 3) [m] in its frame, of radii (k,) [m]."""
+    """A link that touches the floor with spheres about points, (k, 3) [m] in its frame, of radii (k,) [m].
+
+    `along_normal`: its sensor reads the force along the floor's normal alone.
+    """
 
     frame: str
     points: tuple[tuple[float, float, float], ...]
     radii: tuple[float, ...]
+    along_normal: bool = False
 
     @property
     def middle(self) -> Array:
@@ -80,16 +85,18 @@ def find_feet(settings: list[FootConfig], urdf: Path) -> tuple[Foot, ...]:
             raise UnknownNameError.at_field("feet", foot.frame, links)
         if frames.count(foot.frame) > 1:
             raise ConfigError.at_field("feet", f"'{foot.frame}' named twice", "every foot once")
+        along_normal = foot.sensor == NORMAL_FORCE
         if foot.points:
             points = tuple((x, y, z) for x, y, z in foot.points)
-            feet.append(Foot(foot.frame, points, (_RADIUS,) * len(points)))
+            feet.append(Foot(foot.frame, points, (_RADIUS,) * len(points), along_normal))
             continue
         shapes = links[foot.frame].findall("collision")
         spheres = [sphere for shape in shapes if (sphere := _sphere(urdf, foot.frame, shape)) is not None]
         if not spheres:
             missing = f"no points, and {urdf.name} has no collision spheres at {foot.frame}"
             raise ConfigError.at_field("feet", missing, "points: [[x, y, z], ...] in the frame of the foot")
-        feet.append(Foot(foot.frame, tuple(point for point, _ in spheres), tuple(radius for _, radius in spheres)))
+        points, radii = zip(*spheres, strict=True)
+        feet.append(Foot(foot.frame, points, radii, along_normal))
     return tuple(feet)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -16,6 +16,7 @@ from torchid.logs import Log
 from torchid.logs.log import BoolArray
 from torchid.parameters import Array
 from torchid.robot.rolling import rolled_distance
+from torchid.sensing.sensors import NORMAL_INDEX
 from torchid.simulation.controller import Controller, ReferenceMotion, Stance, find_stance
 from torchid.simulation.plant import Foot, Plant, find_feet, form_polygon
 
@@ -90,9 +91,9 @@ class Simulation:
 class Recording:
     """One motion as it truly was, sampled at the physics rate from time 0 on.
 
-    `log` holds exact states, the simulator's accelerations, torques and wrenches, and a contact as active while
-    the floor acts on the foot at all. `feet`, (N, F, 3) [m], and `rotations`, (N, F, 3, 3), are the poses of the feet's
-    frames.
+    `log` holds exact states, the simulator's accelerations, torques and wrenches, the force along the normal of feet
+    that read it, and a contact as active while the floor acts on the foot at all. `feet`, (N, F, 3) [m], and
+    `rotations`, (N, F, 3, 3), are the poses of the feet's frames.
     """
 
     log: Log
@@ -137,6 +138,10 @@ def record(
                 progress(report_every / config.control_hz)
     position, velocity, feet, rotations, *pushed = (np.array(x) for x in zip(*frames, strict=True))
     log = _exact_log(plant, motion.name, config.physics_hz, position, velocity, *pushed)
+    along = np.array([foot.along_normal for foot in simulation.feet])
+    if along.any():
+        up = np.einsum("nfi,nfi->nf", rotations[:, :, 2], require_field(log, "contact_wrench_local")[..., :3])
+        log = replace(log, contact_force_normal=np.where(along, up, np.nan))
     return Recording(log, feet, rotations)
 
 
@@ -272,8 +277,9 @@ def _zmp_margin(position: Array, force: Array, moment: Array, stance: Stance, fe
 def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: str | None = None) -> Log:
     """The log that a robot with imperfect sensors would have written.
 
-    Positions, torques and wrenches only: velocities and accelerations are for the preprocessing to derive. A contact
-    is active while the measured force, along its mean over the log, exceeds the threshold.
+    Positions, torques and wrenches only: velocities and accelerations are for the preprocessing to derive. A foot whose
+    exact log has `contact_force_normal` reads this alone. A contact is active while the measured force, of wrenches
+    along its mean over the log, exceeds the threshold.
 
     Args:
         truth: exact log, of a `Recording`.
@@ -285,7 +291,7 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         InputError: a delay of no sample, or of all.
     """
     name = name or truth.source
-    torque, wrench = require_field(truth, "joint_torque"), require_field(truth, "contact_wrench_local")
+    torque, wrench, along = require_field(truth, "joint_torque"), *_foot_readings(truth)
     if sensors.delay.enabled:
         step = float(np.median(np.diff(truth.time)))
         late = round(sensors.delay.feet_s / step)
@@ -309,6 +315,7 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         turn = (Rotation.from_quat(turn) * turns).as_quat()
         torque = noisy(torque, noise.joint_torque)
         wrench = noisy(wrench, np.repeat([noise.contact_force, noise.contact_moment], 3))
+    force = wrench[..., NORMAL_INDEX]
     return Log(
         name,
         time=truth.time,
@@ -318,9 +325,23 @@ def sensor_log(truth: Log, sensors: SensorImperfectionsConfig, seed: int, name: 
         base_position_world=base,
         base_quat_xyzw=turn,
         contact_names=truth.contact_names,
-        contact_active=_loaded(wrench, sensors.contact_threshold),
-        contact_wrench_local=wrench,
+        contact_active=np.where(along, force > sensors.contact_threshold, _loaded(wrench, sensors.contact_threshold)),
+        contact_wrench_local=None if along.all() else np.where(along[:, None], np.nan, wrench),
+        contact_force_normal=np.where(along, force, np.nan) if along.any() else None,
     )
+
+
+def _foot_readings(truth: Log) -> tuple[Array, BoolArray]:
+    """Wrenches on the feet (N, F, 6), of those that read along the normal their reading as fz; and which these are.
+
+    As wrenches all feet get the noise, bias and gain that they have whatever some of them read.
+    """
+    wrench, force = require_field(truth, "contact_wrench_local"), truth.contact_force_normal
+    if force is None:
+        return wrench, np.zeros(wrench.shape[1], dtype=bool)
+    along: BoolArray = np.asarray(np.isfinite(force).any(axis=0))
+    scalar = force[..., None] * (np.arange(6) == NORMAL_INDEX)
+    return np.where(along[:, None], scalar, wrench), along
 
 
 def _biased(

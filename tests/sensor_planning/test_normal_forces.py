@@ -1,0 +1,180 @@
+"""Scalar sensors of contacts as candidates: what they can take the place of, what they tell, and what they cost."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planning import RANDOM, SIX, Machine, minimal_of, sees_the_base, states_of, sufficient_sets
+from synthetic import G1, SOLO12, load
+
+from torchid.errors import SensorError, UnknownNameError
+from torchid.identifiability.structure import structural_samples
+from torchid.parameters import Array
+from torchid.problem import RowBuilder, Samples, compress, linear_problem
+from torchid.problem.chunks import one_thread
+from torchid.problem.linear import parameter_scale
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorNoise, chosen_sensors, named_sensors
+from torchid.sensor_planning.demands import (
+    Candidate,
+    candidates,
+    count_channels,
+    demands,
+    read_along_normals,
+    sensor_set,
+)
+from torchid.sensor_planning.observability import assess_sensors
+from torchid.sensor_planning.planner import PlanningProblem, plan_sensors
+from torchid.sensor_planning.ranking import SetRanking
+from torchid.sensor_planning.search import all_minimal_sets, cheapest_set, demand_groups
+
+FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
+NAMES = tuple(foot.frame for foot in FEET)
+GAIT = states_of("1111", "1001", "0110", "0000")
+NOISE = SensorNoise(joint_torque=0.7, contact_force=3.0, contact_moment=0.4, base_force=5.0, base_moment=1.0)
+MACHINES = {
+    "a leg on a point": Machine({"leg": ("base", (RANDOM,) * 3)}, (Contact("leg3", "point"),), states_of("1")),
+    "a leg on a flat foot": Machine({"leg": ("base", SIX)}, (Contact("leg6", "flat"),), states_of("1")),
+    "a leg on a rocker": Machine({"leg": ("base", SIX[:5])}, (Contact("leg5", "line", "x"),), states_of("1")),
+    "toe and heel": Machine(
+        {"leg": ("base", SIX)}, (Contact("leg6", "point"), Contact("leg5", "point")), states_of("11", "10")
+    ),
+    "a trunk with hands, and a leg": Machine(
+        {"trunk": ("base", (RANDOM,) * 2), "left": ("trunk2", (RANDOM,) * 2), "leg": ("base", (RANDOM,) * 3)},
+        (Contact("left2", "point"), Contact("leg3", "point")),
+        states_of("11", "01"),
+    ),
+}
+
+
+@pytest.mark.parametrize("per", ["device", "none"])
+@pytest.mark.parametrize("name", MACHINES)
+def test_all_sets_without_a_sensor_to_spare_are_those_that_trying_every_set_finds(
+    name: str, per: str, tmp_path: Path
+) -> None:
+    machine = MACHINES[name]
+    robot = machine.robot(tmp_path)
+    choice = candidates(robot, machine.contacts, per=per, normal_forces=[c.frame for c in machine.contacts])
+    contacts = read_along_normals(machine.contacts, choice)
+    assert all(contact.along_normal for contact in contacts)
+    seen = Machine(machine.chains, contacts, machine.states)
+    wanted = demands(robot, contacts, machine.states, choice)
+    parts = [all_minimal_sets(part.demands, part.candidates) for part in demand_groups(wanted, choice)]
+    found = [frozenset().union(*sets) for sets in product(*parts)]  # type: ignore[arg-type]
+    expected = minimal_of(sufficient_sets(seen, robot, choice), choice)
+    assert set(found) == expected
+    assert any(c.kind == "normal_force" for chosen in expected for c in chosen)
+    least = cheapest_set(wanted, choice)
+    assert least.proven
+    assert least.cost == min(sum(c.cost for c in chosen) for chosen in expected)
+
+
+def test_a_scalar_sensor_is_one_channel_named_and_priced_by_itself() -> None:
+    robot, contacts = load(G1), (Contact("left_ankle_roll_link", "flat"), Contact("right_rubber_hand", "point"))
+    frames = [contact.frame for contact in contacts]
+    choice = candidates(robot, contacts, [], normal_forces=frames, costs={"contact": 2.0, "normal_force": 0.5})
+    assert [(c.name, c.kind, c.channels, c.cost) for c in choice] == [
+        ("left_ankle_roll_link", "contact", 6, 12.0),
+        ("left_ankle_roll_link.fn", "normal_force", 1, 0.5),
+        ("right_rubber_hand", "contact", 3, 6.0),
+        ("right_rubber_hand.fn", "normal_force", 1, 0.5),
+    ]
+    assert count_channels(choice) == 9, "the device reads what the scalar sensor does"
+    (alone,) = candidates(robot, contacts, [], "none", {"left_ankle_roll_link.fn": 0.3}, normal_forces=frames[:1])
+    assert (alone.name, alone.cost) == ("left_ankle_roll_link.fn", 0.3)
+    assert read_along_normals(contacts, candidates(robot, contacts)) == contacts
+    assert [contact.along_normal for contact in read_along_normals(contacts, [alone])] == [True, False]
+    axes = candidates(robot, read_along_normals(contacts, choice)[1:], [], "axis")
+    assert [c.name for c in axes] == [f"right_rubber_hand.{k}" for k in ("fx", "fy", "fn")]
+    with pytest.raises(UnknownNameError, match=r"candidates.normal_forces: unknown name 'left_foot'; accepted: left_"):
+        candidates(robot, contacts, normal_forces=["left_foot"])
+    with pytest.raises(
+        SensorError, match=r"normal_forces: left_ankle_roll_link, beside single axes .*: device or none"
+    ):
+        candidates(robot, contacts, per="axis", normal_forces=frames[:1])
+
+
+@pytest.mark.parametrize("kinds", [("point",) * 4, ("flat", "line", "point", "point")])
+def test_leaving_sensors_out_of_the_rows_is_building_the_rows_without_them(kinds: tuple[str, ...]) -> None:
+    """A channel that a device and a scalar sensor read is lost with both only, and not with others' of the same."""
+    robot = load(SOLO12)
+    contacts = tuple(Contact(frame, kind) for frame, kind in zip(NAMES, kinds, strict=True))
+    offered = candidates(robot, contacts, normal_forces=NAMES[:3])
+    contacts, rng = read_along_normals(contacts, offered), np.random.default_rng(2)
+    logs = structural_samples(robot, contacts, GAIT, 25)
+    prior = parameter_scale(robot.nominal).flatten()
+    for fixed in ((), ("FL_HAA", "FL_FOOT", "FR_FOOT.fn")):
+        others = tuple(c for c in offered if c.name in fixed)
+        open_ = tuple(c for c in offered if c not in others)
+        ranking = SetRanking(robot, contacts, logs, open_, others, NOISE, prior)
+        for share in (0.0, 0.3, 0.5, 0.8, 1.0):
+            chosen = tuple(c for c in open_ if rng.uniform() < share)
+            expected = bits(robot, contacts, logs, (*others, *chosen), prior)
+            assert ranking.bits(chosen) == pytest.approx(expected, rel=1e-8, abs=1e-6)
+        scalar = [c for c in open_ if c.kind == "normal_force"]
+        assert ranking.bits(scalar) > ranking.bits([]) or others
+
+
+def test_a_plan_ranks_them_with_the_others_and_takes_them_where_they_are_cheaper() -> None:
+    """A leg of three joints needs three readings; the force along the normal is one of them."""
+    robot = load(SOLO12)
+    prior = parameter_scale(robot.nominal).flatten()
+
+    def problem(**costs: float) -> PlanningProblem:
+        choice = candidates(robot, FEET, costs=costs, normal_forces=NAMES)
+        return PlanningProblem(robot=robot, contacts=FEET, states=GAIT, candidates=choice, prior=prior)
+
+    plan, bare = plan_sensors(problem()), PlanningProblem(robot, FEET, GAIT, candidates(robot, FEET), prior)
+    assert (plan.cost, plan.proven, plan.problem.contacts[0].along_normal) == (12.0, True, True)
+    assert bare.contacts == FEET
+    for part, (foot, *_), other in zip(plan.parts, ((x,) for x in NAMES), plan_sensors(bare).parts, strict=True):
+        assert part.sets is not None
+        assert sum(f"{foot}.fn" in [c.name for c in chosen] for chosen in part.sets) == 3
+        assert [ranked.bits for ranked in part.ranked] == sorted((r.bits for r in part.ranked), reverse=True)
+        known = {names(chosen): bits for bits, chosen in part.ranked}
+        for bits_without, chosen in other.ranked:  # the same sets tell as much whether there are scalar sensors or not
+            assert known[names(chosen)] == pytest.approx(bits_without, rel=1e-6)
+    cheap = plan_sensors(problem(normal_force=0.5))
+    assert (cheap.cost, cheap.proven) == (10.0, True)
+    assert [c.name for c in cheap.chosen if c.kind == "normal_force"] == [f"{foot}.fn" for foot in NAMES]
+    chosen = sensor_set(robot, FEET, cheap.chosen)
+    assert sees_the_base(robot, cheap.problem.contacts, GAIT[:3], [chosen]).all()
+    assert [state.generic.rank for state in cheap.observability] == [6] * 4
+    assert min(removal.base_rank or 0 for removal in cheap.removals) == 5
+
+
+def test_they_are_remedies_where_no_single_axes_of_the_contact_are_read() -> None:
+    robot = load(SOLO12)
+    torques = [name for name in robot.joint_names if name not in ("FL_HFE", "FL_KFE", "FR_KFE")]
+    choice = candidates(robot, FEET, normal_forces=NAMES)
+    for wrenches, remedies in (
+        ({}, {"FL_HFE", "FL_KFE", "FL_FOOT", "FL_FOOT.fn", "FR_KFE", "FR_FOOT", "FR_FOOT.fn"}),
+        ({"FL_FOOT": ["fy"]}, {"FL_HFE", "FL_KFE", "FL_FOOT", "FR_KFE", "FR_FOOT", "FR_FOOT.fn"}),
+    ):
+        sensors = chosen_sensors(robot.joint_names, FEET, torques, wrenches)
+        (check,) = assess_sensors(robot, FEET, GAIT[:1], sensors, choice)
+        assert check.lost is not None
+        assert {c.name for c in check.lost.remedies} == remedies
+    along = read_along_normals(FEET, choice)
+    cured = chosen_sensors(robot.joint_names, along, [*torques, "FL_HFE"], {"FL_FOOT": ["fn"], "FR_FOOT": ["fn"]})
+    (check,) = assess_sensors(robot, along, GAIT[:1], cured, choice)
+    assert (check.generic.rank, check.lost) == (6, None)
+    (check,) = assess_sensors(robot, FEET, GAIT[:1], named_sensors("contacts", robot.n, 4), choice)
+    assert check.lost is None
+
+
+def names(chosen: tuple[Candidate, ...]) -> frozenset[str]:
+    return frozenset(c.name for c in chosen)
+
+
+@one_thread()
+def bits(
+    robot: Robot, contacts: tuple[Contact, ...], logs: list[Samples], chosen: tuple[Candidate, ...], prior: Array
+) -> float:
+    """log2 det(I + H) / 2, of all rows."""
+    builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, chosen, NOISE))
+    A = linear_problem(compress(logs, builder), builder, robot).A * prior
+    return float(np.log1p(np.linalg.svd(A, compute_uv=False) ** 2).sum() / np.log(4.0))

@@ -1,0 +1,144 @@
+"""Simulated feet that read the force along the floor's normal alone, from the simulation to identified parameters."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from motions import value
+from refusals import refusal
+from simulated import QUADRUPED, feet_of, quadruped
+from synthetic import Array, load
+
+from torchid import parameters
+from torchid.cli import main
+from torchid.config import MotionConfig, SensorImperfectionsConfig, SimulationConfig, load_simulation
+from torchid.config.reading import dump
+from torchid.config.simulation import WaveConfig, WhiteNoiseConfig
+from torchid.estimators import LeastSquares
+from torchid.logs import Log, read_log
+from torchid.problem import RowBuilder, bind_log, compress, linear_problem
+from torchid.sensing import Contact, chosen_sensors
+
+WAVES = (
+    *(("com_z", 1.0, 0.03), ("com_x", 0.7, 0.03), ("com_y", 0.9, 0.02)),
+    *(("base_roll", 1.3, 0.1), ("base_pitch", 1.1, 0.1), ("base_yaw", 0.8, 0.15)),
+)
+NOISE = WhiteNoiseConfig(True, 1e-5, 1e-5, 1e-5, joint_torque=0.1, contact_force=0.5, contact_moment=0.1)
+SCALAR = ("front_left_foot", "rear_right_foot")
+"""The feet that read along the normal; the two others read a wrench."""
+
+
+@dataclass(frozen=True)
+class Walked:
+    """What `torchid simulate` has written."""
+
+    config: SimulationConfig
+
+    @property
+    def feet(self) -> tuple[str, ...]:
+        return tuple(foot.frame for foot in self.config.feet)
+
+    def log(self, kind: str, motion: str) -> Log:
+        return read_log(self.config.output / kind / f"{motion}.npz")
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory: pytest.TempPathFactory) -> Walked:
+    folder = tmp_path_factory.mktemp("scalar_feet")
+    motions = [
+        MotionConfig(name, seconds, [WaveConfig(what, speed * hz, size) for what, hz, size in WAVES])
+        for name, seconds, speed in (("train", 4.0, 1.0), ("test", 1.5, 1.2))
+    ]
+    config = quadruped(*motions, sensors=SensorImperfectionsConfig(noise=NOISE, contact_threshold=3.0))
+    feet = [replace(foot, sensor="fn" if foot.frame in SCALAR else "wrench") for foot in config.feet]
+    config = replace(config, feet=feet, output=folder / "simulation")
+    (folder / "simulation.yaml").write_text(dump(config))
+    assert main(["simulate", str(folder / "simulation.yaml")]) == 0
+    return Walked(config)
+
+
+def test_the_log_has_the_vertical_force_of_these_feet_and_wrenches_of_the_others(walked: Walked) -> None:
+    exact, log = walked.log("exact", "test"), walked.log("logs", "test")
+    along = np.array([frame in SCALAR for frame in walked.feet])
+    _, rotations = feet_of(exact, QUADRUPED)
+    up = np.einsum("nfi,nfi->nf", rotations[:, :, 2], value(exact.contact_wrench_local)[..., :3])
+    np.testing.assert_allclose(value(exact.contact_force_normal)[:, along], up[:, along], rtol=0.0, atol=1e-9)
+    assert np.ptp(up[:, along] - value(exact.contact_wrench_local)[:, along, 2]) > 1.0, "not along the foot's own axis"
+    assert np.isnan(value(exact.contact_force_normal)[:, ~along]).all()
+    assert np.isfinite(value(exact.contact_wrench_local)).all()
+    noise = value(log.contact_force_normal)[:, along] - up[:, along]
+    assert noise.std() == pytest.approx(NOISE.contact_force, rel=0.05)
+    assert np.isnan(value(log.contact_force_normal)[:, ~along]).all()
+    assert np.isnan(value(log.contact_wrench_local)[:, along]).all()
+    assert np.isfinite(value(log.contact_wrench_local)[:, ~along]).all()
+    assert load_simulation(walked.config.output / "simulation.yaml") == walked.config
+
+
+@pytest.mark.parametrize("torques", [False, True])
+def test_exact_readings_give_the_parameters_back(walked: Walked, torques: bool) -> None:
+    """All feet are read along the normal; joint torques have the soft floor's creep in them."""
+    exact, robot = walked.log("exact", "train"), load(QUADRUPED)
+    _, rotations = feet_of(exact, QUADRUPED)
+    up = np.einsum("nfi,nfi->nf", rotations[:, :, 2], value(exact.contact_wrench_local)[..., :3])
+    log = replace(exact, contact_wrench_local=None, contact_force_normal=up)
+    contacts = [Contact(foot, "point", along_normal=True) for foot in walked.feet]
+    joints = robot.joint_names if torques else ()
+    true = robot.nominal.copy()
+    true[:, parameters.FRICTION] = 0.0
+    began = replace(robot, nominal=parameters.perturb_parameters(true, 0.2, np.random.default_rng(0)))
+    sensors = chosen_sensors(robot.joint_names, contacts, joints, {foot: ["fn"] for foot in walked.feet})
+    builder = RowBuilder(began, contacts, sensors)
+    problem = linear_problem(compress([bind_log(log, began, contacts, sensors)], builder), builder, began, False)
+    found = LeastSquares().solve(problem)
+
+    def off(phi: Array) -> float:
+        return float(np.linalg.norm(problem.A @ (phi.ravel() - true.ravel())))
+
+    assert found.rank == (94 if torques else 28)
+    assert off(found.phi) < (2e-3 if torques else 1e-10) * off(began.nominal)
+    assert found.phi.reshape(true.shape)[:, 0].sum() == pytest.approx(true[:, 0].sum(), rel=1e-6 if torques else 1e-12)
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf:torchid.errors.TorchidWarning")
+@pytest.mark.filterwarnings("ignore::torchid.errors.NumericalWarning")
+def test_what_is_simulated_is_identified(walked: Walked, capsys: pytest.CaptureFixture[str]) -> None:
+    """From noisy positions, torques and feet of both kinds, with an experiment file that names `fn`."""
+    folder, simulated = walked.config.output.parent, walked.config.output
+    experiment = {
+        "robot": {"urdf": str(simulated / "nominal.urdf")},
+        "contacts": [{"frame": foot, "type": "point"} for foot in walked.feet],
+        "logs": {kind: [str(simulated / "logs" / f"{kind}.npz")] for kind in ("train", "test")},
+        "preprocessing": {"cutoff_hz": 15.0},
+        "sensors": {
+            "joint_torques": list(load(QUADRUPED).joint_names),
+            "contact_wrenches": {foot: ["fn"] if foot in SCALAR else ["fx", "fy", "fz"] for foot in walked.feet},
+        },
+        "estimator": {"name": "least_squares", "ridge": "auto", "friction": False},
+        "output": str(folder / "run"),
+    }
+    (folder / "run.yaml").write_text(yaml.safe_dump(experiment))
+    assert main(["identify", str(folder / "run.yaml")]) == 0, capsys.readouterr().err
+    metrics = json.loads((folder / "run/metrics.json").read_text())
+    assert metrics["test"]["projected_residual"] < 1.3 < 8.0 < metrics["test_nominal"]["projected_residual"]
+    for group in ("joint_torque_rms", "nullspace_rms"):
+        assert metrics["test"][group] < 0.7 * metrics["test_nominal"][group]
+    true, nominal, found = (
+        load(path).nominal[:, 0].sum()
+        for path in (QUADRUPED, simulated / "nominal.urdf", folder / "run/identified.urdf")
+    )
+    assert abs(found - true) < 0.005 < 0.5 < abs(nominal - true)
+    capsys.readouterr()
+    arguments = ["identify", str(folder / "run.yaml"), "sensors=full", f"output={folder / 'full'}"]
+    assert f"contact_wrench '{SCALAR[0]}'" in refusal(arguments, folder, capsys)
+
+
+def test_a_foot_has_one_of_two_sensors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = quadruped()
+    (tmp_path / "sim.yaml").write_text(dump(config).replace("sensor: wrench", "sensor: fz", 1))
+    message = refusal(["simulate", str(tmp_path / "sim.yaml"), f"output={tmp_path / 'out'}"], tmp_path, capsys)
+    assert "feet.0.sensor: found 'fz'; accepted: 'wrench' or 'fn'" in message
