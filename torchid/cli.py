@@ -112,6 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
     check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
     check.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
+    check.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
     check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
     check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
     check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
@@ -120,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, or a bag of ROS messages")
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
     convert.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
+    convert.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
     for name, command in commands.choices.items():
@@ -349,9 +351,10 @@ def _check(options: argparse.Namespace) -> int:
         from torchid.report.log_checks import finding_table, log_heading, skipped_checks_text
         from torchid.report.tables import print_tables
 
-    check_outputs(options.json, options.figure, options.overwrite, (options.file, options.urdf, options.topics))
+    inputs = (options.file, options.urdf, options.topics, options.columns)
+    check_outputs(options.json, options.figure, options.overwrite, inputs)
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
-    checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
+    checked = check_files(options.file, options.overrides, **robot, topics=options.topics, columns=options.columns)
     write_check_outputs(checked, options.json, options.figure)
     if checked:
         _print_rolling(checked[0].rolling)
@@ -370,7 +373,7 @@ def _convert(options: argparse.Namespace) -> None:
     with _importing():
         from torchid.commands.check import convert
 
-    log = convert(options.source, options.target, options.topics, options.overwrite)
+    log = convert(options.source, options.target, options.topics, options.overwrite, options.columns)
     print(f"written to    {options.target}: {len(log)} samples, {', '.join(log.arrays())}")
 
 
