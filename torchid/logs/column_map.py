@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from fnmatch import fnmatchcase
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from torchid.errors import ConfigError, excerpt
+from torchid.errors import ConfigError, UnknownNameError, excerpt
 from torchid.logs.columns import KINDS, component_names, names_field
 from torchid.logs.units import quantities_of, unit_factor
 from torchid.settings import Number
@@ -369,22 +369,25 @@ def _check_pattern(key: str, part: Part, text: str) -> None:
     raise ConfigError.at_field(key, f"{named} in '{excerpt(text)}'", accepted)
 
 
-def require_known_names(columns: Columns, kind: str, known: Any) -> None:
-    """Make sure that all names that a map states are those of a robot.
+def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> None:
+    """Make sure that all names which a map states are those of a robot.
 
     Args:
         columns: the map.
-        kind: joint, contact or sensor.
-        known: called with the key and each name; raises what is to be said of one that is not known.
+        known: names by their kind: joint, contact.
+
+    Raises:
+        UnknownNameError: one that is not.
     """
-    orders = {f"{KEY}.{kind}_order": getattr(columns, f"{kind}_order") or ()}
+    stated: list[tuple[str, str, Iterable[str | None]]] = []
+    for kind in known:
+        stated.append((kind, f"{kind}_order", getattr(columns, f"{kind}_order") or ()))
     for part in list_parts(columns).values():
-        if part.kind == kind:
-            orders[f"{KEY}.{part.key}.order"] = part.entry.order or ()
-            orders[f"{KEY}.{part.key}.columns"] = tuple(part.entry.columns)
-    if kind == "contact" and columns.contact_active is not None:
-        orders[f"{KEY}.contact_active.always"] = columns.contact_active.always
-    for key, names in orders.items():
+        stated.append((part.kind, f"{part.key}.order", part.entry.order or ()))
+        stated.append((part.kind, f"{part.key}.columns", part.entry.columns))
+    if columns.contact_active is not None:
+        stated.append(("contact", "contact_active.always", columns.contact_active.always))
+    for kind, key, names in stated:
         for name in names:
-            if name is not None:
-                known(key, name)
+            if kind in known and name is not None and name not in known[kind]:
+                raise UnknownNameError.at_field(f"{KEY}.{key}", name, known[kind])

@@ -70,10 +70,11 @@ class _Values:
             array = array[None]  # the same at all samples
         if array.ndim == 1 and int(np.prod(shape)) == 1:
             array = array.reshape(-1, *shape)
-        if array.ndim == 0 or array.shape[1:] != shape:
-            words = ", ".join(map(str, ("N", *shape)))
-            accepted = f"({words})" + (f", one for each name of its order ({self.of.labels[0]}, ...)" if shape else "")
-            raise LogError.at_field(f"'{column}'", f"shape {array.shape}", accepted)
+        if array.ndim == 0:
+            raise LogError.at_field(f"'{column}'", "a single value", "a row for each sample")
+        if array.shape[1:] != shape:
+            names = f", one for each name of its order ({self.of.labels[0]}, ...)" if self.of.labels and shape else ""
+            raise LogError.at_field(f"'{column}'", f"shape {_n_by(array.shape[1:])}", f"{_n_by(shape)}{names}")
         return np.asarray(array, dtype=np.float64)
 
     def _shape(self) -> tuple[int, ...]:
@@ -120,7 +121,8 @@ class MappedFields:
     @property
     def flags(self) -> tuple[str, ...]:
         """Columns of a table that may hold true and false."""
-        return () if "contact_active" not in self.fields else self._own("contact_active")
+        of_numbers = self._threshold is not None or "contact_active" not in self.fields
+        return () if of_numbers else self._own("contact_active")
 
     def sources_of(self, name: str) -> tuple[str, ...]:
         """The columns that a field comes from."""
@@ -246,6 +248,10 @@ class MappedFields:
         force = self._values[f"{name}.force"].read(take)
         moment = self._values.get(f"{name}.moment")
         return np.concatenate([force, np.full_like(force, np.nan) if moment is None else moment.read(take)], axis=2)
+
+
+def _n_by(shape: tuple[int, ...]) -> str:
+    return f"({', '.join(map(str, ('N', *shape)))})"
 
 
 def _flagged(values: FloatArray, above: float | None) -> FloatArray:

@@ -307,7 +307,7 @@ def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
 
 def _number(column: str, word: str) -> float:
     try:
-        return float(_FLAGS.get(word.strip().lower(), word))
+        return float(_FLAGS.get(word.strip().lower(), word.replace(",", ".")))
     except ValueError as error:
         raise LogError.at_field(f"column '{column}'", f"'{excerpt(word)}'", "true and false, or 1 and 0") from error
 
