@@ -215,6 +215,20 @@ def test_every_unknown_column_has_its_proposal(tmp_path: Path) -> None:
     assert "'colour';" in message
 
 
+def test_one_foreign_name_has_its_proposal_and_one_misspelt_name_the_nearest(tmp_path: Path) -> None:
+    for name, found in (
+        (
+            "tau_est",
+            "columns: 1 unknown: 'tau_est' (joint_torque?); accepted: names of the log format, or logs.columns",
+        ),
+        ("joint_torqe", "unknown name 'joint_torqe'; accepted: joint_torque"),
+    ):
+        path = save_csv(tmp_path / "x.csv", {"time": TIME, name: TIME})
+        assert found in refused(lambda: read_log(path), f"{path}: ", LogError)  # noqa: B023
+        np.savez(tmp_path / "x.npz", **{"time": TIME, name: TIME})
+        assert found in refused(lambda: read_log(tmp_path / "x.npz"), f"{tmp_path}", LogError)
+
+
 def test_groups_of_hdf5_that_contain_themselves_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.h5"
     with h5py.File(path, "w") as file:

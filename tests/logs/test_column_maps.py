@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,10 +13,12 @@ import pytest
 import yaml
 from dialects import save_csv
 from mapped import ORDER, POSITION, TIME, mapped
+from repository import ROOT, SHARED
 
 from torchid.errors import ConfigError, LogError
 from torchid.logs import Columns, Log, read_log
 from torchid.logs.blocks import open_log_blocks
+from torchid.logs.column_map import check_columns
 from torchid.logs.units import UNITS, unit_factor
 
 
@@ -126,6 +129,15 @@ assert not {"torch", "pyarrow", "h5py"} & set(sys.modules)
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
 
 
+def test_the_maps_of_the_documentation_are_maps_of_at_most_15_lines() -> None:
+    text = (ROOT / "docs" / "logs.md").read_text()
+    blocks = [block for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL) if "columns:" in block]
+    assert len(blocks) == 2
+    for block in blocks:
+        assert len(block.splitlines()) <= 15
+        check_columns(Columns(**yaml.safe_load(block)["logs"]["columns"]))
+
+
 # ---------------------------------------------------------------------------------------------------- units and signs
 
 
@@ -212,3 +224,16 @@ def test_contacts_are_active_where_a_number_is_above_a_threshold_or_always(tmp_p
     assert always.contact_active.all()
     with pytest.raises(LogError, match="contact_active: nan at sample 1, a"):
         mapped(tmp_path, POSITION + 'contact_active: {column: "f_{contact}", above: 20}', f_a=[1, "", 2], f_b=TIME)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="recorded logs are not beside the repository")
+def test_a_recorded_controllers_arrays_are_read_by_four_lines() -> None:
+    text = (
+        "joint_position: dof_pos\njoint_velocity: dof_vel\njoint_torque: {pd: {kp: kp, kd: kd, position: des_dof_pos, "
+    )
+    path = SHARED / "go2_in_air" / "log.npz"
+    log = read_log(path, columns=Columns(**yaml.safe_load(text + "velocity: des_dof_vel}}")))
+    with np.load(path) as raw:
+        expected = raw["kp"] * (raw["des_dof_pos"] - raw["dof_pos"]) + raw["kd"] * (raw["des_dof_vel"] - raw["dof_vel"])
+        assert log.joint_names == tuple(raw["joint_names"])
+    np.testing.assert_array_equal(log.joint_torque, expected)

@@ -7,8 +7,9 @@ import re
 from collections.abc import Sequence
 
 from torchid.errors import LogError, excerpt
-from torchid.logs.log import SHAPES, VARIANTS
+from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS
 
+_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 _LISTED, _LONGEST = 12, 60
 _BASE = r"\b(base|root|trunk|torso|pelvis|floating base)"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
@@ -34,7 +35,7 @@ _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 
 def propose_field(column: str) -> str:
     """The field of a log that a column probably holds, "" if nothing is plausible."""
-    close = difflib.get_close_matches(column.partition(".")[0], (*SHAPES, *VARIANTS), n=1, cutoff=0.8)
+    close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
     if close:
         return close[0]
     words = " ".join(_words(column))
@@ -63,7 +64,12 @@ def name_unknown(columns: Sequence[str]) -> str:
     return ", ".join(named) + (f" and {rest} more" if rest else "")
 
 
+def is_foreign(column: str) -> bool:
+    """Whether an unknown column has another name for a field of the format, rather than a misspelt one."""
+    return bool(propose_field(column)) and not difflib.get_close_matches(column.partition(".")[0], _FIELDS, cutoff=0.5)
+
+
 def unknown_columns(columns: Sequence[str]) -> LogError:
-    """The error of several columns or arrays that the log format does not know, all in one line."""
+    """The error of columns or arrays that the log format does not know, all in one line."""
     accepted = "names of the log format, or logs.columns of an experiment file, which says what they hold"
     return LogError.at_field("columns", f"{len(columns)} unknown: {name_unknown(columns)}", accepted)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, excerpt, is_plain
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
-from torchid.logs.column_proposals import unknown_columns
+from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS, UnknownFieldError, field_shape, is_quaternion
 from torchid.parameters import WRENCH_COMPONENTS
 
@@ -99,7 +99,8 @@ def parse_header(texts: Sequence[str], named: Mapping[str, tuple[str, ...]] | No
         else:
             given.setdefault(column.field, {})[text] = column
     if unknown:
-        raise next(iter(unknown.values())) if len(unknown) == 1 else unknown_columns(list(unknown))
+        (name, failure), *others = unknown.items()
+        raise unknown_columns(list(unknown)) if others or is_foreign(name) else failure
     names: dict[str, tuple[str, ...]] = dict(named or {})
     for field in COLUMN_FIELDS:
         of = names_field(field)

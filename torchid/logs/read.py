@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, current_file, during
 from torchid.logs.column_map import Columns
-from torchid.logs.column_proposals import unknown_columns
+from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.containers import (
     LogKind,
     existing_log_kind,
@@ -136,7 +136,7 @@ def _check_names(names: Collection[str]) -> None:
     """Raise LogError on unknown or missing fields."""
     known = (*SHAPES, *VARIANTS)
     unknown = [name for name in names if name not in known]
-    if len(unknown) == 1:
+    if len(unknown) == 1 and not is_foreign(unknown[0]):
         raise UnknownFieldError.at_field("field", unknown[0], known)
     if unknown:
         raise unknown_columns(unknown)
