@@ -30,6 +30,7 @@ _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
+_INIT = "write an experiment file for a robot and a log, with a map of its columns, and say what was guessed"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
@@ -124,6 +125,11 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
+    init = commands.add_parser("init", help=_INIT, description=_INIT)
+    init.add_argument("urdf", metavar="URDF", help="the robot")
+    init.add_argument("log", metavar="LOG", help="table or arrays: .csv, .parquet, .npz or .h5")
+    init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write: experiment.yaml")
+    init.set_defaults(command=_init)
     for name, command in commands.choices.items():
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
         command.set_defaults(name=name)
@@ -367,6 +373,17 @@ def _check(options: argparse.Namespace) -> int:
         print(fill(f"verdict       {log.verdict}", 100, subsequent_indent=" " * 14))
         print()
     return 0 if all(log.usable for log in checked) else 1
+
+
+def _init(options: argparse.Namespace) -> None:
+    with _importing():
+        from torchid.commands.init import init
+
+    written = init(options.urdf, options.log, options.output)
+    for word in ("found", "guessed", "missing"):
+        for text in getattr(written, word):
+            print(fill(f"{word:<14}{text}", 100, subsequent_indent=" " * 14))
+    print(f"written to    {written.output}; next: torchid check {written.output}")
 
 
 def _convert(options: argparse.Namespace) -> None:

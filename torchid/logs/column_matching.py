@@ -75,7 +75,7 @@ def match_columns(
         LogError: columns that are missing, have two entries or none; all unknown ones are named at once.
     """
     search = _Search(columns, given, named or {})
-    if not search.finds_any and all(map(is_native, given)):
+    if search.parts and not search.finds_any and all(map(is_native, given)):
         return None
     matched = {key: search.match(part) for key, part in search.parts.items()}
     _require_once(matched)

@@ -25,7 +25,7 @@ _WORDS = (
     ("contact_force_normal", r"\b(foot forces?|feet forces?|grf)\b"),
     ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
     ("joint_torque", r"\b(taus?|torques?|efforts?|trq)\b"),
-    ("joint_velocity", r"\b(dqs?|qd|qvel|vel|vels|velocity|velocities|speeds?)\b"),
+    ("joint_velocity", r"\b(dqs?|qd|qvel|vel|vels|velocity|velocities|speeds?|rates?)\b"),
     ("joint_position", r"\b(qs?|qpos|pos|positions?|angles?)\b"),
     ("time", r"\b(t|ts|time|timestamps?|stamps?|ticks?|clock|sec|secs|seconds)\b"),
 )
@@ -33,13 +33,23 @@ _DESIRED = re.compile(r"\b(des|desired|cmd|command|ref|target|goal|setpoint|ff)\
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 
 
-def propose_field(column: str) -> str:
-    """The field of a log that a column probably holds, "" if nothing is plausible."""
+def is_desired(column: str) -> bool:
+    """Whether a column holds what a controller wants, not what was measured."""
+    return bool(_DESIRED.search(" ".join(_words(column))))
+
+
+def propose_field(column: str, desired: bool = False) -> str:
+    """The field of a log that a column probably holds, "" if nothing is plausible.
+
+    Args:
+        column: its name.
+        desired: whether a desired value counts as one that was measured.
+    """
     close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
     if close:
         return close[0]
     words = " ".join(_words(column))
-    if _DESIRED.search(words):
+    if not desired and _DESIRED.search(words):
         return ""
     return next((field for field, pattern in _WORDS if re.search(pattern, words)), "")
 

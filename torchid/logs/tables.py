@@ -25,6 +25,8 @@ from torchid.logs.mapped_fields import MappedFields, map_table
 _BLOCK = 2**22
 #: Rows that are converted at a time.
 _ROWS = 2**16
+#: Rows from which a map is proposed.
+_SAMPLE = 2**12
 #: Limits on the metadata of a Parquet file (bytes of names and statistics, entries of lists); checksums are verified.
 _PARQUET = {
     "thrift_string_size_limit": 2**26,
@@ -60,6 +62,51 @@ def read_table(path: Path, columns: Columns | None = None) -> dict[str, NDArray[
         batches = [batch for _, batch in rest]
         del rest
         return _fields(pa, layout, batches)
+
+
+def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
+    """The columns of a table with some of their first rows, None for those without numbers.
+
+    Raises:
+        LogError: the file cannot be read.
+    """
+    pa = _pyarrow(path)
+    with _complete(path):
+        batch = (_sample_csv if path.suffix.lower() == ".csv" else _sample_parquet)(pa, path)
+        out: dict[str, NDArray[Any] | None] = {}
+        for name, values in zip(batch.schema.names, batch.columns, strict=True):
+            kind = values.type
+            real = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+            out[name] = np.asarray(values.to_numpy(zero_copy_only=False)) if real else None
+        check_header(list(batch.schema.names))
+        return out
+
+
+def _sample_csv(pa: Any, path: Path) -> Any:
+    import pyarrow.csv
+
+    header = _header(path)
+    check_header(header.texts)
+    options = pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=header.texts)
+    if header.is_all:
+        raise LogError(path, "time", "no samples", "at least one sample")
+    mark = header.decimal_mark
+    convert = pyarrow.csv.ConvertOptions(null_values=_EMPTY, strings_can_be_null=True, decimal_point=mark)
+    with path.open("rb") as stream:
+        parse = pyarrow.csv.ParseOptions(delimiter=header.separator)
+        return pyarrow.csv.open_csv(stream, options, parse, convert).read_next_batch()
+
+
+def _sample_parquet(pa: Any, path: Path) -> Any:
+    import pyarrow.parquet
+
+    with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
+        check_header([name for field in file.schema_arrow for name, _ in _leaves(pa, field)])
+        _check_size(path, file.metadata.num_rows, file.metadata.num_columns, whole=False)
+        batch = next(file.iter_batches(_SAMPLE), None)
+    if batch is None:
+        raise LogError(path, "time", "no samples", "at least one sample")
+    return _flat(pa, batch)
 
 
 def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[str, NDArray[Any]]]:
