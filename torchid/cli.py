@@ -34,12 +34,8 @@ _INIT = "write an experiment file for a robot and a log, with a map of its colum
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
-_SHARED = (
-    "identify",
-    "compress",
-    "evaluate",
-    "analyze",
-)  # by the processes that torchrun has started; the first runs all others
+_SHARED = ("identify", "compress", "evaluate", "analyze")
+"""By the processes that torchrun has started; the first runs all others."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -128,7 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     init = commands.add_parser("init", help=_INIT, description=_INIT)
     init.add_argument("urdf", metavar="URDF", help="the robot")
     init.add_argument("log", metavar="LOG", help="table or arrays: .csv, .parquet, .npz or .h5")
-    init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write: experiment.yaml")
+    init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")
     init.set_defaults(command=_init)
     for name, command in commands.choices.items():
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
@@ -379,11 +375,7 @@ def _init(options: argparse.Namespace) -> None:
     with _importing():
         from torchid.commands.init import init
 
-    written = init(options.urdf, options.log, options.output)
-    for word in ("found", "guessed", "missing"):
-        for text in getattr(written, word):
-            print(fill(f"{word:<14}{text}", 100, subsequent_indent=" " * 14))
-    print(f"written to    {written.output}; next: torchid check {written.output}")
+    print(init(options.urdf, options.log, options.output))
 
 
 def _convert(options: argparse.Namespace) -> None:

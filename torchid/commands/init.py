@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import yaml
@@ -45,6 +46,11 @@ class Initiated:
     found: list[str] = field(default_factory=list)
     guessed: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        said = [(word, text) for word in ("found", "guessed", "missing") for text in getattr(self, word)]
+        lines = [fill(f"{word:<14}{text}", 100, subsequent_indent=" " * 14) for word, text in said]
+        return "\n".join([*lines, f"written to    {self.output}; next: torchid check {self.output}"])
 
 
 @dataclass(frozen=True)

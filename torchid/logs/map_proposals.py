@@ -27,7 +27,8 @@ _SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contac
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_])([WXYZ])$|(?<=[a-z])([wxyz])$")
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
-_MOMENT = re.compile(r"moment|torque", re.IGNORECASE)
+_FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
+_MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
 _FOOT = re.compile(r"foot|feet", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
 _STEP = (2e-4, 0.2)  # [s]: of recordings
@@ -111,6 +112,9 @@ class _Proposer:
         used: list[_Family] = [one for one in families if self._place(one)]
         if "joint_torque" not in {*self.given, *self.out.columns}:
             used += self._place_law([one for one in families if one not in used])
+        if set(wrench := self.out.columns.get("contact_wrench_local", {})) == {"moment"}:  # of no use without forces
+            used = [one for one in used if one.pattern != wrench["moment"]["column"]]
+            del self.out.columns["contact_wrench_local"]
         taken = {column for one in used for column in one.columns}
         self.out.left_out = [name for name in foreign if name not in taken]
         ignored = {_anything(one.pattern) for one in families if one not in used}
@@ -179,6 +183,8 @@ class _Proposer:
             entry["first_index"] = first
         if name == "base_quat_wxyz":
             name = self._quaternion(family)
+            if "imu" in family.words.lower():
+                self.out.notes[name] = "of the IMU, taken to be that of the base link; " + self.out.notes.get(name, "")
         if name == "contact_active":
             self._add_threshold(family, entry)
         self._add_order(family, name)
@@ -189,7 +195,8 @@ class _Proposer:
         """The field that a family probably is."""
         name, axes = propose_field(family.words), len(family.axes) == 3
         of_foot = "{contact}" in family.pattern or _FOOT.search(family.words) is not None
-        if axes and of_foot and (name == "contact_force_normal" or _MOMENT.search(family.words)):
+        of_force = name == "contact_force_normal" or _FORCE.search(family.pattern) or _MOMENT.search(family.pattern)
+        if axes and of_foot and of_force:
             return "contact_wrench_local"
         if name == "contact_force_normal" or (not name and of_foot):
             return "contact_active"  # as a threshold: what it is in newtons nobody knows
@@ -206,7 +213,8 @@ class _Proposer:
             return False
         if name.startswith("joint_"):
             named = {x for x in family.names if x}
-            return (len(named) or count) >= len(self.joints) > 0 and not any(family.axes)
+            enough = count >= len(self.joints) if family.numbers else (len(named) or count) == len(self.joints)
+            return enough and len(self.joints) > 0 and not any(family.axes)
         if name.startswith("contact_wrench"):
             return count == 6 * len(self.feet)
         if name.startswith("contact_"):
@@ -217,7 +225,7 @@ class _Proposer:
     def _place_force(self, family: _Family) -> bool:
         """Whether a family is the forces or the moments of contacts."""
         wrench = self.out.columns.setdefault("contact_wrench_local", {})
-        part = "moment" if _MOMENT.search(family.words) else "force"
+        part = "moment" if _MOMENT.search(family.pattern) else "force"
         complete = "".join(sorted(family.axes)).lower() == "xyz" and len(family.columns) == 3 * len(self.feet)
         if part in wrench or not complete or "contact_wrench_local" in self.given:
             if not wrench:

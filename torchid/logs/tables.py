@@ -68,45 +68,48 @@ def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
     """The columns of a table with some of their first rows, None for those without numbers.
 
     Raises:
-        LogError: the file cannot be read.
+        LogError: the file cannot be read, or has no rows.
     """
     pa = _pyarrow(path)
     with _complete(path):
-        batch = (_sample_csv if path.suffix.lower() == ".csv" else _sample_parquet)(pa, path)
-        out: dict[str, NDArray[Any] | None] = {}
-        for name, values in zip(batch.schema.names, batch.columns, strict=True):
-            kind = values.type
-            real = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
-            out[name] = np.asarray(values.to_numpy(zero_copy_only=False)) if real else None
-        check_header(list(batch.schema.names))
-        return out
+        names, batch = (_sample_csv if path.suffix.lower() == ".csv" else _sample_parquet)(pa, path)
+        if batch is None or not batch.num_rows:
+            raise LogError.at_field("time", "no samples", "at least one sample")
+        columns = dict(zip(batch.schema.names, batch.columns, strict=True))
+        read = {name: x for name, x in columns.items() if _is_number(pa, x.type)}
+        return {name: np.asarray(read[name].to_numpy(False)) if name in read else None for name in names}
 
 
-def _sample_csv(pa: Any, path: Path) -> Any:
+def _is_number(pa: Any, type_: Any) -> bool:
+    return bool(pa.types.is_integer(type_) or pa.types.is_floating(type_) or pa.types.is_boolean(type_))
+
+
+def _sample_csv(pa: Any, path: Path) -> tuple[list[str], Any]:
     import pyarrow.csv
 
     header = _header(path)
     check_header(header.texts)
-    options = pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=header.texts)
     if header.is_all:
-        raise LogError(path, "time", "no samples", "at least one sample")
-    mark = header.decimal_mark
-    convert = pyarrow.csv.ConvertOptions(null_values=_EMPTY, strings_can_be_null=True, decimal_point=mark)
+        return header.texts, None
+    options = pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=header.texts)
+    marks = {"decimal_point": header.decimal_mark, "null_values": _EMPTY, "strings_can_be_null": True}
     with path.open("rb") as stream:
         parse = pyarrow.csv.ParseOptions(delimiter=header.separator)
-        return pyarrow.csv.open_csv(stream, options, parse, convert).read_next_batch()
+        return header.texts, pyarrow.csv.open_csv(
+            stream, options, parse, pyarrow.csv.ConvertOptions(**marks)
+        ).read_next_batch()
 
 
-def _sample_parquet(pa: Any, path: Path) -> Any:
+def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
     import pyarrow.parquet
 
     with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        check_header([name for field in file.schema_arrow for name, _ in _leaves(pa, field)])
-        _check_size(path, file.metadata.num_rows, file.metadata.num_columns, whole=False)
-        batch = next(file.iter_batches(_SAMPLE), None)
-    if batch is None:
-        raise LogError(path, "time", "no samples", "at least one sample")
-    return _flat(pa, batch)
+        leaves = {name: type_ for field in file.schema_arrow for name, type_ in _leaves(pa, field)}
+        check_header(list(leaves))
+        _check_size(path, file.metadata.num_rows, len(leaves), whole=False)
+        numbers = [name for name, type_ in leaves.items() if _is_number(pa, type_)]  # of lists nobody knows the size
+        batch = next(file.iter_batches(_SAMPLE, columns=numbers), None) if numbers else None
+    return list(leaves), None if batch is None else _flat(pa, batch)
 
 
 def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[str, NDArray[Any]]]:
@@ -265,9 +268,8 @@ def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> 
     ) as file:
         used = set(layout.sources)
         for name, type_ in (leaf for field in file.schema_arrow for leaf in _leaves(pa, field)):
-            number = pa.types.is_integer(type_) or pa.types.is_floating(type_)
-            fits = pa.types.is_dictionary(type_) if name == TEXT_COLUMN else number
-            if name in used and not fits and not (name in layout.flags and pa.types.is_boolean(type_)):
+            number = _is_number(pa, type_) and (name in layout.flags or not pa.types.is_boolean(type_))
+            if name in used and not (pa.types.is_dictionary(type_) if name == TEXT_COLUMN else number):
                 accepted = "text" if name == TEXT_COLUMN else "real numbers"
                 raise LogError(path, f"column '{name}'", f"values of type {type_}", accepted)
         _check_size(path, file.metadata.num_rows, len(used), whole)
