@@ -17,6 +17,7 @@ from synthetic import ANYMAL, G1, PANDA, ROBOTS, SOLO12
 from torchid.cli import main
 from torchid.commands.init import init
 from torchid.config import load_config
+from torchid.errors import InputError
 from torchid.fitting.experiment import set_up
 from torchid.logs import Log, read_log
 from torchid.robot import load_robot
@@ -172,6 +173,40 @@ def test_nothing_is_ever_replaced_and_nothing_half_written(tmp_path: Path, capsy
         message = refusal(["init", str(urdf), str(source), "--output", str(tmp_path / output)], tmp_path, capsys)
         assert found in message
     assert target.read_text() == "precious"
+
+
+WORDS = ("time", "q", "dq", "tau", "pos", "quat", "imu_acc", "gyro", "foot_force", "contact", "kp", "des_q", "base_pos",
+         "front_left_hip", "front_left_foot", "{joint}", "[0]", "x", "w", "1", "12", "é", "joint_names",
+         "*", "moment")  # fmt: skip
+SHAPES = ((), (0,), (5,), (5, 12), (5, 3), (5, 4), (5, 20), (12,), (5, 4, 6), (5, 4, 3), (3, 2), (1, 12))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_arrays_of_any_names_and_shapes_end_in_a_file_or_in_one_line(tmp_path: Path, seed: int) -> None:
+    rng, written = np.random.default_rng(seed), 0
+    makers = (
+        lambda x: x,
+        lambda x: x > 0,
+        lambda x: np.asarray(x).astype(np.int64),
+        lambda x: np.full_like(x, np.nan),
+        lambda x: np.full(np.shape(x), "a"),
+        lambda x: x + 1j,
+    )
+    for _ in range(25):
+        arrays: dict[str, Any] = {}
+        for _ in range(rng.integers(1, 9)):
+            name = "_".join(rng.choice(WORDS, rng.integers(1, 4)))
+            values = rng.standard_normal(SHAPES[rng.integers(len(SHAPES))]) * 10.0 ** rng.integers(-2, 12)
+            arrays[name] = makers[rng.integers(len(makers))](values)
+        np.savez(tmp_path / "x.npz", **(arrays | {"time": np.arange(5.0) * rng.choice([0.01, 10.0, 1e7, 0.0])}))
+        (tmp_path / "new.yaml").unlink(missing_ok=True)
+        try:
+            init(URDF, tmp_path / "x.npz", tmp_path / "new.yaml")
+        except InputError:
+            continue
+        written += 1
+        yaml.safe_load((tmp_path / "new.yaml").read_text())
+    assert written > 5
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="recorded logs are not beside the repository")

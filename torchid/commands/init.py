@@ -18,7 +18,7 @@ from torchid.config.experiment import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, excerpt, format_count, join_names
 from torchid.logs import Columns, read_log
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
-from torchid.logs.map_proposals import MapProposal, propose_map, read_sample
+from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names
 from torchid.logs.time_range import split_range
 from torchid.robot import CollisionShapes, Robot, load_robot
 
@@ -99,7 +99,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
 
 def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
     """Contacts that a log in the format names, as far as the robot has them."""
-    names = [] if sample.get("contact_names") is None else [str(x) for x in sample["contact_names"].astype(str)]
+    names = stated_names(sample, "contact_names")
     names += [name.split(".")[1] for name in sample if re.fullmatch(r"contact_active\.[^.]+", name)]
     return [name for name in dict.fromkeys(names) if name in robot.links]
 

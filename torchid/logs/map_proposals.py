@@ -85,6 +85,13 @@ def read_sample(path: Path) -> Columns:
     return out
 
 
+def stated_names(sample: Columns, field: str) -> list[str]:
+    """Names of joints, contacts or sensors that a file of arrays states."""
+    stated = sample.get(field)
+    names = [] if stated is None else np.ravel(stated).tolist()
+    return [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names]
+
+
 def propose_map(sample: Columns, joints: Sequence[str], feet: Sequence[str]) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called and what is in them.
 
@@ -103,8 +110,8 @@ class _Proposer:
         self.sample, self.joints, self.feet, self.native = sample, joints, feet, native
         self.given = {name.partition(".")[0] for name in native}
         self.out = MapProposal()
-        stated = sample.get("joint_names")
-        self.names_stated = stated is not None and {_text(x) for x in stated} <= set(joints)
+        stated = stated_names(sample, "joint_names")
+        self.names_stated = bool(stated) and set(stated) <= set(joints)
 
     def propose(self, foreign: Sequence[str]) -> MapProposal:
         numeric = [name for name in foreign if self.sample[name] is not None]
@@ -122,7 +129,8 @@ class _Proposer:
         ignored |= {_anything(one.pattern) for one in used if len(one.numbers) > len(self.joints)}
         if ignored:
             self.out.columns["ignore"] = sorted(ignored)
-        self._add_units()
+        with np.errstate(all="ignore"):  # of numbers that no unit explains
+            self._add_units()
         return self.out
 
     # --------------------------------------------------------------------------------------------------- patterns
@@ -205,7 +213,9 @@ class _Proposer:
     def _fits(self, family: _Family, name: str) -> bool:
         """Whether a family has as many columns as a field."""
         first = self.sample[family.columns[0]]
-        inner = 1 if first is None or first.ndim < 2 else int(np.prod(first.shape[1:]))
+        if first is None or not first.ndim:
+            return False
+        inner = int(np.prod(first.shape[1:]))
         count = max(inner, len(family.columns)) if inner == 1 or len(family.columns) == 1 else 0
         if name == "time":
             return count == 1
@@ -259,7 +269,7 @@ class _Proposer:
             return "base_quat_xyzw" if family.axes[0] in "xX" else "base_quat_wxyz"
         values = [self.sample[column] for column in family.columns]
         flat = np.concatenate([np.atleast_2d(x).T if x.ndim == 1 else x for x in values if x is not None], axis=1)
-        order = "xyzw" if np.nanmean(np.abs(flat[:, 3])) > np.nanmean(np.abs(flat[:, 0])) else "wxyz"
+        order = "xyzw" if np.nansum(np.abs(flat[:, 3])) > np.nansum(np.abs(flat[:, 0])) else "wxyz"
         self.out.notes[f"base_quat_{order}"] = "order of components, with w as the largest"
         return f"base_quat_{order}"
 
@@ -329,9 +339,10 @@ class _Proposer:
         text = re.escape(entry["column"])
         text = re.sub(r"\\{(joint|contact)\\}", ".+", text)
         text = re.sub(r"\\{index(:\d+)?\\}", r"\\d+", re.sub(r"\\{(axis|AXIS)\\}", "[wxyzWXYZ]", text))
-        found = [x for column, x in self.sample.items() if x is not None and re.fullmatch(text, column)]
+        found = [x for column, x in self.sample.items() if x is not None and x.size and re.fullmatch(text, column)]
         flat = [np.asarray(x, dtype=float).reshape(len(x), -1) for x in found]
-        return np.concatenate(flat, axis=1) if flat and len({len(x) for x in flat}) == 1 else None
+        values = np.concatenate(flat, axis=1) if flat and len({len(x) for x in flat}) == 1 else np.zeros((0, 1))
+        return values if np.isfinite(values).any() else None
 
 
 def _si(name: str) -> str:
@@ -344,10 +355,6 @@ def _rms(x: NDArray[np.float64]) -> float:
 
 def _length(x: NDArray[np.float64]) -> float:
     return float(np.nanmedian(np.linalg.norm(x, axis=1)))
-
-
-def _text(name: Any) -> str:
-    return name.decode(errors="replace") if isinstance(name, bytes) else str(name)
 
 
 def _within(stem: str) -> re.Pattern[str]:
