@@ -215,11 +215,32 @@ class MappedFields:
             terms.append(self._values[f"{_PD}.feed_forward"].read(take))
         return np.asarray(sum(terms[1:], terms[0]))
 
-    def check_gains(self) -> None:
-        """Make sure that gains which are stated as numbers are those of all joints; ConfigError where they are not."""
+    def check(self) -> MappedFields:
+        """The fields themselves.
+
+        Raises:
+            LogError: one is computed from others that are not there, or is there twice.
+            ConfigError: gains that are not those of all joints.
+        """
+        for name in self.columns.fields:
+            if name in self.native:
+                found, accepted = f"beside '{self.native[name][0]}'", f"one of the two, the other in {KEY}.ignore"
+                raise LogError.at_field(f"{KEY}.{name}", found, accepted)
+            for other in self._needed(name):
+                if other not in self.fields:
+                    gain = {"joint_position": ".pd.kp", "joint_velocity": ".pd.kd"}.get(other, "")
+                    raise LogError.at_field(f"{KEY}.{name}{gain}", f"given without {other}", f"{other} in the log too")
+        if self.columns.imu_frame is not None and TEXT_COLUMN in self.native:
+            found, accepted = f"beside '{TEXT_COLUMN}' of the file", f"one of the two, the other in {KEY}.ignore"
+            raise LogError.at_field(f"{KEY}.imu_frame", found, accepted)
+        if self._threshold is not None and not (self._own("contact_active") or self._forces):
+            raise LogError.at_field(
+                f"{KEY}.contact_active.above", "set, without a force", "a column, or contact forces"
+            )
         for name in ("kp", "kd"):
             if (gains := getattr(self._law, name, None)) is not None and gains.value:
                 self._stated_gains(name, gains)
+        return self
 
     def _gains(self, name: str, take: Take) -> FloatArray | None:
         gains: Gains | None = getattr(self._law, name, None)
@@ -307,25 +328,6 @@ def _values(matched: Mapping[str, Matched], names: Mapping[str, tuple[str, ...]]
     return out
 
 
-def _checked(fields: MappedFields) -> MappedFields:
-    """The fields; LogError where one is computed from others that are not there, or is there twice."""
-    for name in fields.columns.fields:
-        if name in fields.native:
-            found, accepted = f"beside '{fields.native[name][0]}'", f"one of the two, the other in {KEY}.ignore"
-            raise LogError.at_field(f"{KEY}.{name}", found, accepted)
-        for other in fields._needed(name):
-            if other not in fields.fields:
-                gain = {"joint_position": ".pd.kp", "joint_velocity": ".pd.kd"}.get(other, "")
-                raise LogError.at_field(f"{KEY}.{name}{gain}", f"given without {other}", f"{other} in the log too")
-    if fields.columns.imu_frame is not None and TEXT_COLUMN in fields.native:
-        found = f"beside '{TEXT_COLUMN}' of the file"
-        raise LogError.at_field(f"{KEY}.imu_frame", found, f"one of the two, the other in {KEY}.ignore")
-    if fields._threshold is not None and not (fields._own("contact_active") or fields._forces):
-        raise LogError.at_field(f"{KEY}.contact_active.above", "set, without a force", "a column, or contact forces")
-    fields.check_gains()
-    return fields
-
-
 def map_table(columns: Columns, header: Sequence[str]) -> MappedFields | None:
     """The fields of a table; None for one that needs no map.
 
@@ -338,7 +340,7 @@ def map_table(columns: Columns, header: Sequence[str]) -> MappedFields | None:
         return None
     layout = parse_header(matching.others, matching.names)
     values = _values(matching.matched, layout.names)
-    return _checked(MappedFields(layout.names, columns, layout.columns, values, layout))
+    return MappedFields(layout.names, columns, layout.columns, values, layout).check()
 
 
 def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFields | None:
@@ -359,7 +361,7 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
         return None
     native = {name: (name,) for name in matching.others}
     values = _values(matching.matched, matching.names)
-    return _checked(MappedFields(matching.names, columns, native, values))
+    return MappedFields(matching.names, columns, native, values).check()
 
 
 class MappedArray:
