@@ -13,6 +13,7 @@ from dialects import DIALECTS, save_csv, with_velocity
 from refusals import refusal
 from repository import DEMO, SHARED
 from synthetic import ANYMAL, G1, PANDA, ROBOTS, SOLO12
+from trainings import without_figures
 
 from torchid.cli import main
 from torchid.commands.init import init
@@ -73,6 +74,28 @@ def test_names_alone_give_the_log_where_the_file_has_them(tmp_path: Path, dialec
     log = read_log(path, columns=load_config(tmp_path / "new.yaml").logs.columns)
     order = [log.joint_names.index(joint) for joint in recorded().joint_names]
     np.testing.assert_allclose(log.joint_position[:, order], recorded().joint_position, rtol=1e-9)
+
+
+def test_a_recording_is_identified_without_an_edit_where_names_say_everything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_figures(monkeypatch)
+    name, _, write = DIALECTS["groups"]
+    init(URDF, write(tmp_path / name, recorded()), tmp_path / "new.yaml")
+    more = ("estimator={name: least_squares, ridge: 0.01}", "preprocessing.cutoff_hz=8", "sensors=joints")
+    assert main(["identify", str(tmp_path / "new.yaml"), *more, f"output={tmp_path / 'run'}"]) == 0
+    assert (tmp_path / "run" / "parameters.json").is_file()
+
+
+def test_check_notices_an_order_of_motors_that_was_guessed_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, text, write = DIALECTS["LowState"]
+    init(URDF, write(tmp_path / name, recorded()), tmp_path / "new.yaml")
+    wrong = yaml.safe_load((tmp_path / "new.yaml").read_text())["logs"]["columns"]["joint_order"]
+    assert wrong != yaml.safe_load(text)["joint_order"]
+    assert main(["check", str(tmp_path / "new.yaml")]) == 1
+    assert "exchanged" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_log_in_the_format_needs_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
