@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from torchid.errors import ConfigError, LogError
 from torchid.logs import Columns, Log, read_log
 from torchid.logs.blocks import open_log_blocks
 from torchid.logs.column_map import check_columns
-from torchid.logs.units import UNITS, unit_factor
+from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS
+from torchid.logs.units import UNITS, quantities_of, unit_factor
 
 
 def mapped_arrays(folder: Path, text: str, **arrays: Any) -> Log:
@@ -127,6 +129,14 @@ assert torchid.Columns is not None
 assert not {"torch", "pyarrow", "h5py"} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+
+
+def test_every_field_of_the_format_has_a_key_in_a_map() -> None:
+    keys = {field.name for field in fields(Columns)}
+    assert {*SHAPES, *VARIANTS} - set(NAME_FIELDS) <= keys
+    plain = ("base_quat_", "contact_active", "contact_normal", "imu_frame")  # numbers without a unit, and a name
+    for name in keys & {*SHAPES, *VARIANTS}:
+        assert bool(quantities_of(name, "fx" if "wrench" in name else "")) != name.startswith(plain), name
 
 
 def test_the_maps_of_the_documentation_are_maps_of_at_most_15_lines() -> None:
