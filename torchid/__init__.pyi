@@ -60,6 +60,7 @@ from .log_checks.check import (
     check,
 )
 from .logs import (
+    Columns,
     Log,
     Topics,
     read_log,
@@ -120,6 +121,7 @@ __all__ = [
     "BaseParameters",
     "Calibration",
     "Checked",
+    "Columns",
     "CompressedLog",
     "Conditions",
     "Consistent",

@@ -30,15 +30,12 @@ _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
+_INIT = "write an experiment file for a robot and a log, with a map of its columns, and say what was guessed"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
-_SHARED = (
-    "identify",
-    "compress",
-    "evaluate",
-    "analyze",
-)  # by the processes that torchrun has started; the first runs all others
+_SHARED = ("identify", "compress", "evaluate", "analyze")
+"""By the processes that torchrun has started; the first runs all others."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -112,6 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--base-link", metavar="LINK", help="base of that robot, if it is not the URDF's root")
     check.add_argument("--fixed-base", action="store_true", help="the base of that robot is fixed")
     check.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
+    check.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
     check.add_argument("--json", metavar="FILE", help="write all findings to a .json file")
     check.add_argument("--figure", metavar="FILE", help="write an overview of all channels (.png, .pdf or .svg)")
     check.add_argument("--overwrite", action="store_true", help="replace these two files if they exist")
@@ -120,8 +118,14 @@ def _parser() -> argparse.ArgumentParser:
     convert.add_argument("source", metavar="IN", help="log: .npz, .h5, .csv, .parquet, or a bag of ROS messages")
     convert.add_argument("target", metavar="OUT", help="file to write: .npz, .h5, .csv or .parquet")
     convert.add_argument("--topics", metavar="FILE", help="experiment file with logs.topics, the map of a bag's topics")
+    convert.add_argument("--columns", metavar="FILE", help="experiment file with logs.columns, a map of columns")
     convert.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     convert.set_defaults(command=_convert)
+    init = commands.add_parser("init", help=_INIT, description=_INIT)
+    init.add_argument("urdf", metavar="URDF", help="the robot")
+    init.add_argument("log", metavar="LOG", help="table or arrays: .csv, .parquet, .npz or .h5")
+    init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")
+    init.set_defaults(command=_init)
     for name, command in commands.choices.items():
         command.add_argument("--debug", action="store_true", help="show the traceback of an unexpected error")
         command.set_defaults(name=name)
@@ -219,10 +223,9 @@ def _print_fit(run: Identification) -> None:
 
     estimate, robot = run.estimate, run.experiment.robot
     _print_rolling(run.experiment.rolling)
-    print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
-    print(f"condition     {estimate.condition_number:.3g}")
-    expected = run.misfit.expected
-    rest = "" if expected is None else f"; {expected:.3g} are left by noise alone"
+    identified = f"{estimate.rank} independent combinations of {int(estimate.phi.size)} identified"
+    print(f"parameters    {identified}\ncondition     {estimate.condition_number:.3g}")
+    rest = "" if run.misfit.expected is None else f"; {run.misfit.expected:.3g} are left by noise alone"
     print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise{rest}")
     if run.motion_noise.combinations:
         print(fill(f"motion noise  {run.motion_noise}", 100, subsequent_indent=" " * 14))
@@ -351,9 +354,10 @@ def _check(options: argparse.Namespace) -> int:
         from torchid.report.log_checks import finding_table, log_heading, skipped_checks_text
         from torchid.report.tables import print_tables
 
-    check_outputs(options.json, options.figure, options.overwrite, (options.file, options.urdf, options.topics))
+    inputs = (options.file, options.urdf, options.topics, options.columns)
+    check_outputs(options.json, options.figure, options.overwrite, inputs)
     robot = {"urdf": options.urdf, "base_link": options.base_link, "fixed_base": options.fixed_base}
-    checked = check_files(options.file, options.overrides, **robot, topics=options.topics)
+    checked = check_files(options.file, options.overrides, **robot, topics=options.topics, columns=options.columns)
     write_check_outputs(checked, options.json, options.figure)
     if checked:
         _print_rolling(checked[0].rolling)
@@ -368,11 +372,18 @@ def _check(options: argparse.Namespace) -> int:
     return 0 if all(log.usable for log in checked) else 1
 
 
+def _init(options: argparse.Namespace) -> None:
+    with _importing():
+        from torchid.commands.init import init
+
+    print(init(options.urdf, options.log, options.output))
+
+
 def _convert(options: argparse.Namespace) -> None:
     with _importing():
         from torchid.commands.check import convert
 
-    log = convert(options.source, options.target, options.topics, options.overwrite)
+    log = convert(options.source, options.target, options.topics, options.overwrite, options.columns)
     print(f"written to    {options.target}: {len(log)} samples, {', '.join(log.arrays())}")
 
 

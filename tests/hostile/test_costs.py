@@ -12,7 +12,7 @@ from torchid.guards import FREE_MESSAGES, MAX_GROWTH, MAX_SMALL, Budget, max_unp
 from torchid.logs import Topics, read_log
 from torchid.robot import body_extents, load_robot
 
-FINE = ("urdf", "csv of 20000", "parquet of 20000")  # which are read, or only warned of
+FINE = ("urdf", "csv of 20000", "parquet of 20000", "parquet of 50 structures")  # which are read, or only warned of
 
 
 def read(path: Path) -> None:

@@ -18,7 +18,7 @@ from repository import DEMO
 from torchid.cli import main
 from torchid.commands.training import load_checkpoint
 from torchid.config import load_analysis, load_config, load_simulation
-from torchid.config.experiment import load_topics
+from torchid.config.experiment import load_columns, load_topics
 from torchid.errors import InputError, is_plain
 from torchid.logs import Topics, read_log
 from torchid.parameters import PARAMETERS
@@ -37,7 +37,13 @@ def read(path: Path) -> None:
 def read_settings(path: Path) -> None:
     """As every kind of file that settings may stand in, refused if it is none of them."""
     refused: list[InputError] = []
-    loads: tuple[Callable[[Path], object], ...] = (load_topics, load_simulation, load_analysis, load_config)
+    loads: tuple[Callable[[Path], object], ...] = (
+        load_topics,
+        load_columns,
+        load_simulation,
+        load_analysis,
+        load_config,
+    )
     for load in loads:
         try:
             load(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -155,11 +156,30 @@ def test_text_where_a_number_belongs_is_named_with_its_row(tmp_path: Path) -> No
     assert "column 'time': values of type timestamp[ns]" in log_refusal(path)
 
 
-def test_other_separators_are_recognised(tmp_path: Path) -> None:
-    for separator in (";", "\t"):
-        text = save(tmp_path / "x.csv", columns()).read_text().replace(",", separator)
-        (tmp_path / "x.csv").write_text(text)
-        assert "header: 'time" in log_refusal(tmp_path / "x.csv")
+@pytest.mark.parametrize("separator", [";", "\t"])
+@pytest.mark.parametrize("mark", [".", ","])
+def test_semicolons_tabs_and_decimal_commas_are_recognised(tmp_path: Path, separator: str, mark: str) -> None:
+    header, *rows = save(tmp_path / "x.csv", columns()).read_text().replace(",", separator).split("\n")
+    numbers = [re.sub(r"(?<=\d)\.(?=\d)", mark, row) for row in rows]
+    (tmp_path / "y.csv").write_text("\n".join([header, *numbers]))
+    plain, other = read_log(tmp_path / "x.csv"), read_log(tmp_path / "y.csv")
+    assert other.names == plain.names
+    for field, values in plain.arrays().items():
+        np.testing.assert_array_equal(other.arrays()[field], values)
+
+
+def test_two_decimal_marks_in_a_file_are_refused_by_row(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("time;joint_position.a\n0,0;1,5\n0,1;2.5\n")
+    assert "column 'joint_position.a': '2.5' in row 3; accepted: numbers" in log_refusal(tmp_path / "x.csv")
+    (tmp_path / "y.csv").write_text("time;joint_position.a\n0,0;1,5\n0,1;1.002,5\n")
+    assert "column 'joint_position.a': '1.002,5' in row 3; accepted: numbers" in log_refusal(tmp_path / "y.csv")
+
+
+def test_quoted_names_with_other_separators_in_them_stay_names(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text('time,"joint_position.a;b;c","joint_position.d"\n0,1,2\n')
+    assert read_log(tmp_path / "x.csv").joint_names == ("a;b;c", "d")
+    (tmp_path / "y.csv").write_text('"time";"joint_position.a,b,c";"joint_position.d"\n0;1;2\n')
+    assert read_log(tmp_path / "y.csv").joint_names == ("a,b,c", "d")
 
 
 def test_rows_of_other_lengths_and_repeated_columns_are_refused(tmp_path: Path) -> None:

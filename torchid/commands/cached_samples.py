@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -53,6 +54,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
     config, robot = scene.config, scene.robot
     settings = {name: x for name, x in vars(config.preprocessing).items() if name not in NOT_IN_SAMPLES}
     topics = None if config.logs is None or config.logs.topics is None else asdict(config.logs.topics)
+    columns = None if config.logs is None or config.logs.columns is None else asdict(config.logs.columns)
     return {
         "format": _FORMAT,
         "urdf": [config.robot.urdf.name, file_checksum(config.robot.urdf)],
@@ -62,6 +64,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "preprocessing": settings,
         "motion_noise": config.sensors.noise.motion,
         "topics": topics,
+        "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }
 
 

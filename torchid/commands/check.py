@@ -13,14 +13,15 @@ import numpy as np
 from torchid.commands.folder import check_free_file
 from torchid.commands.reading import memory_needed
 from torchid.config import load_analysis
-from torchid.config.experiment import PreprocessingConfig, load_topics
+from torchid.config.experiment import PreprocessingConfig, load_columns, load_topics
+from torchid.config.logs import LogsConfig
 from torchid.config.sensors import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file
 from torchid.fitting.contacts import resolve_contacts
 from torchid.fitting.experiment import set_up_scene
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check
-from torchid.logs import Log, Topics, read_log, write_log
+from torchid.logs import Columns, Log, Topics, read_log, write_log
 from torchid.logs.blocks import open_log_blocks
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, new_log_kind
 from torchid.logs.time_range import split_range
@@ -43,13 +44,15 @@ def check_files(
     base_link: str | None = None,
     fixed_base: bool = False,
     topics: str | Path | None = None,
+    columns: str | Path | None = None,
 ) -> list[Checked]:
     """Check the logs of an experiment file, or one log; see `check_experiment` and `check_log`.
 
     Raises:
         ConfigError: options of the one with the other.
     """
-    options = {"--urdf": urdf, "--base-link": base_link, "--fixed-base": fixed_base, "--topics": topics}
+    options = {"--urdf": urdf, "--base-link": base_link, "--fixed-base": fixed_base}
+    options |= {"--topics": topics, "--columns": columns}
     given = [name for name, value in options.items() if value]
     if Path(path).suffix.lower() in EXPERIMENTS:
         if given:
@@ -60,7 +63,7 @@ def check_files(
         raise ConfigError("command line", "overrides", found, f"an experiment file ({', '.join(EXPERIMENTS)})")
     if urdf is None and (base_link or fixed_base):
         raise ConfigError("command line", given[0], "given without a robot", "--urdf too")
-    return [check_log(path, urdf, base_link, fixed_base, topics)]
+    return [check_log(path, urdf, base_link, fixed_base, topics, columns)]
 
 
 def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Checked]:
@@ -79,7 +82,7 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     checked = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
-            log = read_log_to_check(file, config.logs.topics, config.preprocessing)
+            log = read_log_to_check(file, config.logs, config.preprocessing)
             found = check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
@@ -91,6 +94,7 @@ def check_log(
     base_link: str | None = None,
     fixed_base: bool = False,
     topics: str | Path | None = None,
+    columns: str | Path | None = None,
 ) -> Checked:
     """Check one log, by itself or against a robot.
 
@@ -100,11 +104,14 @@ def check_log(
         base_link: as in an experiment file.
         fixed_base: likewise.
         topics: experiment file whose `logs.topics` says what the topics of a bag hold.
+        columns: experiment file whose `logs.columns` says what foreign columns or arrays hold.
 
     Raises:
         InputError: the log or the URDF cannot be read, or the log is larger than an experiment's may be by default.
     """
-    log = read_log_to_check(Path(path), None if topics is None else load_topics(topics), PreprocessingConfig())
+    _require_memory(Path(path), PreprocessingConfig())
+    of_topics, of_columns = _maps(topics, columns)
+    log = read_log(path, of_topics, allow_gaps=True, columns=of_columns)
     if urdf is None:
         return check(log)
     robot = load_robot(urdf, base_link, fixed_base, log.ft_names)
@@ -119,29 +126,31 @@ def check_log(
     return replace(check(log, robot, contacts), rolling=rolling)
 
 
-def read_log_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Log:
-    """A log as it was read.
+def read_log_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
+    """One of the logs of an experiment as it was read.
 
     Raises:
         LogError: it cannot be read, or is larger than what may be in memory at once.
     """
     _require_memory(path, settings)
-    return read_log(path, topics, allow_gaps=True)
+    return read_log(path, logs.topics, allow_gaps=True, columns=logs.columns)
 
 
-def stretches_to_check(path: Path, topics: Topics | None, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
-    """The log in equal stretches of at most `MOST_CHECKED` samples, each with a name that says which; the middle first.
+def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
+    """One of the logs of an experiment in equal stretches of at most `MOST_CHECKED` samples, the middle first.
+
+    Each has a name that says which.
 
     Raises:
         LogError: as `read_log_to_check`.
     """
     _require_memory(path, settings)
     if existing_log_kind(path) is LogKind.BAG:
-        log = read_log(path, topics, allow_gaps=True)
+        log = read_log(path, logs.topics, allow_gaps=True)
         for stretch in _stretches(len(log)):
             yield log.select(stretch), _stretch_name(path, stretch, len(log))
         return
-    with open_log_blocks(path, None) as blocks:
+    with open_log_blocks(path, None, logs.columns) as blocks:
         for stretch in _stretches(len(blocks)):
             yield blocks.read(stretch, allow_gaps=True), _stretch_name(path, stretch, len(blocks))
 
@@ -208,13 +217,25 @@ def write_check_outputs(checked: Sequence[Checked], document: str | None, figure
             save_figure(log_check_figure(checked), new, Path(figure).suffix[1:].lower())
 
 
-def convert(source: str | Path, target: str | Path, topics: str | Path | None = None, overwrite: bool = False) -> Log:
+def _maps(topics: str | Path | None, columns: str | Path | None) -> tuple[Topics | None, Columns | None]:
+    """The maps in experiment files."""
+    return None if topics is None else load_topics(topics), None if columns is None else load_columns(columns)
+
+
+def convert(
+    source: str | Path,
+    target: str | Path,
+    topics: str | Path | None = None,
+    overwrite: bool = False,
+    columns: str | Path | None = None,
+) -> Log:
     """Read a log and write it as a file of another type, which appears complete or not at all.
 
     Args:
         source: any log that can be read.
         target: .npz, .h5, .hdf5, .csv or .parquet.
         topics: experiment file whose `logs.topics` says what the topics of a bag hold.
+        columns: experiment file whose `logs.columns` says what foreign columns or arrays hold.
         overwrite: whether `target` may be replaced; what is read never is, as a log may hold more than is written.
 
     Returns:
@@ -225,11 +246,16 @@ def convert(source: str | Path, target: str | Path, topics: str | Path | None = 
     """
     path = Path(target)
     new_log_kind(path)
-    check_free_file(path, "OUT", overwrite, (split_range(source).file, *([] if topics is None else [topics])))
-    mapped = None if topics is None else load_topics(topics)
+    inputs = (split_range(source).file, *(one for one in (topics, columns) if one is not None))
+    check_free_file(path, "OUT", overwrite, inputs)
+    of_topics, of_columns = _maps(topics, columns)
     with progress_bars() as bars:
         reading = bars.add_task("reading", total=None)
-        log = read_log(source, mapped, lambda share: bars.update(reading, completed=round(100 * share), total=100))
+
+        def show(share: float) -> None:
+            bars.update(reading, completed=round(100 * share), total=100)
+
+        log = read_log(source, of_topics, show, columns=of_columns)
         bars.update(reading, completed=100, total=100)
         bars.add_task("writing", total=None)
         write_log(log, path)

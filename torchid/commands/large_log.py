@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchid.config.experiment import PreprocessingConfig
 from torchid.errors import LogError, about_file
-from torchid.logs import Log
+from torchid.logs import Columns, Log
 from torchid.logs.blocks import GIGABYTE, LogBlocks, count_samples_from, open_log_blocks
 from torchid.logs.coverage import Coverage, warn_of_gaps
 from torchid.logs.log import CONTACT_READINGS, BoolArray, FloatArray
@@ -61,6 +61,7 @@ class LargeLog:
         required: sensors whose every value must be there, None if gaps are allowed.
         folder: where there is room for the samples; None: in memory.
         motion_noise: of the recorded motion, as far as it is stated, as `preprocess` takes it.
+        columns: as of `read_log`.
     """
 
     path: Path
@@ -70,6 +71,7 @@ class LargeLog:
     required: SensorSet | None
     folder: Path | None
     motion_noise: Mapping[str, float] = field(default_factory=dict)
+    columns: Columns | None = None
 
     def samples(self, with_unloaded: bool = True) -> Samples:
         """What reading, preprocessing and binding the log as a whole would give.
@@ -100,7 +102,7 @@ class LargeLog:
             with_unloaded: as in `samples`.
             own: which of the log's blocks, from the numbers of their samples; all by default.
         """
-        with about_file(self.path), open_log_blocks(self.path, self.folder) as blocks:
+        with about_file(self.path), open_log_blocks(self.path, self.folder, self.columns) as blocks:
             course = self._course(blocks, with_unloaded)
             pieces, kept = list(self._pieces(blocks, len(course.time))), course.kept
             mine = pieces[own([piece.stop - piece.start for piece in pieces])]

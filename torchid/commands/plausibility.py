@@ -182,7 +182,7 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     findings: list[tuple[str, Finding]] = []
     for path in files.train:
         with suppress(InputError):  # larger than memory: it is not checked
-            for log, name in stretches_to_check(path, files.topics, scene.config.preprocessing):
+            for log, name in stretches_to_check(path, files, scene.config.preprocessing):
                 checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
                 severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
                 findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]

@@ -84,8 +84,8 @@ class LogReader:
         settings, files = self.scene.config.preprocessing, self.scene.config.logs
         if self._takes_blocks(log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
             return self._large_log(path, required, None).samples(fits_contact_offsets(self.scene))
-        topics = None if files is None else files.topics
-        recorded = read_log(path, topics, allow_gaps=settings.exclude_condemned)
+        topics, columns = (None, None) if files is None else (files.topics, files.columns)
+        recorded = read_log(path, topics, allow_gaps=settings.exclude_condemned, columns=columns)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz, self._stated)
@@ -117,7 +117,17 @@ class LogReader:
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
         scene = self.scene
-        return LargeLog(path, scene.config.preprocessing, scene.robot, scene.contacts, required, folder, self._stated)
+        settings = scene.config.preprocessing
+        return LargeLog(
+            path,
+            settings,
+            scene.robot,
+            scene.contacts,
+            required,
+            folder,
+            motion_noise=self._stated,
+            columns=None if scene.config.logs is None else scene.config.logs.columns,
+        )
 
     @property
     def _stated(self) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,10 +29,14 @@ from torchid.config.sensors import (
     validate_choice,
 )
 from torchid.errors import ConfigError, about_file
-from torchid.logs import Topics
+from torchid.logs import Columns, Topics
+from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
 from torchid.settings import NotNegative, Positive, Seed
+
+COLUMNS_ACCEPTED = "the name of a column, a pattern such as {joint}_q, or a mapping with column, unit, scale, ..."
+"""Accepted for an entry of a map of columns, in messages."""
 
 JOINTS_ACCEPTED = "the name of a topic, or a mapping with topic and joints"
 """Accepted for the one topic that every bag needs, in messages."""
@@ -185,6 +189,7 @@ _EXPERIMENT = FileKind(
         "analysis.compare.*": CHOICE_ACCEPTED,
         "estimator.robust": ROBUST_ACCEPTED,
         "logs.topics.joint_states": JOINTS_ACCEPTED,
+        "logs.columns.*": COLUMNS_ACCEPTED,
     },
 )
 _ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": "robot, contacts, output"}))
@@ -243,19 +248,33 @@ def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
 
 
 @dataclass(config=STRICT, frozen=True)
-class _Logs:
+class _TopicsOfLogs:
     topics: Topics
 
 
 @dataclass(config=STRICT, frozen=True)
 class _TopicsFile:
-    logs: _Logs
+    logs: _TopicsOfLogs
 
 
-def _topics_alone(settings: Settings, _: Settings) -> Settings:
-    """The key `logs.topics` alone."""
-    logs = settings.get("logs")
-    return {"logs": {key: x for key, x in logs.items() if key == "topics"} if isinstance(logs, dict) else {}}
+@dataclass(config=STRICT, frozen=True)
+class _ColumnsOfLogs:
+    columns: Columns
+
+
+@dataclass(config=STRICT, frozen=True)
+class _ColumnsFile:
+    logs: _ColumnsOfLogs
+
+
+def _alone(name: str) -> Callable[[Settings, Settings], Settings]:
+    """What leaves one key of `logs` alone of all settings."""
+
+    def prepare(settings: Settings, _: Settings) -> Settings:
+        logs = settings.get("logs")
+        return {"logs": {key: x for key, x in logs.items() if key == name} if isinstance(logs, dict) else {}}
+
+    return prepare
 
 
 _TOPICS = FileKind(
@@ -263,8 +282,16 @@ _TOPICS = FileKind(
     name="experiment",
     keys="logs.topics",
     list_example="logs.topics.joint_states.joints=[l_knee]",
-    prepare=_topics_alone,
+    prepare=_alone("topics"),
     accepted={"logs.topics.joint_states": JOINTS_ACCEPTED},
+)
+_COLUMNS = FileKind(
+    settings=_ColumnsFile,
+    name="experiment",
+    keys="logs.columns",
+    list_example="logs.columns.joint_order=[l_knee]",
+    prepare=_alone("columns"),
+    accepted={"logs.columns.*": COLUMNS_ACCEPTED},
 )
 
 
@@ -279,6 +306,14 @@ def load_topics(path: str | Path) -> Topics:
     with about_file(path):
         check_topics(topics)
     return topics
+
+
+def load_columns(path: str | Path) -> Columns:
+    """Read `logs.columns` from an experiment file, as `load_topics` does `logs.topics`."""
+    columns = load(_COLUMNS, Path(path)).logs.columns
+    with about_file(path):
+        check_columns(columns)
+    return columns
 
 
 def _check_extras(config: _Common) -> None:
@@ -300,6 +335,8 @@ def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:
     checked = resolve_logs(logs)
     if logs.topics is not None:
         check_topics(logs.topics)
+    if logs.columns is not None:
+        check_columns(logs.columns)
     _check_factors(config, checked)
     return checked
 

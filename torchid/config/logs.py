@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT
 from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, warn_about_file
-from torchid.logs import Topics
+from torchid.logs import Columns, Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
 from torchid.logs.remote import RemoteFile, as_path, list_matching
 from torchid.logs.time_range import LogPart, share_samples, split_range
@@ -34,14 +34,15 @@ class LogsConfig:
 
     A name with `*` or `?` is a pattern for all files that match. A range behind a name takes a part of each log, as if
     it were a log of its own: `walk.npz[0:30]`, see `TimeRange`; mappings say the same in words (`entries_spelled_out`).
-    `topics` describes the topics of bags. The logs to fit on may be factors of logs, from `torchid compress`, which may
-    lie elsewhere: `s3://...`.
+    `topics` describes the topics of bags, `columns` those of foreign tables and arrays. The logs to fit on may be
+    factors of logs, from `torchid compress`, which may lie elsewhere: `s3://...`.
     """
 
     train: Annotated[list[Annotated[Path, BeforeValidator(as_path)]], Field(min_length=1)]
     test: list[Path] = dataclasses.field(default_factory=list)
     validation: list[Path] = dataclasses.field(default_factory=list)
     topics: Topics | None = None
+    columns: Columns | None = None
 
     @property
     def compressed(self) -> bool:
@@ -150,7 +151,7 @@ def resolve_logs(logs: LogsConfig) -> LogsConfig:
     files = {key: _matching(f"logs.{key}", getattr(logs, key)) for key in SETS}
     parts = {key: [_part(f"logs.{key}", path) for path in files[key]] for key in SETS}
     require_apart(parts, lambda one, other: share_samples(one.range, other.range) is True)
-    return LogsConfig(**files, topics=logs.topics)
+    return LogsConfig(**files, topics=logs.topics, columns=logs.columns)
 
 
 Parts = Mapping[str, Sequence[LogPart]]

@@ -21,6 +21,7 @@ from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
+from torchid.logs.column_map import require_names
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
@@ -29,14 +30,7 @@ from torchid.problem.extras import CHANNELS, measured_channels
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
-from torchid.sensing import (
-    Contact,
-    SensorNoise,
-    SensorSet,
-    chosen_sensors,
-    named_sensors,
-    with_ft_sensors,
-)
+from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
 
 _FRICTION = PARAMETERS[parameters.FRICTION]
 _POSITIVE = ("m", "Ixx", "Iyy", "Izz")
@@ -211,6 +205,9 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         raise UnknownNameError.at_field(field, error.name, error.valid, error.what) from error
     if not robot.nv:
         raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
+    if config.logs is not None and config.logs.columns is not None:
+        joints = [body.joint.name for body in robot.bodies if body.joint is not None]
+        require_names(config.logs.columns, {"joint": joints, "contact": robot.links})
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = read_along_normals(contacts, config.sensors)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]

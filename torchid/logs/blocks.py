@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file
+from torchid.logs.column_map import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.log import (
     NAME_FIELDS,
@@ -27,6 +28,7 @@ from torchid.logs.log import (
     parse_names,
     to_float64,
 )
+from torchid.logs.mapped_fields import MappedArray, map_arrays
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
 from torchid.logs.tables import read_table, table_blocks, table_size
@@ -158,11 +160,16 @@ class LogBlocks:
 
 
 @contextmanager
-def open_log_blocks(path: Path, folder: Path | None) -> Iterator[LogBlocks]:
+def open_log_blocks(path: Path, folder: Path | None, columns: Columns | None = None) -> Iterator[LogBlocks]:
     """Open a log (.h5, .npz, .csv or .parquet).
 
     Arrays of .h5 and .npz files are read in place unless these are compressed; others are unpacked to temporary files
     in `folder`, or to memory without one. Of a part of a log no other samples are there.
+
+    Args:
+        path: of the log.
+        folder: on whose disk there is room.
+        columns: as of `read_log`.
 
     Raises:
         LogError: the file is invalid.
@@ -172,39 +179,55 @@ def open_log_blocks(path: Path, folder: Path | None) -> Iterator[LogBlocks]:
         with about_file(path):
             part = split_range(path)
             if existing_log_kind(part.file) is LogKind.TABLE:
-                names, fields = _open_table(part.file, folder)
+                names, fields = _open_table(part.file, folder, columns)
             else:
-                names, fields = _open_arrays(stack.enter_context(open_container(part.file, whole=False)), folder)
+                container = stack.enter_context(open_container(part.file, whole=False))
+                names, fields = _open_arrays(container, folder, columns)
             blocks = _check_blocks(str(path), names, fields)
             if part.range is not None:
                 blocks = blocks.part(part.range.select(blocks.time))
         yield blocks
 
 
-def _open_arrays(container: Container, folder: Path | None) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
+def _open_arrays(
+    container: Container, folder: Path | None, columns: Columns | None
+) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a container."""
-    given = list(container.declared_bytes())
-    check_fields_given(given)
-    names: dict[str, NDArray[Any]] = {}
-    fields: dict[str, LazyArray] = {}
-    for name in given:
+
+    def load(name: str) -> NDArray[Any]:
         with reader_errors_explained(name, _ACCEPTED):
-            if _is_text(name):
-                names[name] = container.load(name)
-            else:
-                fields[name] = container.lazy(name, folder)
-    return names, fields
+            return container.load(name)
+
+    def lazy(name: str) -> LazyArray:
+        with reader_errors_explained(name, _ACCEPTED):
+            return container.lazy(name, folder)
+
+    given = list(container.declared_bytes())
+    mapped = None if columns is None else map_arrays(columns, given, load)
+    check_fields_given(given if mapped is None else mapped.given)
+    if mapped is None:
+        text = [name for name in given if _is_text(name)]
+        return {name: load(name) for name in text}, {name: lazy(name) for name in given if name not in text}
+    sources = dict.fromkeys(source for name in mapped.fields for source in mapped.sources_of(name))
+    arrays = {source: lazy(source) for source in sources}
+    fields: dict[str, LazyArray] = {}
+    for name in mapped.fields:
+        with reader_errors_explained(name, _ACCEPTED):
+            fields[name] = MappedArray(mapped, name, arrays)
+    return mapped.text(load), fields
 
 
-def _open_table(path: Path, folder: Path | None) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
+def _open_table(
+    path: Path, folder: Path | None, columns: Columns | None
+) -> tuple[dict[str, NDArray[Any]], dict[str, LazyArray]]:
     """Text and arrays of a table, which is read once."""
     names: dict[str, NDArray[Any]] = {}
     if folder is None:
-        raw = read_table(path)
+        raw = read_table(path, columns)
         check_fields_given(raw)
         return {n: x for n, x in raw.items() if _is_text(n)}, {n: x for n, x in raw.items() if not _is_text(n)}
     spills: defaultdict[str, Spill] = defaultdict(partial(Spill, path, folder))
-    for number, block in enumerate(table_blocks(path)):
+    for number, block in enumerate(table_blocks(path, columns)):
         if not number:
             check_fields_given(block)
             continue

@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, excerpt, is_plain
 from torchid.guards import MAX_COLUMNS
 from torchid.guards import MAX_LETTERS as MAX_NAME
+from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS, UnknownFieldError, field_shape, is_quaternion
 from torchid.parameters import WRENCH_COMPONENTS
 
 #: The one column of text: the same in every row.
 TEXT_COLUMN = "imu_frame"
-_COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
+COLUMN_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 #: Characters in the name of a column, which contains that of a joint.
 MAX_LETTERS = 2 * MAX_NAME
 
 _UNIT = re.compile(r"\[.*\]$|\(.*\)$")
-_KIND = {"joint_names": "joint", "contact_names": "contact", "ft_names": "sensor"}
+KINDS = {"joint_names": "joint", "contact_names": "contact", "ft_names": "sensor"}
 
 
 @dataclass(frozen=True)
@@ -50,45 +51,59 @@ class TableLayout:
     names: dict[str, tuple[str, ...]]
     columns: dict[str, tuple[str, ...]]
 
-    def fields(self, samples: int, take: Callable[[str], NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """All columns."""
+        return tuple(column for columns in self.columns.values() for column in columns)
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Columns that may hold true and false."""
+        return self.columns.get("contact_active", ())
+
+    def read(self, take: Callable[[str], NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """The arrays of a log file; `take` returns the values (N,) of a column and is called once for each."""
         out: dict[str, NDArray[Any]] = {name: np.array(names, dtype=np.str_) for name, names in self.names.items()}
         for field, columns in self.columns.items():
-            if field == TEXT_COLUMN:
-                out[field] = take(field)
-                continue
-            flat = np.stack([take(column) for column in columns], axis=-1)
-            sizes = {letter: len(self.names.get(name, ())) for name, letter in NAME_FIELDS.items()}
-            shape = [sizes[x] if isinstance(x, str) else x for x in field_shape(field)[1:]]
-            out[field] = flat.reshape(samples, *shape)
-        if not out["joint_names"].size:  # a robot without joints
-            out["joint_position"] = np.zeros((samples, 0))
+            taken = [take(column) for column in columns]
+            out[field] = taken[0] if field == TEXT_COLUMN else self.field(field, taken)
         return out
 
+    def field(self, name: str, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """A field (N, ...) of the values (N,) of its columns."""
+        flat = np.stack(columns, axis=-1)
+        sizes = {letter: len(self.names.get(field, ())) for field, letter in NAME_FIELDS.items()}
+        shape = [sizes[x] if isinstance(x, str) else x for x in field_shape(name)[1:]]
+        return flat.reshape(len(flat), *shape)
 
-def parse_header(texts: Sequence[str]) -> TableLayout:
+
+def parse_header(texts: Sequence[str], named: Mapping[str, tuple[str, ...]] | None = None) -> TableLayout:
     """Sort the columns of a table into fields.
 
     Joints, contacts and sensors are named by the columns of the first of their fields; the others have the same.
 
+    Args:
+        texts: the columns.
+        named: names of joints, contacts and sensors by field, where they are known already.
+
     Raises:
-        LogError: a column is unknown, duplicate or missing, or there are too many.
+        LogError: a column is missing, or some are unknown: all of these are named at once.
     """
-    if len(texts) > MAX_COLUMNS:
-        raise LogError.at_field("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
     given: dict[str, dict[str, _Column]] = {}
+    unknown: dict[str, LogError] = {}
     for text in texts:
-        if len(text) > MAX_LETTERS or not is_plain(text):
-            found = f"a name of {len(text)} characters: {excerpt(text)}"
-            raise LogError.at_field("header", found, f"names of one line and at most {MAX_LETTERS} characters")
-        column = _parse_column(text)
-        of_field = given.setdefault(column.field, {})
-        if text in of_field:
-            raise LogError.at_field(f"column '{text}'", "given twice", "every column once")
-        of_field[text] = column
-    names: dict[str, tuple[str, ...]] = {}
-    for field in _COLUMN_FIELDS:
-        of = _names_of(field)
+        try:
+            column = parse_column(text)
+        except LogError as error:
+            unknown[text] = error
+        else:
+            given.setdefault(column.field, {})[text] = column
+    if unknown:
+        (name, failure), *others = unknown.items()
+        raise unknown_columns(list(unknown)) if others or is_foreign(name) else failure
+    names: dict[str, tuple[str, ...]] = dict(named or {})
+    for field in COLUMN_FIELDS:
+        of = names_field(field)
         if of and of not in names and field in given:
             names[of] = tuple(dict.fromkeys(column.name for column in given[field].values()))
     columns = {field: column_names(field, names) for field in given}
@@ -97,18 +112,41 @@ def parse_header(texts: Sequence[str]) -> TableLayout:
     return TableLayout({"joint_names": (), **names}, columns)
 
 
+def check_header(texts: Sequence[str]) -> None:
+    """Raise LogError for too many columns, and names that are too long, of control characters, or given twice."""
+    if len(texts) > MAX_COLUMNS:
+        raise LogError.at_field("file", f"{len(texts)} columns", f"at most {MAX_COLUMNS}")
+    seen = set[str]()
+    for text in texts:
+        if len(text) > MAX_LETTERS or not is_plain(text):
+            found = f"a name of {len(text)} characters: {excerpt(text)}"
+            raise LogError.at_field("header", found, f"names of one line and at most {MAX_LETTERS} characters")
+        if text in seen:
+            raise LogError.at_field(f"column '{text}'", "given twice", "every column once")
+        seen.add(text)
+
+
+def is_column(text: str) -> bool:
+    """Whether a column has a name of the log format."""
+    try:
+        parse_column(text)
+    except LogError:
+        return False
+    return True
+
+
 def _check_complete(field: str, expected: Sequence[str], given: Mapping[str, _Column]) -> None:
     missing = [text for text in expected if text not in given]
     if missing:
-        accepted = f"every column of {_column_pattern(field)}; a cell may be empty where nothing was measured"
+        accepted = f"every column of {column_pattern(field)}; a cell may be empty where nothing was measured"
         raise LogError.at_field(f"column '{missing[0]}'", f"missing, though there is '{next(iter(given))}'", accepted)
     extra = list(given.keys() - set(expected))
     if extra:
-        found = f"a {_KIND[_names_of(field)]} that the first field of its kind does not name"
+        found = f"a {KINDS[names_field(field)]} that the first field of its kind does not name"
         raise LogError.at_field(f"column '{extra[0]}'", found, "the same names in all fields")
 
 
-def _parse_column(text: str) -> _Column:
+def parse_column(text: str) -> _Column:
     """The parts of a column's name: the field up to its first dot, a component after its last.
 
     Raises:
@@ -117,30 +155,30 @@ def _parse_column(text: str) -> _Column:
     field, _, rest = text.partition(".")
     if _UNIT.search(text):
         raise LogError.at_field(f"column '{text}'", "a unit in its name", "names without units, values in SI units")
-    if field not in _COLUMN_FIELDS:
-        raise UnknownFieldError.at_field(f"column '{text}'", field, _COLUMN_FIELDS)
-    components, of = _component_names(field), _names_of(field)
+    if field not in COLUMN_FIELDS:
+        raise UnknownFieldError.at_field(f"column '{text}'", field, COLUMN_FIELDS)
+    components, of = component_names(field), names_field(field)
     if of and components:
         name, _, component = rest.rpartition(".")
     else:
         name, component = (rest, "") if of else ("", rest)
     column = _Column(field, name, component)
     if str(column) != text or bool(name) != bool(of) or (component not in components if components else component):
-        raise LogError.at_field(f"column '{text}'", "no such part of this field", _column_pattern(field))
+        raise LogError.at_field(f"column '{text}'", "no such part of this field", column_pattern(field))
     return column
 
 
 def column_names(field: str, names: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     """The columns of a field in the order of its elements; `names` by field."""
-    of = _names_of(field)
+    of = names_field(field)
     return tuple(
         str(_Column(field, name, component))
         for name in (names[of] if of else ("",))
-        for component in _component_names(field) or ("",)
+        for component in component_names(field) or ("",)
     )
 
 
-def _component_names(field: str) -> tuple[str, ...]:
+def component_names(field: str) -> tuple[str, ...]:
     """Possible last parts of a column's name; none for fields without components."""
     size = field_shape(field)[-1] if len(field_shape(field)) > 1 else None
     if size == 6:
@@ -150,13 +188,13 @@ def _component_names(field: str) -> tuple[str, ...]:
     return ("x", "y", "z") if size == 3 else ()
 
 
-def _column_pattern(field: str) -> str:
+def column_pattern(field: str) -> str:
     """Pattern of a field's column names, such as `ft_wrench.<sensor>.{fx, fy, fz, mx, my, mz}`."""
-    of, components = _names_of(field), _component_names(field)
-    return str(_Column(field, f"<{_KIND[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))
+    of, components = names_field(field), component_names(field)
+    return str(_Column(field, f"<{KINDS[of]}>" if of else "", f"{{{', '.join(components)}}}" if components else ""))
 
 
-def _names_of(field: str) -> str:
+def names_field(field: str) -> str:
     """The field with the names of a field's columns (`joint_names`, ...), or ""."""
     letter = next((x for x in field_shape(field)[1:2] if isinstance(x, str)), None)
     return next((name for name, of in NAME_FIELDS.items() if of == letter), "")

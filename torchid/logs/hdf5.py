@@ -22,6 +22,7 @@ _DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000
 _ACCEPTED = "gzip or lzf, shuffle and fletcher32, each once (h5repack rewrites others)"
 #: Bytes of a checksum, bytes that are unpacked at a time, and bytes of an array's header in a file.
 _CHECKSUM_BYTES, _PIECE_BYTES, _HEADER_BYTES = 4, 2**22, 4096
+_DEPTH = 8  # of groups in groups
 
 
 class Hdf5:
@@ -32,8 +33,25 @@ class Hdf5:
 
     def declared_bytes(self) -> dict[str, int]:
         """Declared bytes of each array, by name."""
-        check_fields(self._file if len(self._file) else (), len(self._file))
-        return {name: self._size(name) for name in self._file}
+        return {name: self._size(name) for name in self._names()}
+
+    def _names(self) -> list[str]:
+        """All names, `group/name` of what is in groups of the file itself; a group that holds nothing is a name too.
+
+        ValueError where there are more than a log may have, as those of a group that contains itself.
+        """
+        names, count, groups = list[str](), 0, [("", self._file)]
+        for prefix, group in groups:
+            count += len(group)
+            check_fields((), count)
+            for name in group:
+                inner = group[name] if isinstance(group.get(name, getlink=True), self._h5py.HardLink) else None
+                if isinstance(inner, self._h5py.Group) and len(inner) and prefix.count("/") < _DEPTH:
+                    groups.append((f"{prefix}{name}/", inner))
+                else:
+                    names.append(f"{prefix}{name}")
+        check_fields(names, len(names))
+        return names
 
     def load(self, name: str) -> NDArray[Any]:
         """The array `name`; text is an array of UTF-8 bytes."""

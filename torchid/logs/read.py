@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, about_file, current_file, during
+from torchid.logs.column_map import Columns
+from torchid.logs.column_proposals import is_foreign, unknown_columns
 from torchid.logs.containers import (
     LogKind,
     existing_log_kind,
@@ -44,6 +46,7 @@ from torchid.logs.log import (
     parse_names,
     to_float64,
 )
+from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.quaternion import make_sign_continuous, rotate_to_base, rotate_to_world
 from torchid.logs.ros_read import read_bag
 from torchid.logs.ros_topics import Topics
@@ -56,6 +59,7 @@ def read_log(
     topics: Topics | None = None,
     progress: Callable[[float], None] | None = None,
     allow_gaps: bool = False,
+    columns: Columns | None = None,
 ) -> Log:
     """Read a log: arrays (.npz, never pickled, .h5, .hdf5), a table (.csv, .parquet) or a bag of ROS messages.
 
@@ -69,9 +73,11 @@ def read_log(
         topics: topics of a bag (.bag, .mcap, .db3).
         progress: called with the share of a bag that has been read.
         allow_gaps: accept NaN in poses and their derivatives, which `torchid.check` reports.
+        columns: what the columns of a table, or the arrays of a file, hold where these have other names.
 
     Raises:
         LogError: one line with the file, the field, its value and the accepted values.
+        ConfigError: a map of columns that does not fit itself.
 
     Warns:
         TorchidWarning: messages of a bag without time stamps, duplicate messages, or channels that are NaN in some.
@@ -80,9 +86,9 @@ def read_log(
         part = split_range(path)
         kind = existing_log_kind(part.file)
         if kind is LogKind.ARRAYS:
-            raw = _read_arrays(part.file)
+            raw = _read_arrays(part.file, columns)
         else:
-            raw = read_table(part.file) if kind is LogKind.TABLE else read_bag(part.file, topics, progress)
+            raw = read_table(part.file, columns) if kind is LogKind.TABLE else read_bag(part.file, topics, progress)
             check_fields_given(raw)
         return build_log(raw if part.range is None else _cut(raw, part.range), allow_gaps)
 
@@ -112,24 +118,28 @@ def check_fields_given(names: Collection[str]) -> None:
     _check_combination(names)
 
 
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _read_arrays(path: Path, columns: Columns | None) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz or HDF5 file; all names are checked first."""
     with open_container(path) as container:
-        names = list(container.declared_bytes())
-        check_fields_given(names)
-        raw: dict[str, NDArray[Any]] = {}
-        for name in names:
+
+        def load(name: str) -> NDArray[Any]:
             with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
-                raw[name] = container.load(name)
-    return raw
+                return container.load(name)
+
+        names = list(container.declared_bytes())
+        mapped = None if columns is None else map_arrays(columns, names, load)
+        check_fields_given(names if mapped is None else mapped.given)
+        return {name: load(name) for name in names} if mapped is None else mapped.read(load)
 
 
 def _check_names(names: Collection[str]) -> None:
     """Raise LogError on unknown or missing fields."""
     known = (*SHAPES, *VARIANTS)
-    for name in names:
-        if name not in known:
-            raise UnknownFieldError.at_field("field", name, known)
+    unknown = [name for name in names if name not in known]
+    if len(unknown) == 1 and not is_foreign(unknown[0]):
+        raise UnknownFieldError.at_field("field", unknown[0], known)
+    if unknown:
+        raise unknown_columns(unknown)
     for name in REQUIRED:
         if name not in names:
             raise LogError.at_field(name, "missing", f"a log with {', '.join(REQUIRED)}")

@@ -6,6 +6,7 @@ import csv
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,18 @@ from numpy.typing import NDArray
 
 from torchid.errors import LogError, excerpt, how_to_install
 from torchid.guards import MAX_ARRAYS, MAX_SCHEMA, check_names, check_unpacked_size
-from torchid.logs.columns import TEXT_COLUMN, TableLayout, column_names, parse_header
+from torchid.logs.column_map import Columns
+from torchid.logs.columns import TEXT_COLUMN, TableLayout, check_header, column_names, parse_header
 from torchid.logs.containers import atomic_output, reader_errors_explained
 from torchid.logs.log import NAME_FIELDS
+from torchid.logs.mapped_fields import MappedFields, map_table
 
 #: Bytes of a CSV file that are parsed at a time; no row may be longer.
 _BLOCK = 2**22
 #: Rows that are converted at a time.
 _ROWS = 2**16
+#: Rows from which a map is proposed.
+_SAMPLE = 2**12
 #: Limits on the metadata of a Parquet file (bytes of names and statistics, entries of lists); checksums are verified.
 _PARQUET = {
     "thrift_string_size_limit": 2**26,
@@ -29,31 +34,89 @@ _PARQUET = {
     "page_checksum_verification": True,
 }
 _BAD_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*?invalid value '(.{0,40})", re.DOTALL)
+_SEPARATORS = (",", ";", "\t")
+#: A cell such as -1,5 or 1,5e-3 between semicolons or tabs.
+_DECIMAL_COMMA = re.compile(rb'(?:^|[;\t\n])[ "]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ "]*(?=[;\t\r\n]|\Z)')
 _QUOTES = "'\n"
 _EMPTY = ["", " ", "  ", "nan", "NaN", "NAN"]
 _FLAGS = {"true": "1", "false": "0"}
 _NUMBERS = "numbers, or empty cells where nothing was measured"
 
 
-def read_table(path: Path) -> dict[str, NDArray[Any]]:
+_Layout = TableLayout | MappedFields  # which columns a table's fields come from
+
+
+def read_table(path: Path, columns: Columns | None = None) -> dict[str, NDArray[Any]]:
     """The fields of a .csv or .parquet file, including names of joints, contacts and sensors.
+
+    Args:
+        path: the file.
+        columns: what those of its columns hold that have no names of the log format.
 
     Raises:
         LogError: one line with the file and the column.
     """
     pa = _pyarrow(path)
     with _complete(path):
-        (layout, _), *rest = _batches(pa, path)
+        (layout, _), *rest = _batches(pa, path, columns)
         batches = [batch for _, batch in rest]
         del rest
         return _fields(pa, layout, batches)
 
 
-def table_blocks(path: Path) -> Iterator[dict[str, NDArray[Any]]]:
+def sample_table(path: Path) -> dict[str, NDArray[Any] | None]:
+    """The columns of a table with some of their first rows, None for those without numbers.
+
+    Raises:
+        LogError: the file cannot be read, or has no rows.
+    """
+    pa = _pyarrow(path)
+    with _complete(path):
+        names, batch = (_sample_csv if path.suffix.lower() == ".csv" else _sample_parquet)(pa, path)
+        if batch is None or not batch.num_rows:
+            raise LogError.at_field("time", "no samples", "at least one sample")
+        columns = dict(zip(batch.schema.names, batch.columns, strict=True))
+        read = {name: x for name, x in columns.items() if _is_number(pa, x.type)}
+        return {name: np.asarray(read[name].to_numpy(False)) if name in read else None for name in names}
+
+
+def _is_number(pa: Any, type_: Any) -> bool:
+    return bool(pa.types.is_integer(type_) or pa.types.is_floating(type_) or pa.types.is_boolean(type_))
+
+
+def _sample_csv(pa: Any, path: Path) -> tuple[list[str], Any]:
+    import pyarrow.csv
+
+    header = _header(path)
+    check_header(header.texts)
+    if header.is_all:
+        return header.texts, None
+    options = pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=header.texts)
+    marks = {"decimal_point": header.decimal_mark, "null_values": _EMPTY, "strings_can_be_null": True}
+    with path.open("rb") as stream:
+        parse = pyarrow.csv.ParseOptions(delimiter=header.separator)
+        return header.texts, pyarrow.csv.open_csv(
+            stream, options, parse, pyarrow.csv.ConvertOptions(**marks)
+        ).read_next_batch()
+
+
+def _sample_parquet(pa: Any, path: Path) -> tuple[list[str], Any]:
+    import pyarrow.parquet
+
+    with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
+        leaves = {name: type_ for field in file.schema_arrow for name, type_ in _leaves(pa, field)}
+        check_header(list(leaves))
+        _check_size(path, file.metadata.num_rows, len(leaves), whole=False)
+        numbers = [name for name, type_ in leaves.items() if _is_number(pa, type_)]  # of lists nobody knows the size
+        batch = next(file.iter_batches(_SAMPLE, columns=numbers), None) if numbers else None
+    return list(leaves), None if batch is None else _flat(pa, batch)
+
+
+def table_blocks(path: Path, columns: Columns | None = None) -> Iterator[dict[str, NDArray[Any]]]:
     """As `read_table`, some rows at a time, after a block without rows."""
     pa = _pyarrow(path)
     with _complete(path):
-        for layout, batch in _batches(pa, path, whole=False):
+        for layout, batch in _batches(pa, path, columns, whole=False):
             yield _fields(pa, layout, [] if batch is None else [batch])
 
 
@@ -61,7 +124,14 @@ def _complete(path: Path) -> AbstractContextManager[None]:
     return reader_errors_explained("file", f"a complete {path.suffix.lower()} file")
 
 
-def _fields(pa: Any, layout: TableLayout, batches: list[Any]) -> dict[str, NDArray[Any]]:
+def _layout(texts: list[str], columns: Columns | None) -> _Layout:
+    """Which columns a table's fields come from."""
+    check_header(texts)
+    mapped = None if columns is None else map_table(columns, texts)
+    return parse_header(texts) if mapped is None else mapped
+
+
+def _fields(pa: Any, layout: _Layout, batches: list[Any]) -> dict[str, NDArray[Any]]:
     """The fields of some rows; releases the batches."""
     table = pa.Table.from_batches(batches) if batches else None
     samples = 0 if table is None else table.num_rows
@@ -73,7 +143,10 @@ def _fields(pa: Any, layout: TableLayout, batches: list[Any]) -> dict[str, NDArr
         # popped, to release its memory
         return _values(pa, column, columns.pop(column)) if columns else np.zeros(0)
 
-    return layout.fields(samples, take)
+    out = layout.read(take)
+    if not out["joint_names"].size:  # a robot without joints
+        out["joint_position"] = np.zeros((samples, 0))
+    return out
 
 
 def save_table(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -104,32 +177,39 @@ def _pyarrow(path: Path) -> Any:
     return pyarrow
 
 
-def _batches(pa: Any, path: Path, whole: bool = True) -> Iterator[tuple[TableLayout, Any]]:
+def _batches(pa: Any, path: Path, columns: Columns | None, whole: bool = True) -> Iterator[tuple[_Layout, Any]]:
     """The layout of a table, first with None, then with each batch of rows."""
-    return (_read_csv if path.suffix.lower() == ".csv" else _read_parquet)(pa, path, whole)
+    return (_read_csv if path.suffix.lower() == ".csv" else _read_parquet)(pa, path, columns, whole)
 
 
-def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayout, Any]]:
+def _read_csv(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
     import pyarrow.csv
 
-    texts, empty = _header(path)
-    layout = parse_header(texts)
+    header = _header(path)
+    texts = header.texts
+    layout = _layout(texts, columns)
     yield layout, None
-    if empty:
+    if header.is_all:
         return
     words = pa.dictionary(pa.int32(), pa.string())
-    types = {text: words if _is_text(text) else pa.float64() for text in texts}
+    may_be_text = {TEXT_COLUMN, *layout.flags}
+    types = {text: words if text in may_be_text else pa.float64() for text in layout.sources}
     with path.open("rb") as stream:
         try:
             reader = pyarrow.csv.open_csv(
                 stream,
                 # one thread: else error messages have no row number
                 pyarrow.csv.ReadOptions(use_threads=False, block_size=_BLOCK, skip_rows=1, column_names=texts),
-                convert_options=pyarrow.csv.ConvertOptions(
-                    column_types=types, null_values=_EMPTY, strings_can_be_null=True
+                pyarrow.csv.ParseOptions(delimiter=header.separator),
+                pyarrow.csv.ConvertOptions(
+                    column_types=types,
+                    null_values=_EMPTY,
+                    strings_can_be_null=True,
+                    decimal_point=header.decimal_mark,
+                    include_columns=layout.sources if columns is not None else None,
                 ),
             )
-            for batch in _bounded(path, reader, len(texts), whole):
+            for batch in _bounded(path, reader, len(types), whole):
                 yield layout, batch
         except pa.ArrowInvalid as error:
             bad = _BAD_CELL.match(str(error))
@@ -141,45 +221,82 @@ def _read_csv(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayout, A
             raise LogError(path, f"column '{texts[int(column)]}'", text, _NUMBERS) from error
 
 
-def _header(path: Path) -> tuple[list[str], bool]:
-    """Names of a CSV file's columns, and whether it has no rows."""
+@dataclass(frozen=True)
+class _Header:
+    """Names of a CSV file's columns, what separates them, the decimal mark, and whether the file has no rows."""
+
+    texts: list[str]
+    separator: str
+    decimal_mark: str
+    is_all: bool
+
+
+def _header(path: Path) -> _Header:
+    """The first line of a CSV file; the decimal mark is that of the rows after it."""
     with path.open("rb") as stream:
         line = stream.readline(_BLOCK)
-        empty = not stream.read(_BLOCK).strip()
+        rows = stream.read(_BLOCK)
     if not line.strip():
         raise LogError(path, "header", "an empty line", "the names of the columns")
     if len(line) == _BLOCK:
         raise LogError(path, "header", f"a line of at least {_BLOCK} bytes", "the names of the columns")
     text = line.decode("utf-8-sig").rstrip("\r\n")
-    try:
-        texts = [text.strip() for text in next(csv.reader([text], strict=True))]
-    except csv.Error as error:
-        raise LogError(path, "header", f"no line of names ({error})", "names separated by commas") from error
-    if len(texts) == 1 and re.search("[;\t]", text):
-        raise LogError(path, "header", f"'{excerpt(text)}'", "names separated by commas")
-    return texts, empty
+    names, failures = dict[str, list[str]](), list[csv.Error]()
+    for mark in _SEPARATORS:
+        try:
+            names[mark] = next(csv.reader([text], strict=True, delimiter=mark))
+        except csv.Error as error:  # behind a quoted name stands another mark
+            failures.append(error)
+    separator = max(names, key=lambda mark: len(names[mark]), default="")  # the first of equals
+    if not separator or (failures and len(names[separator]) == 1):
+        accepted = "names separated by commas, semicolons or tabs"
+        raise LogError(path, "header", f"no line of names ({failures[0]})", accepted) from failures[0]
+    texts = [text.strip() for text in names[separator]]
+    decimal_comma = separator != "," and _DECIMAL_COMMA.search(rows) is not None
+    return _Header(texts, separator, "," if decimal_comma else ".", not rows.strip())
 
 
-def _read_parquet(pa: Any, path: Path, whole: bool) -> Iterator[tuple[TableLayout, Any]]:
+def _read_parquet(pa: Any, path: Path, columns: Columns | None, whole: bool) -> Iterator[tuple[_Layout, Any]]:
     import pyarrow.parquet
 
     with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-        texts = file.schema_arrow.names
-        layout = parse_header(texts)
+        texts = [name for field in file.schema_arrow for name, _ in _leaves(pa, field)]
+        layout = _layout(texts, columns)
     # as a dictionary: one long text, repeated in every row, could fill the memory
     with pyarrow.parquet.ParquetFile(
         path, read_dictionary=[TEXT_COLUMN] if TEXT_COLUMN in texts else None, **_PARQUET
     ) as file:
-        for field in file.schema_arrow:
-            number = pa.types.is_integer(field.type) or pa.types.is_floating(field.type)
-            fits = pa.types.is_dictionary(field.type) if field.name == TEXT_COLUMN else number
-            if not fits and not (_is_text(field.name) and pa.types.is_boolean(field.type)):
-                accepted = "text" if field.name == TEXT_COLUMN else "real numbers"
-                raise LogError(path, f"column '{field.name}'", f"values of type {field.type}", accepted)
-        _check_size(path, file.metadata.num_rows, len(texts), whole)
+        used = set(layout.sources)
+        for name, type_ in (leaf for field in file.schema_arrow for leaf in _leaves(pa, field)):
+            number = _is_number(pa, type_) and (name in layout.flags or not pa.types.is_boolean(type_))
+            if name in used and not (pa.types.is_dictionary(type_) if name == TEXT_COLUMN else number):
+                accepted = "text" if name == TEXT_COLUMN else "real numbers"
+                raise LogError(path, f"column '{name}'", f"values of type {type_}", accepted)
+        _check_size(path, file.metadata.num_rows, len(used), whole)
         yield layout, None
-        for batch in _bounded(path, file.iter_batches(_ROWS), len(texts), whole):
-            yield layout, batch
+        only = None if columns is None else list(layout.sources)
+        for batch in _bounded(path, file.iter_batches(_ROWS, columns=only), len(used), whole):
+            yield layout, _flat(pa, batch)
+
+
+def _leaves(pa: Any, field: Any, outer: str = "") -> Iterator[tuple[str, Any]]:
+    """Names and types of the columns inside a column, `state.q` for q in state."""
+    name = f"{outer}{field.name}"
+    if not pa.types.is_struct(field.type):
+        yield name, field.type
+        return
+    for inner in field.type:
+        yield from _leaves(pa, inner, f"{name}.")
+
+
+def _flat(pa: Any, batch: Any) -> Any:
+    """A batch with the columns inside of others in the place of these."""
+    if not any(pa.types.is_struct(field.type) for field in batch.schema):
+        return batch
+    table = pa.Table.from_batches([batch])
+    while any(pa.types.is_struct(field.type) for field in table.schema):
+        table = table.flatten()
+    return table.combine_chunks().to_batches()[0]
 
 
 def _bounded(path: Path, batches: Iterable[Any], columns: int, whole: bool) -> Iterator[Any]:
@@ -201,13 +318,13 @@ def table_size(path: Path) -> int:
     _pyarrow(path)
     with _complete(path):
         if path.suffix.lower() == ".csv":
-            texts, _ = _header(path)
+            columns = len(_header(path).texts)
             with path.open("rb") as stream:
-                return 8 * len(texts) * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(_BLOCK), b""))
+                return 8 * columns * sum(piece.count(b"\n") for piece in iter(lambda: stream.read(_BLOCK), b""))
         import pyarrow.parquet
 
         with pyarrow.parquet.ParquetFile(path, **_PARQUET) as file:
-            return 8 * int(file.metadata.num_rows) * len(file.schema_arrow.names)
+            return 8 * int(file.metadata.num_rows) * int(file.metadata.num_columns)
 
 
 def _check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
@@ -215,11 +332,6 @@ def _check_size(path: Path, rows: int, columns: int, whole: bool) -> None:
         accepted = f"at most {MAX_ARRAYS} bytes in all"
         raise LogError(path, "file", f"{rows} rows of {columns} columns", accepted)
     check_unpacked_size(path, 8 * rows * columns)
-
-
-def _is_text(column: str) -> bool:
-    """Whether a column may contain text: the IMU's frame, and flags as `true` and `false`."""
-    return column == TEXT_COLUMN or column.startswith("contact_active.")
 
 
 def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
@@ -244,7 +356,7 @@ def _values(pa: Any, column: str, values: Any) -> NDArray[Any]:
 
 def _number(column: str, word: str) -> float:
     try:
-        return float(_FLAGS.get(word.strip().lower(), word))
+        return float(_FLAGS.get(word.strip().lower(), word.replace(",", ".")))
     except ValueError as error:
         raise LogError.at_field(f"column '{column}'", f"'{excerpt(word)}'", "true and false, or 1 and 0") from error
 
@@ -264,6 +376,7 @@ def _columns(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
             if text != text.strip():
                 raise LogError.at_field(f"column '{text}'", "a space at its end", "names without")
             columns[text] = flat[:, j]
+    check_header(list(columns))
     layout = parse_header(list(columns))
     for name, given in names.items():
         if given and layout.names.get(name) != given:

@@ -1,0 +1,245 @@
+"""`torchid init`: an experiment file from a robot and a log, with what was guessed, and nothing replaced."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from dialects import DIALECTS, save_csv, with_velocity
+from refusals import refusal
+from repository import DEMO, SHARED
+from synthetic import ANYMAL, G1, PANDA, ROBOTS, SOLO12
+from trainings import without_figures
+
+from torchid.cli import main
+from torchid.commands.init import init
+from torchid.config import load_config
+from torchid.errors import InputError
+from torchid.fitting.experiment import set_up
+from torchid.logs import Log, read_log
+from torchid.robot import load_robot
+
+URDF = DEMO / "quadruped.urdf"
+GO2 = ROBOTS / "go2_description/urdf/go2.urdf"
+
+
+def recorded() -> Log:
+    return with_velocity(read_log(DEMO / "sway_train.npz").select(slice(0, 300)))
+
+
+def entries(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Columns, units and numbers of a map, by key; without what no name and no number says."""
+    for name, inner in value.items():
+        if name in ("order", "joint_order", "contact_order", "ignore", "scale", "above"):
+            continue
+        if isinstance(inner, dict) and name not in ("unit",):
+            yield from entries(inner, f"{key}.{name}")
+        else:
+            yield f"{key}.{name}".removesuffix(".column"), str(inner)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_at_least_80_percent_of_a_dialects_map_is_proposed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], dialect: str
+) -> None:
+    name, text, write = DIALECTS[dialect]
+    log = write(tmp_path / name, recorded())
+    assert main(["init", str(URDF), str(log), "--output", str(tmp_path / "new.yaml")]) == 0
+    shown, columns = capsys.readouterr().out, yaml.safe_load((tmp_path / "new.yaml").read_text())["logs"]["columns"]
+    expected, found = dict(entries(yaml.safe_load(text))), dict(entries(columns))
+    right = [key for key, value in expected.items() if found.get(key) == value]
+    assert len(right) >= 0.8 * len(expected), {key: found.get(key) for key in expected.keys() - set(right)}
+    config = load_config(tmp_path / "new.yaml")
+    assert {contact.frame for contact in config.contacts} == set(recorded().contact_names)
+    assert {contact.type for contact in config.contacts} == {"point"}
+    set_up(config)
+    assert config.logs.columns is not None
+    assert len(read_log(log, columns=config.logs.columns)) == 300
+    assert "300 samples over 2.99 s: time, joint_position" in shown
+    assert "missing" not in shown
+    for line in (tmp_path / "new.yaml").read_text().splitlines():
+        if line.startswith("    # guessed: "):
+            assert line.removeprefix("    # guessed: ")[:40] in " ".join(shown.split()), "what is marked is said"
+
+
+@pytest.mark.parametrize("dialect", [name for name in DIALECTS if name in ("nested names", "groups", "PD law")])
+def test_names_alone_give_the_log_where_the_file_has_them(tmp_path: Path, dialect: str) -> None:
+    name, _, write = DIALECTS[dialect]
+    path = write(tmp_path / name, recorded())
+    init(URDF, path, tmp_path / "new.yaml")
+    log = read_log(path, columns=load_config(tmp_path / "new.yaml").logs.columns)
+    order = [log.joint_names.index(joint) for joint in recorded().joint_names]
+    np.testing.assert_allclose(log.joint_position[:, order], recorded().joint_position, rtol=1e-9)
+
+
+def test_a_recording_is_identified_without_an_edit_where_names_say_everything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_figures(monkeypatch)
+    name, _, write = DIALECTS["groups"]
+    init(URDF, write(tmp_path / name, recorded()), tmp_path / "new.yaml")
+    more = ("estimator={name: least_squares, ridge: 0.01}", "preprocessing.cutoff_hz=8", "sensors=joints")
+    assert main(["identify", str(tmp_path / "new.yaml"), *more, f"output={tmp_path / 'run'}"]) == 0
+    assert (tmp_path / "run" / "parameters.json").is_file()
+
+
+def test_check_notices_an_order_of_motors_that_was_guessed_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, text, write = DIALECTS["LowState"]
+    init(URDF, write(tmp_path / name, recorded()), tmp_path / "new.yaml")
+    wrong = yaml.safe_load((tmp_path / "new.yaml").read_text())["logs"]["columns"]["joint_order"]
+    assert wrong != yaml.safe_load(text)["joint_order"]
+    assert main(["check", str(tmp_path / "new.yaml")]) == 1
+    assert "exchanged" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_log_in_the_format_needs_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", str(URDF), str(DEMO / "sway_train.npz"), "--output", str(tmp_path / "new.yaml")]) == 0
+    settings = yaml.safe_load((tmp_path / "new.yaml").read_text())
+    assert "columns" not in settings["logs"]
+    assert settings["sensors"] == "full"
+    assert "missing" not in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "new.yaml")]) == 0
+
+
+def robot_log(folder: Path, urdf: Path, joint: str, feet: tuple[str, ...] = ()) -> tuple[Path, list[str]]:
+    """A CSV of a robot whose joints are named by a pattern, in degrees and milliseconds."""
+    robot, rng, time = load_robot(urdf), np.random.default_rng(0), np.arange(200) * 5.0
+    columns: dict[str, Any] = {"timestamp_ms": time}
+    for name in robot.joint_names:
+        phase, rate = rng.uniform(0.0, 6.0), rng.uniform(1.0, 3.0)
+        columns[joint.format(name.removesuffix("_joint")) + "_pos"] = 40.0 * np.sin(1e-3 * rate * time + phase)
+        columns[joint.format(name.removesuffix("_joint")) + "_vel"] = 40.0 * rate * np.cos(1e-3 * rate * time + phase)
+        columns[joint.format(name.removesuffix("_joint")) + "_effort"] = rng.standard_normal(200)
+    columns |= {f"{foot}_contact": np.ones(200, int) for foot in feet}
+    return save_csv(folder / "log.csv", columns), list(robot.joint_names)
+
+
+LEGS = ("FL", "FR", "RL", "RR")
+MACHINES = [
+    (GO2, "{}", tuple(f"{leg}_foot" for leg in LEGS), "point"),
+    (G1, "joint.{}", ("left_ankle_roll_link", "right_ankle_roll_link"), "flat"),
+    (SOLO12, "m_{}", ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), "point"),
+    (ANYMAL, "{}", ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT"), "point"),
+]
+
+
+@pytest.mark.parametrize(("urdf", "joint", "feet", "kind"), MACHINES, ids=[str(x[0].stem) for x in MACHINES])
+@pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")
+def test_joints_feet_and_units_of_robots_are_found_by_name_and_number(
+    tmp_path: Path, urdf: Path, joint: str, feet: tuple[str, ...], kind: str
+) -> None:
+    log, joints = robot_log(tmp_path, urdf, joint, feet)
+    written = init(urdf, log, tmp_path / "new.yaml")
+    config = load_config(tmp_path / "new.yaml")
+    assert {(contact.frame, contact.type) for contact in config.contacts} == {(foot, kind) for foot in feet}
+    again = read_log(log, columns=config.logs.columns)
+    assert set(again.joint_names) == set(joints)
+    assert set(again.contact_names) == set(feet)
+    assert np.abs(again.joint_position).max() == pytest.approx(np.radians(40.0), rel=0.01)
+    np.testing.assert_allclose(
+        np.gradient(again.joint_position, again.time, axis=0)[5:-5], again.joint_velocity[5:-5], atol=1e-3
+    )
+    assert written.missing == ["motion of the base: neither its pose nor an IMU"]
+    set_up(config)
+
+
+def test_an_arm_without_feet_is_bolted(tmp_path: Path) -> None:
+    log, joints = robot_log(tmp_path, PANDA, "{}")
+    written = init(PANDA, log, tmp_path / "new.yaml")
+    config = load_config(tmp_path / "new.yaml")
+    assert config.robot.fixed_base
+    assert not config.contacts
+    assert not written.missing
+    assert set(read_log(log, columns=config.logs.columns).joint_names) == set(joints)
+
+
+def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = save_csv(tmp_path / "x.csv", {"a": [1.0, 2.0], "b": ["x", "y"]})
+    assert main(["init", str(URDF), str(log), "--output", str(tmp_path / "new.yaml")]) == 0
+    shown = capsys.readouterr().out
+    for text in (
+        "missing       time: no columns that look like it",
+        "missing       joint_position: no columns that look like it, of all 12 joints",
+        "missing       forces: neither joint torques nor contact wrenches",
+        "missing       motion of the base: neither its pose nor an IMU",
+        "missing       contact_active: which foot touches when; set to touch throughout",
+        "guessed       2 columns not needed: a, b",
+    ):
+        assert text in shown
+    reason = "log is not read with this file yet: logs.columns.contact_active: given without time"
+    assert reason in " ".join(shown.split())
+    load_config(tmp_path / "new.yaml")
+
+
+def test_nothing_is_ever_replaced_and_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, target = DEMO / "sway_train.npz", tmp_path / "new.yaml"
+    target.write_text("precious")
+    (tmp_path / "link.yaml").symlink_to("nowhere.yaml")
+    (tmp_path / "bad.npz").write_bytes(b"no archive")
+    (tmp_path / "x.mcap").write_bytes(b"")
+    for urdf, source, output, found in (
+        (URDF, log, "new.yaml", "--output: exists; accepted: a new file: torchid init replaces none"),
+        (URDF, log, "link.yaml", "--output: exists"),
+        (URDF, log, "nowhere/new.yaml", "--output: no folder"),
+        (URDF, log, "new.txt", "--output: '"),
+        (URDF, tmp_path / "absent.csv", "a.yaml", "absent.csv: file: no such file"),
+        (tmp_path / "absent.urdf", log, "a.yaml", "absent.urdf"),
+        (URDF, tmp_path / "bad.npz", "a.yaml", "bad.npz: file: cannot be read"),
+        (URDF, tmp_path / "x.mcap", "a.yaml", "x.mcap: file: a bag of messages; accepted: a table or arrays"),
+    ):
+        message = refusal(["init", str(urdf), str(source), "--output", str(tmp_path / output)], tmp_path, capsys)
+        assert found in message
+    assert target.read_text() == "precious"
+
+
+WORDS = ("time", "q", "dq", "tau", "pos", "quat", "imu_acc", "gyro", "foot_force", "contact", "kp", "des_q", "base_pos",
+         "front_left_hip", "front_left_foot", "{joint}", "[0]", "x", "w", "1", "12", "é", "joint_names",
+         "*", "moment")  # fmt: skip
+SHAPES = ((), (0,), (5,), (5, 12), (5, 3), (5, 4), (5, 20), (12,), (5, 4, 6), (5, 4, 3), (3, 2), (1, 12))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_arrays_of_any_names_and_shapes_end_in_a_file_or_in_one_line(tmp_path: Path, seed: int) -> None:
+    rng, written = np.random.default_rng(seed), 0
+    makers = (
+        lambda x: x,
+        lambda x: x > 0,
+        lambda x: np.asarray(x).astype(np.int64),
+        lambda x: np.full_like(x, np.nan),
+        lambda x: np.full(np.shape(x), "a"),
+        lambda x: x + 1j,
+    )
+    for _ in range(25):
+        arrays: dict[str, Any] = {}
+        for _ in range(rng.integers(1, 9)):
+            name = "_".join(rng.choice(WORDS, rng.integers(1, 4)))
+            values = rng.standard_normal(SHAPES[rng.integers(len(SHAPES))]) * 10.0 ** rng.integers(-2, 12)
+            arrays[name] = makers[rng.integers(len(makers))](values)
+        np.savez(tmp_path / "x.npz", **(arrays | {"time": np.arange(5.0) * rng.choice([0.01, 10.0, 1e7, 0.0])}))
+        (tmp_path / "new.yaml").unlink(missing_ok=True)
+        try:
+            init(URDF, tmp_path / "x.npz", tmp_path / "new.yaml")
+        except InputError:
+            continue
+        written += 1
+        yaml.safe_load((tmp_path / "new.yaml").read_text())
+    assert written > 5
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="recorded logs are not beside the repository")
+def test_recorded_arrays_of_a_go2_need_no_edit_to_be_read(tmp_path: Path) -> None:
+    for name, count in (("go2_in_air", 4779), ("go2_standing", 5000)):
+        path = SHARED / name / "log.npz"
+        init(GO2, path, tmp_path / f"{name}.yaml")
+        config = load_config(tmp_path / f"{name}.yaml")
+        log = read_log(path, columns=config.logs.columns)
+        assert len(log) == count
+        assert log.joint_torque is not None
+        assert log.joint_velocity is not None
+        assert {contact.frame for contact in config.contacts} == {f"{leg}_foot" for leg in LEGS}

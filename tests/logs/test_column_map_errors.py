@@ -1,0 +1,257 @@
+"""Maps of columns that do not fit themselves or their file, and files without a map: one line each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from dialects import DIALECTS, save_csv, with_velocity
+from mapped import ORDER, POSITION, TIME, mapped
+from refusals import refused
+from repository import DEMO
+
+from torchid.errors import InputError, LogError
+from torchid.logs import Columns, read_log
+from torchid.logs.blocks import open_log_blocks
+
+BAD: list[tuple[str, dict[str, Any], str]] = [
+    (
+        'joint_position: "p_{index}"',
+        {},
+        "logs.columns.joint_position: 'p_0', no such column (nor 1 more); accepted: q_0",
+    ),
+    (
+        'joint_position: "{joint}_pos"',
+        {},
+        "joint_position: no column that fits '{joint}_pos'; accepted: time, q_0, q_1",
+    ),
+    (POSITION, {"q_1": None}, "logs.columns.joint_position: 'q_1', no such column; accepted:"),
+    (
+        POSITION + "joint_velocity: q_0",
+        {},
+        "joint_velocity: column 'q_0', which logs.columns.joint_position has already",
+    ),
+    ("joint_position: {columns: {a: q_0, b: q_0}}\nignore: [q_1]", {}, "which logs.columns.joint_position has already"),
+    ('joint_position: {column: "q_{index}", order: [a, b, a]}', {}, "joint_position.order: 'a' twice; accepted: every"),
+    ('joint_position: "q_{index}"', {}, "joint_position.order: missing; accepted: names of the joints in the order"),
+    ('joint_position: {column: "q_{index}", order: [a]}', {}, "no entry for 'q_1' (joint_position?); accepted: an ent"),
+    (POSITION, {"w": TIME, "t2": TIME, "x[3]": TIME}, "no entry for 'w', 't2' (time?), 'x[3]'; accepted"),
+    (POSITION + 'joint_torque: {column: "t{index}", order: [hip, foot]}', {"t0": TIME, "t1": TIME}, "joint 'foot' mis"),
+    (POSITION + "joint_torque: q_0", {}, "which logs.columns.joint_position has already"),
+    ('joint_position: {column: "q_{index}", order: [a, b], unit: grad}', {}, "unit: 'grad', an unknown unit; accepted"),
+    ('joint_position: {column: "q_{index}", order: [a, b], unit: rpm}', {}, "'rpm', a unit of angular velocity; acc"),
+    (
+        'joint_position: {column: "q_{index}", order: [a, b], scale: {c: -1}}',
+        {},
+        "scale: unknown name 'c'; accepted: a",
+    ),
+    (
+        POSITION + "time: {column: time, unit: deg}",
+        {},
+        "logs.columns.time.unit: 'deg', a unit of angle; accepted: s, m",
+    ),
+    (POSITION + "time: {column: time, unit: {x: s}}", {}, "logs.columns.time.unit: unknown name 'x'"),
+    (
+        POSITION + 'base_quat_wxyz: {column: "k_{axis}", unit: deg}',
+        {},
+        "accepted: no unit, as this is a number without",
+    ),
+    (
+        'joint_position: {column: "q_{axis}", order: [a]}',
+        {},
+        "{axis} in 'q_{axis}'; accepted: at most one each of {joi",
+    ),
+    ('joint_position: "{index}_{joint}"', {}, "accepted: at most one each of {joint}, {index}"),
+    (
+        "joint_position: {order: [a, b]}",
+        {},
+        "joint_position: nothing that says where it is; accepted: one of column, co",
+    ),
+    (POSITION + "joint_torque: {column: q_0, pd: {kd: 1}}", {}, "joint_torque: column and pd together; accepted: one"),
+    (POSITION + "joint_torque: {pd: {kp: 1}}", {}, "joint_torque.pd: kp without position; accepted: kp together with"),
+    (
+        POSITION + "joint_torque: {pd: {kd: 1}}",
+        {},
+        "joint_torque.pd.kd: given without joint_velocity; accepted: joint_v",
+    ),
+    (
+        POSITION + "joint_torque: {pd: {kp: {hip: 3}, position: 'r_{index}'}}",
+        {"r_0": TIME, "r_1": TIME},
+        "no gain of knee",
+    ),
+    (
+        POSITION + "joint_torque: {pd: {kp: {q: 3}, position: 'r_{index}'}}",
+        {"r_0": TIME, "r_1": TIME},
+        "unknown name 'q'",
+    ),
+    (POSITION + "joint_torque: {unit: N mm, pd: {kd: 1}}", {}, "joint_torque: unit beside pd, which it says nothing"),
+    (POSITION + "contact_active: {above: 3}", {}, "contact_active.above: set, without a force; accepted: a column"),
+    (
+        POSITION + "contact_active: {above: 3, always: [a]}",
+        {},
+        "contact_active: always beside above, which it says not",
+    ),
+    (
+        POSITION + 'contact_force_normal: "f_{contact}"',
+        {"f_a": TIME},
+        "contact_force_normal: given without contact_act",
+    ),
+    (POSITION + "imu_frame: imu", {}, "imu_frame: given without imu_specific_force"),
+    (POSITION + "imu_specific_force: {columns: {x: q_0}}", {}, "columns: components x; accepted: each of x, y, z"),
+    (
+        POSITION,
+        {"joint_position__hip": TIME, "joint_position__knee": TIME},
+        "joint_position: beside 'joint_position.hip'",
+    ),
+    (POSITION, {"joint_torque__hip": TIME}, "column 'joint_torque.knee': missing, though there is 'joint_torque.hip'"),
+    (POSITION + 'joint_name: "{joint}s_of_{joint}"', {}, "accepted: a pattern with {joint} once, such as {joint}_link"),
+    (POSITION, {"q_0": [1, "x", 3]}, "column 'q_0': 'x' in row 3; accepted: numbers, or empty cells"),
+    (POSITION, {"q_0": [1, "", 3]}, "joint_position: nan at sample 1, hip; accepted: finite numbers"),
+    (POSITION, {"time": None}, "time: missing"),
+]
+
+
+@pytest.mark.parametrize(("text", "columns", "found"), BAD)
+def test_a_map_that_does_not_fit_ends_in_one_line(
+    tmp_path: Path, text: str, columns: dict[str, Any], found: str
+) -> None:
+    if "joint_order" not in text and '"p_' in text:
+        text = ORDER + text
+    message = refused(lambda: mapped(tmp_path, text, **columns), f"{tmp_path / 'x.csv'}: ", InputError)
+    assert found in message
+    assert len(message) < 600
+
+
+BAD_ARRAYS: list[tuple[str, dict[str, Any], str]] = [
+    (
+        "joint_position: {column: q, order: [a, b, c]}",
+        {},
+        "'q': shape (N, 2); accepted: (N, 3), one for each name of its",
+    ),
+    (
+        "joint_position: {column: q, order: [a]}",
+        {},
+        "'q': shape (N, 2); accepted: (N, 1), one for each name of its order",
+    ),
+    (
+        "joint_position: q",
+        {},
+        "logs.columns.joint_position.order: missing; accepted: names of the joints in the order o",
+    ),
+    (ORDER + "joint_position: p", {}, "logs.columns.joint_position: 'p', no such column; accepted: "),
+    (ORDER + "joint_position: q", {"q": np.array([["a", "b"]] * 3)}, "'q': values of type <U1; accepted: real numbers"),
+    (ORDER + "joint_position: q", {"q": np.array(1.0)}, "'q': a single value"),
+    (
+        ORDER + "joint_position: q",
+        {"q": np.ones((4, 2))},
+        "joint_position: shape (4, 2); accepted: shape (N, n) = (3, 2)",
+    ),
+    (ORDER + 'joint_position: "q{index}"', {"q0": np.ones(3), "q1": np.ones(2), "q": np.ones(1)}, "no entry for 'q'"),
+    (
+        ORDER + 'joint_position: "q{index}"\nignore: [q]',
+        {"q0": np.ones(3), "q1": np.ones(2)},
+        "'q1': 2 samples; accepted",
+    ),
+    (
+        ORDER + "joint_position: q",
+        {"joint_names": np.array(["hip", "foot"])},
+        "joint 'foot' missing here; accepted: the ",
+    ),
+    (
+        ORDER + "joint_position: q\nft_wrench: w\nsensor_order: [s]",
+        {"w": np.ones((3, 6))},
+        "'w': shape (N, 6); accepted",
+    ),
+    (
+        ORDER + "joint_position: q\njoint_velocity: v",
+        {"v": np.ones((2, 2))},
+        "joint_velocity: shape (2, 2); accepted: s",
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "arrays", "found"), BAD_ARRAYS)
+@pytest.mark.parametrize("in_blocks", [False, True])
+def test_arrays_that_do_not_fit_a_map_end_in_one_line(
+    tmp_path: Path, text: str, arrays: dict[str, Any], found: str, in_blocks: bool
+) -> None:
+    path, columns = tmp_path / "x.npz", Columns(**yaml.safe_load(text))
+    np.savez(path, **({"time": np.array(TIME), "q": np.arange(6.0).reshape(3, 2)} | arrays))
+
+    def read() -> None:
+        if not in_blocks:
+            read_log(path, columns=columns)
+            return
+        with open_log_blocks(path, None, columns) as blocks:
+            blocks.read(slice(0, len(blocks)))
+
+    assert found in refused(read, f"{path}: ", InputError)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_without_a_map_all_unknown_columns_are_named_in_one_line_with_proposals(tmp_path: Path, dialect: str) -> None:
+    name, _, write = DIALECTS[dialect]
+    path = write(tmp_path / name, with_velocity(read_log(DEMO / "sway_test.npz").select(slice(0, 3))))
+    message = refused(lambda: read_log(path), f"{path}: columns: ", LogError)
+    assert len(message) < 1000
+    assert "accepted: names of the log format, or logs.columns of an experiment file" in message
+    for field in ("time", "joint_position", "joint_torque" if dialect != "PD law" else "joint_velocity"):
+        assert f"({field}?)" in message
+
+
+def test_every_unknown_column_has_its_proposal(tmp_path: Path) -> None:
+    names = ("Timestamp", "leftKneePos", "left_knee_qd", "tau[3]", "imu.gyro.x", "base_pos_x", "grf_left", "colour")
+    path = save_csv(tmp_path / "x.csv", dict.fromkeys(names, [1, 2]))
+    message = refused(lambda: read_log(path), f"{path}: columns: 8 unknown: ", LogError)
+    fields = ("time", "joint_position", "joint_velocity", "joint_torque", "imu_angular_velocity", "base_position_world")
+    for name, field in zip(names, (*fields, "contact_force_normal"), strict=False):
+        assert f"'{name}' ({field}?)" in message
+    assert "'colour';" in message
+
+
+def test_one_foreign_name_has_its_proposal_and_one_misspelt_name_the_nearest(tmp_path: Path) -> None:
+    for name, found in (
+        (
+            "tau_est",
+            "columns: 1 unknown: 'tau_est' (joint_torque?); accepted: names of the log format, or logs.columns",
+        ),
+        ("joint_torqe", "unknown name 'joint_torqe'; accepted: joint_torque"),
+    ):
+        path = save_csv(tmp_path / "x.csv", {"time": TIME, name: TIME})
+        assert found in refused(lambda: read_log(path), f"{path}: ", LogError)  # noqa: B023
+        np.savez(tmp_path / "x.npz", **{"time": TIME, name: TIME})
+        assert found in refused(lambda: read_log(tmp_path / "x.npz"), f"{tmp_path}", LogError)
+
+
+def test_groups_of_hdf5_that_contain_themselves_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.h5"
+    with h5py.File(path, "w") as file:
+        for name in ("a", "b", "c"):
+            file.create_group(name)
+            for inner in ("a", "b", "c"):
+                file[f"{name}/{inner}"] = file["/"]
+        file["soft"] = h5py.SoftLink("/a")
+    message = refused(lambda: read_log(path, columns=Columns(time="a/time")), f"{path}: ", LogError)
+    assert "more than the 200 that a log may have" in message
+    with h5py.File(path, "w") as file:
+        file["time"], file["joint_names"] = TIME, ["a"]
+        file["joint_position"], file["empty"] = np.ones((3, 1)), h5py.SoftLink("/time")
+        file.create_group("nothing")
+    assert "columns: 2 unknown: 'empty', 'nothing'" in refused(lambda: read_log(path), f"{path}: ", LogError)
+
+
+def test_columns_inside_of_others_count_and_lists_are_refused(tmp_path: Path) -> None:
+    inner = pa.StructArray.from_arrays([pa.array(TIME), pa.array([[1.0]] * 3)], ["q", "list"])
+    pq.write_table(pa.table({"time": pa.array(TIME), "a": inner}), tmp_path / "x.parquet")
+    columns = Columns(**yaml.safe_load('joint_position: "{joint}.q"\nignore: [a.list]'))
+    assert read_log(tmp_path / "x.parquet", columns=columns).joint_names == ("a",)
+    columns = Columns(**yaml.safe_load('joint_position: "{joint}.q"\njoint_torque: "{joint}.list"'))
+    message = refused(lambda: read_log(tmp_path / "x.parquet", columns=columns), f"{tmp_path}", LogError)
+    assert "column 'a.list': values of type list<" in message
+    assert "2 unknown: 'a.q' (joint_position?), 'a.list'" in refused(lambda: read_log(tmp_path / "x.parquet"), "")

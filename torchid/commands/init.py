@@ -1,0 +1,259 @@
+"""`torchid init`: an experiment file from a URDF and a log, with what was guessed beside it."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import yaml
+
+from torchid.commands.folder import check_free_file
+from torchid.commands.reading import memory_needed
+from torchid.config.experiment import PreprocessingConfig
+from torchid.errors import ConfigError, InputError, LogError, excerpt, format_count, join_names
+from torchid.logs import Columns, read_log
+from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
+from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names
+from torchid.logs.time_range import split_range
+from torchid.robot import CollisionShapes, Robot, load_robot
+
+_FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
+"""Words in names of links that touch the ground, the surest first."""
+
+_FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
+_POSE = ("base_quat_wxyz", "base_quat_xyzw")
+_IMU = ("imu_specific_force", "imu_angular_velocity")
+_LINE = 118
+
+
+@dataclass
+class Initiated:
+    """What `init` has written, and what a user should know of it.
+
+    Attributes:
+        output: the experiment file.
+        found: what log and robot have, in words.
+        guessed: what should be compared with the robot and its manual.
+        missing: what a fit needs and nobody found.
+    """
+
+    output: Path
+    found: list[str] = field(default_factory=list)
+    guessed: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        said = [(word, text) for word in ("found", "guessed", "missing") for text in getattr(self, word)]
+        lines = [fill(f"{word:<14}{text}", 100, subsequent_indent=" " * 14) for word, text in said]
+        return "\n".join([*lines, f"written to    {self.output}; next: torchid check {self.output}"])
+
+
+@dataclass(frozen=True)
+class _Contact:
+    frame: str
+    type: str
+
+
+def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
+    """Write an experiment file for a robot and a log, complete or not at all.
+
+    Args:
+        urdf: of the robot.
+        log: a table or arrays, in the log format or not.
+        output: the file; nothing that is there is replaced.
+
+    Raises:
+        InputError: the URDF or the log cannot be read, or there is a file already.
+    """
+    target, path = Path(output), Path(log)
+    if target.suffix.lower() not in (".yaml", ".yml"):
+        raise ConfigError("command line", "--output", f"'{target}'", "a file name that ends in .yaml or .yml")
+    if os.path.lexists(target):
+        raise ConfigError(target, "--output", "exists", "a new file: torchid init replaces none")
+    check_free_file(target, "--output", False, [urdf, path])
+    file = split_range(path).file
+    if existing_log_kind(file) is LogKind.BAG:
+        raise LogError(file, "file", "a bag of messages", "a table or arrays; logs.topics says what a bag holds")
+    robot = load_robot(urdf)
+    size = memory_needed(file, PreprocessingConfig().memory_gb)
+    if size > PreprocessingConfig().memory_gb:
+        accepted = "a log of a part of the recording, whose map holds for all of it"
+        raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
+    sample = read_sample(file)
+    contacts = _guess_contacts(robot, _stated_contacts(sample, robot))
+    proposal = propose_map(sample, robot.joint_names, [contact.frame for contact in contacts])
+    out, fields = Initiated(target), _fields_of(sample, proposal)
+    _add_imu_frame(robot, fields, proposal)
+    text = _text(robot, urdf, path, target, contacts, fields, proposal)
+    _describe(out, robot, contacts, fields, proposal)
+    _try(out, path, proposal)
+    with atomic_output(target) as new:
+        new.write_text(text, encoding="utf-8")
+    return out
+
+
+def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
+    """Contacts that a log in the format names, as far as the robot has them."""
+    names = stated_names(sample, "contact_names")
+    names += [name.split(".")[1] for name in sample if re.fullmatch(r"contact_active\.[^.]+", name)]
+    return [name for name in dict.fromkeys(names) if name in robot.links]
+
+
+def _guess_contacts(robot: Robot, stated: Sequence[str]) -> list[_Contact]:
+    """Feet: links of outermost bodies with the surest word in their names, one of each body, spheres first."""
+    shapes = CollisionShapes(robot)
+    inner = {body.parent for body in robot.bodies}
+    frames = list(stated)
+    for words in _FEET if not frames else ():
+        by_body: dict[int, list[str]] = {}
+        for name, (body, _) in robot.links.items():
+            if body and body not in inner and re.search(words, name, re.IGNORECASE):
+                by_body.setdefault(body, []).append(name)
+        frames = [min(names, key=lambda name: (shapes.about(name) is None, len(name))) for names in by_body.values()]
+        if len(frames) > 1:
+            break
+        frames = []
+    flat = len(frames) < 3
+    return [_Contact(x, "flat" if flat and shapes.about(x) is None else "point") for x in frames]
+
+
+def _fields_of(sample: Any, proposal: MapProposal) -> set[str]:
+    """Fields of a log that file and map have."""
+    return {*(name.partition(".")[0] for name in sample), *proposal.columns}
+
+
+def _add_imu_frame(robot: Robot, fields: set[str], proposal: MapProposal) -> None:
+    if not set(_IMU) & fields or "imu_frame" in fields:
+        return
+    if not set(_IMU) <= fields:  # one alone is of no use
+        for name in set(_IMU) & set(proposal.columns):
+            proposal.columns.setdefault("ignore", []).append(_as_ignored(proposal.columns.pop(name)["column"]))
+            fields.discard(name)
+        return
+    named = [name for name, (body, _) in robot.links.items() if body == 0 and "imu" in name.lower()]
+    frame = min(named, key=len, default=robot.base_link)
+    proposal.columns = {"imu_frame": frame, **proposal.columns}
+    proposal.notes["imu_frame"] = "from its name" if named else "the base link, as no link of it is called imu"
+    fields.add("imu_frame")
+
+
+def _as_ignored(pattern: str) -> str:
+    return re.sub(r"\{[^{}]*\}", "*", pattern)
+
+
+def _sensors(fields: set[str]) -> str:
+    """The set of sensors of a run."""
+    wrench = bool({"contact_wrench_local", "contact_wrench_world"} & fields)
+    if "joint_torque" in fields:
+        return "full" if wrench else "joints"
+    return "contacts"
+
+
+def _is_fixed(contacts: Sequence[_Contact], fields: set[str]) -> bool:
+    return not contacts and not {*_POSE, *_IMU} & fields
+
+
+def _describe(
+    out: Initiated, robot: Robot, contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal
+) -> None:
+    """What was found, guessed and missed, in lines."""
+    known = [name for name in proposal.columns if name in fields and not name.endswith(("_order", "_name", "ignore"))]
+    frames = join_names([contact.frame for contact in contacts])
+    out.found.append(f"{len(robot.joint_names)} joints" + f", contacts {frames}" * bool(contacts))
+    if known:
+        out.found.append(f"columns of {', '.join(known)}")
+    out.guessed += [f"{key}: {note}" for key, note in proposal.notes.items()]
+    if contacts:
+        out.guessed.append("contacts: from names of links; point where there is a ball or more than two of them")
+    if _is_fixed(contacts, fields):
+        out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
+    if proposal.left_out:
+        out.guessed.append(
+            f"{format_count(len(proposal.left_out), 'column')} not needed: {join_names(proposal.left_out)}"
+        )
+    for name in ("time", "joint_position"):
+        if name not in fields:
+            out.missing.append(f"{name}: no columns that look like it, of all {len(robot.joint_names)} joints")
+    if not set(_FORCES) & fields:
+        out.missing.append("forces: neither joint torques nor contact wrenches")
+    if contacts and "contact_active" not in fields:
+        out.missing.append("contact_active: which foot touches when; set to touch throughout")
+    pose = set(_POSE) & fields and "base_position_world" in fields
+    if not _is_fixed(contacts, fields) and not pose and not set(_IMU) <= fields:
+        out.missing.append("motion of the base: neither its pose nor an IMU")
+
+
+def _try(out: Initiated, path: Path, proposal: MapProposal) -> None:
+    """Read the log with the map, and say why that fails if it does."""
+    try:
+        columns = Columns(**proposal.columns) if proposal.columns else None
+        log = read_log(path, allow_gaps=True, columns=columns)
+    except InputError as error:
+        out.missing.append(f"the log is not read with this file yet: {error.field}: {error.found}")
+        return
+    out.found.append(f"{len(log)} samples over {log.time[-1] - log.time[0]:.4g} s: {', '.join(log.arrays())}")
+
+
+# ------------------------------------------------------------------------------------------------------- the file
+
+
+def _text(
+    robot: Robot,
+    urdf: str | Path,
+    log: Path,
+    output: Path,
+    contacts: Sequence[_Contact],
+    fields: set[str],
+    proposal: MapProposal,
+) -> str:
+    """The experiment file, with comments."""
+    if contacts and "contact_active" not in fields:
+        proposal.columns["contact_active"] = {"always": [contact.frame for contact in contacts]}
+        proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
+    own = {"urdf": _relative(Path(urdf), output)} | ({"fixed_base": True} if _is_fixed(contacts, fields) else {})
+    names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
+    lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]
+    lines += _entry("robot", own)
+    if contacts:
+        lines.append("contacts:  # guessed: from names of links")
+        lines += [f"  - {_flow({'frame': contact.frame, 'type': contact.type})}" for contact in contacts]
+    name = _relative(log, output)
+    whole = split_range(log).range is not None
+    lines += ["logs:", f"  train: {_flow([name if whole else f'{name}[:80%]'])}"]
+    lines += [] if whole else [f"  test: {_flow([f'{name}[80%:]'])}"]
+    if proposal.columns:
+        lines.append("  columns:  # names, units and orders of the file: docs/logs.md")
+        for key, value in proposal.columns.items():
+            note = proposal.notes.get(key, "")
+            lines += [f"    # guessed: {note}"] if note else []
+            lines += [f"    {line}" for line in _entry(key, value)]
+    lines += _entry("sensors", _sensors(fields))
+    lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
+    lines += _entry("output", f"runs/{output.stem}")
+    return "\n".join(lines) + "\n"
+
+
+def _relative(path: Path, output: Path) -> str:
+    return os.path.relpath(os.path.abspath(path), os.path.abspath(output.parent))
+
+
+def _flow(value: object) -> str:
+    """A value on one line, as YAML."""
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6, allow_unicode=True)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def _entry(key: str, value: object) -> list[str]:
+    """A key with its value, short ones on one line; a column alone is its name."""
+    if isinstance(value, dict) and set(value) == {"column"}:
+        value = value["column"]
+    line = f"{key}: {_flow(value)}"
+    if len(line) <= _LINE - 4 or not isinstance(value, (dict, list)):
+        return [line]
+    block = yaml.safe_dump({key: value}, default_flow_style=None, sort_keys=False, width=_LINE - 4, allow_unicode=True)
+    return block.splitlines()

@@ -1,0 +1,393 @@
+"""What foreign columns and arrays hold: `logs.columns` of an experiment file."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Collection, Iterable, Mapping
+from fnmatch import fnmatchcase
+from typing import Annotated
+
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from torchid.errors import ConfigError, UnknownNameError, excerpt
+from torchid.logs.columns import KINDS, component_names, names_field
+from torchid.logs.units import quantities_of, unit_factor
+from torchid.settings import Number
+
+KEY = "logs.columns"
+_STRICT = ConfigDict(extra="forbid")
+_Name = Annotated[str, Field(min_length=1)]
+_Names = list[_Name]
+_EVERYTHING = "*"
+#: `{joint}`, `{index}`, `{index:02}`, `{axis}`, `{AXIS}`.
+PLACEHOLDER = re.compile(r"\{([^{}:]*)(?::(0\d))?\}")
+AXES = ("axis", "AXIS")
+_GAINS = ("value", "column", "columns", "order", "first_index")
+
+
+def _for_all(value: object) -> object:
+    return value if isinstance(value, Mapping) else {_EVERYTHING: value}
+
+
+def _column(value: object) -> object:
+    return {"column": value} if isinstance(value, str) else value
+
+
+def _gains(value: object) -> object:
+    if isinstance(value, str):
+        return {"column": value}
+    if isinstance(value, Mapping) and set(value) & set(_GAINS):
+        return value
+    return {"value": value}
+
+
+@dataclass(config=_STRICT, frozen=True, kw_only=True)
+class ColumnEntry:
+    """The columns, or the array, of one field.
+
+    Attributes:
+        column: its name, or a pattern: `{joint}`, `{contact}` or `{sensor}` stands for a name, `{index}` for the number
+            of one in `order` (or of a component), `{axis}` for a component (x, y, z; w, x, y, z; fx to mz), `{AXIS}`
+            for the same in capitals.
+        columns: by name or component, its column, in place of a pattern.
+        order: names, by number; null for a number that is no joint (contact, sensor) of the robot.
+        first_index: number of the first of them.
+        unit: by pattern of a name or component, or one for all; SI units by default.
+        scale: what numbers are multiplied by, likewise: -1 turns a sign.
+    """
+
+    column: _Name | None = None
+    columns: dict[_Name, _Name] = dataclasses.field(default_factory=dict)
+    order: Annotated[list[_Name | None], Field(min_length=1)] | None = None
+    first_index: int = 0
+    unit: Annotated[dict[str, _Name], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+    scale: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+
+
+_Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=_STRICT, frozen=True, kw_only=True)
+class Gains(ColumnEntry):
+    """Gains [N m/rad, N m s/rad]: `value` by pattern of the joint or one for all, or columns, or an array (n,)."""
+
+    value: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+
+
+_Gains = Annotated[Gains, BeforeValidator(_gains)]
+
+
+@dataclass(config=_STRICT, frozen=True, kw_only=True)
+class PdLaw:
+    """kp (position - q) + kd (velocity - dq) + feed_forward, with desired values; what is not given is 0."""
+
+    kp: _Gains | None = None
+    kd: _Gains | None = None
+    position: _Entry | None = None
+    velocity: _Entry | None = None
+    feed_forward: _Entry | None = None
+
+
+@dataclass(config=_STRICT, frozen=True, kw_only=True)
+class TorqueEntry(ColumnEntry):
+    """Torques as columns, or of a PD law."""
+
+    pd: PdLaw | None = None
+
+
+@dataclass(config=_STRICT, frozen=True, kw_only=True)
+class FlagEntry(ColumnEntry):
+    """Contact flags as columns.
+
+    Attributes:
+        above: contacts are active where the number is above this, in its unit; without columns that of the contact's
+            force [N].
+        always: contacts that are active throughout, in place of columns.
+    """
+
+    above: Number | None = None
+    always: _Names = dataclasses.field(default_factory=list)
+
+
+@dataclass(config=_STRICT, frozen=True, kw_only=True)
+class WrenchEntry(ColumnEntry):
+    """Wrenches as columns of all components, or forces and moments each for themselves (x, y, z); no moments: NaN."""
+
+    force: _Entry | None = None
+    moment: _Entry | None = None
+
+
+_Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
+_Flags = Annotated[FlagEntry, BeforeValidator(_column)]
+_Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=_STRICT, frozen=True, kw_only=True)
+class Columns:
+    """What the columns of a table, or the arrays of a file, hold; those with names of the log format need no entry.
+
+    Keys are the fields of a log, and:
+
+    Attributes:
+        imu_frame: the frame of the URDF that the IMU sits at: no column, but the name itself.
+        joint_order: names of joints by number, for entries without `order`; `contact_order`, `sensor_order`: as well.
+        joint_name: what the joint that the file calls {joint} is called in the URDF, such as `{joint}_joint`.
+        contact_name: as well, of {contact}.
+        ignore: columns that are not needed; * and ? stand for others.
+    """
+
+    time: _Entry | None = None
+    joint_position: _Entry | None = None
+    joint_velocity: _Entry | None = None
+    joint_acceleration: _Entry | None = None
+    joint_torque: _Torque | None = None
+    base_quat_xyzw: _Entry | None = None
+    base_quat_wxyz: _Entry | None = None
+    base_position_world: _Entry | None = None
+    base_linear_velocity_world: _Entry | None = None
+    base_linear_velocity_base: _Entry | None = None
+    base_angular_velocity_base: _Entry | None = None
+    base_angular_velocity_world: _Entry | None = None
+    base_linear_acceleration_world: _Entry | None = None
+    base_linear_acceleration_base: _Entry | None = None
+    base_angular_acceleration_base: _Entry | None = None
+    base_angular_acceleration_world: _Entry | None = None
+    contact_active: _Flags | None = None
+    contact_wrench_local: _Wrench | None = None
+    contact_wrench_world: _Wrench | None = None
+    contact_normal_world: _Entry | None = None
+    contact_force_normal: _Entry | None = None
+    ft_wrench: _Wrench | None = None
+    imu_frame: _Name | None = None
+    imu_specific_force: _Entry | None = None
+    imu_angular_velocity: _Entry | None = None
+    imu_angular_acceleration: _Entry | None = None
+    joint_order: list[_Name | None] | None = None
+    contact_order: list[_Name | None] | None = None
+    sensor_order: list[_Name | None] | None = None
+    joint_name: _Name = "{joint}"
+    contact_name: _Name = "{contact}"
+    ignore: _Names = dataclasses.field(default_factory=list)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields of a log that have an entry."""
+        return tuple(name for name, entry in vars(self).items() if isinstance(entry, ColumnEntry))
+
+    def order_of(self, entry: ColumnEntry, kind: str) -> list[str | None] | None:
+        """Names by number, of an entry for a kind of names (`joint`, ...)."""
+        return entry.order or getattr(self, f"{kind}_order")
+
+    def name_of(self, kind: str) -> str:
+        """The pattern of the URDF's names of a kind."""
+        return str(getattr(self, f"{kind}_name", f"{{{kind}}}"))
+
+
+def fits(name: str, pattern: str) -> bool:
+    """Whether a name fits a pattern, in which * and ? stand for other letters and brackets for themselves."""
+    return fnmatchcase(name, pattern.replace("[", "[[]"))
+
+
+def letters_of(pattern: str) -> int:
+    """How much a pattern says: of several that a name fits, the one with most letters counts."""
+    return len(re.sub(r"[*?]", "", PLACEHOLDER.sub("", pattern)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A field of a log, or a part that it is computed from, as one entry gives it.
+
+    Attributes:
+        key: below `logs.columns`.
+        entry: of the map.
+        names_field: `joint_names`, ... or "" without names.
+        components: `x`, ...; none for one number each.
+        quantities: by component that its unit may be of, as `quantities_of` says; of one number under "".
+    """
+
+    key: str
+    entry: ColumnEntry
+    names_field: str
+    components: tuple[str, ...]
+    quantities: Mapping[str, tuple[str, ...]]
+
+    @property
+    def kind(self) -> str:
+        """Word for one of its names: joint, contact or sensor; "" without names."""
+        return KINDS.get(self.names_field, "")
+
+    @property
+    def placeholders(self) -> tuple[str, ...]:
+        """Placeholders that its pattern may have."""
+        return (*([self.kind] if self.kind else []), "index", *(AXES if self.components else ()))
+
+
+def list_parts(columns: Columns) -> dict[str, Part]:
+    """All entries that have columns or arrays of their own, by key."""
+    parts: dict[str, Part] = {}
+    for field in columns.fields:
+        entry = getattr(columns, field)
+        if entry.column or entry.columns:
+            parts[field] = _part(field, field, entry)
+        if isinstance(entry, WrenchEntry):
+            for name, quantity in (("force", "force"), ("moment", "torque")):
+                if (inner := getattr(entry, name)) is not None:
+                    axes: tuple[str, ...] = ("x", "y", "z")
+                    quantities = dict.fromkeys(axes, (quantity,))
+                    parts[f"{field}.{name}"] = Part(f"{field}.{name}", inner, names_field(field), axes, quantities)
+        if isinstance(entry, TorqueEntry) and entry.pd is not None:
+            parts |= _pd_parts(entry.pd)
+    return parts
+
+
+def _part(key: str, field: str, entry: ColumnEntry) -> Part:
+    """An entry that is like a field of a log."""
+    components = component_names(field)
+    raw = isinstance(entry, (FlagEntry, Gains))
+    quantities = {name: () if raw else quantities_of(field, name) for name in components or ("",)}
+    return Part(key, entry, names_field(field), components, quantities)
+
+
+def _pd_parts(law: PdLaw) -> dict[str, Part]:
+    like = {"position": "joint_position", "velocity": "joint_velocity", "feed_forward": "joint_torque"}
+    like |= dict.fromkeys(("kp", "kd"), "joint_torque")
+    parts = {}
+    for name, field in like.items():
+        entry = getattr(law, name)
+        if entry is not None and (entry.column or entry.columns):
+            parts[f"joint_torque.pd.{name}"] = _part(f"joint_torque.pd.{name}", field, entry)
+    return parts
+
+
+# --------------------------------------------------------------------------------------------------- checks of a map
+
+
+def check_columns(columns: Columns) -> None:
+    """Check whatever of a map does not depend on a file.
+
+    Raises:
+        ConfigError: an entry without columns or with two kinds of them, a placeholder that stands for nothing, a name
+            twice in an order, a unit that is none.
+    """
+    for kind in KINDS.values():
+        _check_order(f"{KEY}.{kind}_order", getattr(columns, f"{kind}_order"))
+    for kind in ("joint", "contact"):
+        if columns.name_of(kind).count(f"{{{kind}}}") != 1:
+            accepted = f"a pattern with {{{kind}}} once, such as {{{kind}}}_link"
+            raise ConfigError.at_field(f"{KEY}.{kind}_name", f"found '{excerpt(columns.name_of(kind))}'", accepted)
+    for field in columns.fields:
+        _check_given(field, getattr(columns, field))
+    for part in list_parts(columns).values():
+        _check_part(part)
+
+
+def _check_order(key: str, order: list[str | None] | None) -> None:
+    names = [name for name in order or () if name is not None]
+    again = [name for name in names if names.count(name) > 1]
+    if again:
+        raise ConfigError.at_field(key, f"'{excerpt(again[0])}' twice", "every name once, null for what is left out")
+    if order is not None and not names:
+        raise ConfigError.at_field(key, "no name", "names in the order of the columns")
+
+
+def _check_given(field: str, entry: ColumnEntry) -> None:
+    """Refuse an entry that says nothing, or the same in two ways."""
+    ways = {
+        "column": entry.column,
+        "columns": entry.columns,
+        "pd": getattr(entry, "pd", None),
+        "always": getattr(entry, "always", None),
+        "force": getattr(entry, "force", None),
+    }
+    given = [name for name, value in ways.items() if value]
+    own = [name for name in ways if hasattr(entry, name)]
+    if isinstance(entry, FlagEntry) and entry.above is not None:
+        _check_unscaled(field, entry, [x for x in given if x == "always"], "above")
+        given = given or ["above"]
+    if len(given) != 1:
+        found = f"{' and '.join(given)} together" if given else "nothing that says where it is"
+        raise ConfigError.at_field(f"{KEY}.{field}", found, f"one of {', '.join(own)}")
+    if given[0] not in ("column", "columns"):
+        _check_unscaled(field, entry, [x for x in ("unit", "scale", "order") if getattr(entry, x)], given[0])
+    if isinstance(entry, WrenchEntry) and entry.moment is not None and entry.force is None:
+        raise ConfigError.at_field(f"{KEY}.{field}", "moment without force", "force, with or without moment")
+    if isinstance(entry, TorqueEntry) and entry.pd is not None:
+        _check_law(entry.pd)
+
+
+def _check_unscaled(field: str, entry: ColumnEntry, given: list[str], beside: str) -> None:
+    if given:
+        found = f"{given[0]} beside {beside}, which it says nothing about"
+        raise ConfigError.at_field(f"{KEY}.{field}", found, f"{beside} without {given[0]}")
+
+
+def _check_law(law: PdLaw) -> None:
+    key = f"{KEY}.joint_torque.pd"
+    if (law.kp is None) != (law.position is None):
+        found = "position without kp" if law.kp is None else "kp without position"
+        raise ConfigError.at_field(key, found, "kp together with position, the desired one")
+    if law.velocity is not None and law.kd is None:
+        raise ConfigError.at_field(key, "velocity without kd", "kd, with or without velocity, the desired one")
+    if law.kp is None and law.kd is None:
+        raise ConfigError.at_field(key, "no gain", "kp with position, or kd, or both")
+    for name in ("kp", "kd"):
+        gains = getattr(law, name)
+        if gains is not None and bool(gains.value) + bool(gains.column) + bool(gains.columns) != 1:
+            accepted = "a number, numbers by joint, or a column or an array"
+            raise ConfigError.at_field(f"{key}.{name}", "not one of value, column and columns", accepted)
+
+
+def _check_part(part: Part) -> None:
+    """Check patterns, names and units of an entry."""
+    key, entry = f"{KEY}.{part.key}", part.entry
+    if entry.column and entry.columns:
+        raise ConfigError.at_field(key, "column and columns together", "one of the two")
+    _check_order(f"{key}.order", entry.order)
+    for text in (entry.column, *entry.columns.values()):
+        _check_pattern(key, part, text or "")
+    if entry.columns and part.components and not part.kind and set(entry.columns) != set(part.components):
+        found = f"components {', '.join(entry.columns)}"
+        raise ConfigError.at_field(f"{key}.columns", found, f"each of {', '.join(part.components)}")
+    if entry.columns and not part.components and not part.kind:
+        raise ConfigError.at_field(f"{key}.columns", "several columns", "column, as it is one number")
+    quantities = tuple(dict.fromkeys(one for of in part.quantities.values() for one in of))
+    for unit in entry.unit.values():
+        unit_factor(f"{key}.unit", unit, quantities)
+
+
+def _check_pattern(key: str, part: Part, text: str) -> None:
+    found = [name for name, _ in PLACEHOLDER.findall(text)]
+    wrong = [name for name in found if name not in part.placeholders]
+    several = [name for name in found if found.count(name) > 1]
+    if not wrong and not several and len(set(found) & {part.kind, "index"}) < 2 and len(set(found) & set(AXES)) < 2:
+        return
+    named = f"{{{(wrong or several or found)[0]}}}"
+    allowed = ", ".join(f"{{{name}}}" for name in part.placeholders)
+    accepted = f"at most one each of {allowed}, and one of them for the names"
+    raise ConfigError.at_field(key, f"{named} in '{excerpt(text)}'", accepted)
+
+
+def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> None:
+    """Make sure that all names which a map states are those of a robot.
+
+    Args:
+        columns: the map.
+        known: names by their kind: joint, contact.
+
+    Raises:
+        UnknownNameError: one that is not.
+    """
+    stated: list[tuple[str, str, Iterable[str | None]]] = []
+    for kind in known:
+        stated.append((kind, f"{kind}_order", getattr(columns, f"{kind}_order") or ()))
+    for part in list_parts(columns).values():
+        stated.append((part.kind, f"{part.key}.order", part.entry.order or ()))
+        stated.append((part.kind, f"{part.key}.columns", part.entry.columns))
+    if columns.contact_active is not None:
+        stated.append(("contact", "contact_active.always", columns.contact_active.always))
+    for kind, key, names in stated:
+        for name in names:
+            if kind in known and name is not None and name not in known[kind]:
+                raise UnknownNameError.at_field(f"{KEY}.{key}", name, known[kind])

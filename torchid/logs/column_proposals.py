@@ -1,0 +1,85 @@
+"""What unknown columns probably hold, for messages that name them."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+
+from torchid.errors import LogError, excerpt
+from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS
+
+_FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
+_LISTED, _LONGEST = 12, 60
+_BASE = r"\b(base|root|trunk|torso|pelvis|floating base)"
+#: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
+_WORDS = (
+    ("base_position_world", rf"{_BASE} (pos|position|xyz)\b"),
+    ("base_linear_velocity_world", rf"{_BASE} (lin vel|linear vel|linear velocity|vel|velocity)\b"),
+    ("base_angular_velocity_base", rf"{_BASE} (ang vel|angular velocity|omega)\b"),
+    ("joint_acceleration", r"\b(ddq|qdd|qacc|joint acc|joint acceleration)\b"),
+    ("imu_angular_velocity", r"\b(gyro\w*|omega|ang vel|angular velocity)\b"),
+    ("imu_specific_force", r"\b(acc|accel\w*|linear acceleration|specific force)\b"),
+    ("base_quat_wxyz", r"\b(quat\w*|orientation)\b"),
+    ("contact_wrench_local", r"\b(wrench|wrenches)\b"),
+    ("contact_force_normal", r"\b(foot forces?|feet forces?|grf)\b"),
+    ("contact_active", r"\b(contacts?|touch|touches|stance)\b"),
+    ("joint_torque", r"\b(taus?|torques?|efforts?|trq)\b"),
+    ("joint_velocity", r"\b(dqs?|qd|qvel|vel|vels|velocity|velocities|speeds?|rates?)\b"),
+    ("joint_position", r"\b(qs?|qpos|pos|positions?|angles?)\b"),
+    ("time", r"\b(t|ts|time|timestamps?|stamps?|ticks?|clock|sec|secs|seconds)\b"),
+)
+_DESIRED = re.compile(r"\b(des|desired|cmd|command|ref|target|goal|setpoint|ff)\b")
+_SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
+
+
+def is_desired(column: str) -> bool:
+    """Whether a column holds what a controller wants, not what was measured."""
+    return bool(_DESIRED.search(" ".join(_words(column))))
+
+
+def propose_field(column: str, desired: bool = False) -> str:
+    """The field of a log that a column probably holds, "" if nothing is plausible.
+
+    Args:
+        column: its name.
+        desired: whether a desired value counts as one that was measured.
+    """
+    close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
+    if close:
+        return close[0]
+    words = " ".join(_words(column))
+    if not desired and _DESIRED.search(words):
+        return ""
+    return next((field for field, pattern in _WORDS if re.search(pattern, words)), "")
+
+
+def _words(column: str) -> list[str]:
+    return [word.lower() for word in _SPLIT.split(column) if word]
+
+
+def name_unknown(columns: Sequence[str]) -> str:
+    """Columns, with what each may be, in one line: `'timestamp' (time?), 'q_0' and 11 like it (joint_position?)`."""
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for column in columns:
+        proposed, words = propose_field(column), _words(column) or [column]
+        if proposed and len(words) > 1 and words[-1] in ("w", "x", "y", "z"):
+            words.pop()
+        alike.setdefault((proposed, words[-1], "" if proposed else words[0]), []).append(column)
+    named = []
+    for (proposed, *_), group in list(alike.items())[:_LISTED]:
+        more = f" and {len(group) - 1} like it" if len(group) > 1 else ""
+        named.append(f"'{excerpt(group[0], _LONGEST)}'{more}" + (f" ({proposed}?)" if proposed else ""))
+    rest = sum(map(len, list(alike.values())[_LISTED:]))
+    return ", ".join(named) + (f" and {rest} more" if rest else "")
+
+
+def is_foreign(column: str) -> bool:
+    """Whether an unknown column has another name for a field of the format, rather than a misspelt one."""
+    return bool(propose_field(column)) and not difflib.get_close_matches(column.partition(".")[0], _FIELDS, cutoff=0.5)
+
+
+def unknown_columns(columns: Sequence[str]) -> LogError:
+    """The error of columns or arrays that the log format does not know, all in one line."""
+    accepted = "names of the log format, or logs.columns of an experiment file, which says what they hold"
+    return LogError.at_field("columns", f"{len(columns)} unknown: {name_unknown(columns)}", accepted)

@@ -1,0 +1,388 @@
+"""A proposed map of foreign columns, from their names and some of their numbers."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.logs.column_map import PLACEHOLDER
+from torchid.logs.column_proposals import is_desired, propose_field
+from torchid.logs.columns import is_column
+from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
+from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS
+from torchid.logs.tables import sample_table
+from torchid.logs.units import UNITS
+
+Columns = Mapping[str, NDArray[Any] | None]
+"""Columns of a table or arrays with some of their rows; None for one without numbers."""
+
+_SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact", "_link", "_ankle_roll_link")}
+_NUMBER = re.compile(r"\d+")
+_AXIS = re.compile(r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_])([WXYZ])$|(?<=[a-z])([wxyz])$")
+_GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
+_FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
+_MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
+_FOOT = re.compile(r"foot|feet", re.IGNORECASE)
+_LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
+_STEP = (2e-4, 0.2)  # [s]: of recordings
+_TURNED = 7.0  # [rad]: no joint's position is as large throughout
+_HEAVY = 500.0  # [N m]: rms of no torque is as large
+_FAR = 60.0  # [m]: no base is recorded as far away
+_SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
+
+
+@dataclass
+class MapProposal:
+    """What `logs.columns` may say of a log.
+
+    Attributes:
+        columns: the map, as it stands in a file.
+        notes: what was guessed, by key.
+        left_out: columns that it ignores.
+    """
+
+    columns: dict[str, Any] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Columns that differ in a name, a number or an axis alone."""
+
+    pattern: str
+    columns: list[str]
+    names: tuple[str, ...]
+    numbers: tuple[int, ...]  # no element of columns without
+    axes: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        return PLACEHOLDER.sub(" ", self.pattern)
+
+
+def read_sample(path: Path) -> Columns:
+    """The columns of a table or the arrays of a file, with some of the rows of tables.
+
+    Raises:
+        LogError: it cannot be read, or is a bag.
+    """
+    if existing_log_kind(path) is LogKind.TABLE:
+        return sample_table(path)
+    out: dict[str, NDArray[Any] | None] = {}
+    with open_container(path) as container:
+        for name in container.declared_bytes():
+            with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
+                array = container.load(name)
+            out[name] = array if array.dtype.kind in "fiub" or name in NAME_FIELDS else None
+    return out
+
+
+def stated_names(sample: Columns, field: str) -> list[str]:
+    """Names of joints, contacts or sensors that a file of arrays states."""
+    stated = sample.get(field)
+    names = [] if stated is None else np.ravel(stated).tolist()
+    return [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names]
+
+
+def propose_map(sample: Columns, joints: Sequence[str], feet: Sequence[str]) -> MapProposal:
+    """Sort foreign columns into fields of a log by what they are called and what is in them.
+
+    Args:
+        sample: from `read_sample`.
+        joints: of the robot.
+        feet: frames of its contacts.
+    """
+    native = [name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)]
+    foreign = [name for name in sample if name not in native]
+    return _Proposer(sample, native, joints, feet).propose(foreign)
+
+
+class _Proposer:
+    def __init__(self, sample: Columns, native: Sequence[str], joints: Sequence[str], feet: Sequence[str]) -> None:
+        self.sample, self.joints, self.feet, self.native = sample, joints, feet, native
+        self.given = {name.partition(".")[0] for name in native}
+        self.out = MapProposal()
+        stated = stated_names(sample, "joint_names")
+        self.names_stated = bool(stated) and set(stated) <= set(joints)
+
+    def propose(self, foreign: Sequence[str]) -> MapProposal:
+        numeric = [name for name in foreign if self.sample[name] is not None]
+        families = self._families(numeric)
+        used: list[_Family] = [one for one in families if self._place(one)]
+        if "joint_torque" not in {*self.given, *self.out.columns}:
+            used += self._place_law([one for one in families if one not in used])
+        if set(wrench := self.out.columns.get("contact_wrench_local", {})) == {"moment"}:  # of no use without forces
+            used = [one for one in used if one.pattern != wrench["moment"]["column"]]
+            del self.out.columns["contact_wrench_local"]
+        taken = {column for one in used for column in one.columns}
+        self.out.left_out = [name for name in foreign if name not in taken]
+        ignored = {_anything(one.pattern) for one in families if one not in used}
+        ignored |= {name for name in foreign if self.sample[name] is None}
+        ignored |= {_anything(one.pattern) for one in used if len(one.numbers) > len(self.joints)}
+        if ignored:
+            self.out.columns["ignore"] = sorted(ignored)
+        with np.errstate(all="ignore"):  # of numbers that no unit explains
+            self._add_units()
+        return self.out
+
+    # --------------------------------------------------------------------------------------------------- patterns
+
+    def _families(self, columns: Sequence[str]) -> list[_Family]:
+        """Columns by pattern, in their order."""
+        joints = self._stems("joint", columns, {})
+        stems = {"joint": joints, "contact": self._stems("contact", columns, joints)}
+        found = defaultdict[str, list[tuple[str, str, str, str]]](list)
+        for column in columns:
+            pattern, name, number, axis = _pattern(column, stems)
+            found[pattern].append((column, name, number, axis))
+        out = []
+        for pattern, members in found.items():
+            texts, names, numbers, axes = ([x for x in dict.fromkeys(of)] for of in zip(*members, strict=True))
+            if "{index}" in pattern and (widths := {len(x) for x in numbers}) == {2} and numbers[0].startswith("0"):
+                pattern = pattern.replace("{index}", f"{{index:0{widths.pop()}}}")
+            whole = len(members) == max(len(names), 1) * max(len(numbers), 1) * max(len(axes), 1)
+            if whole and (len(members) > 1 or not PLACEHOLDER.search(pattern)):
+                out.append(_Family(pattern, texts, tuple(names), tuple(int(x) for x in numbers if x), tuple(axes)))
+            else:
+                out += [_Family(column, [column], ("",), (), ("",)) for column in texts]
+        return out
+
+    def _stems(self, kind: str, columns: Sequence[str], others: Mapping[str, str]) -> dict[str, str]:
+        """What the file calls joints or feet, where no longer one of others fits, with the name of the URDF."""
+        longest = {column: max((len(x) for x in others if _within(x).search(column)), default=0) for column in columns}
+        names, best = (self.joints if kind == "joint" else self.feet), dict[str, str]()
+        for suffix in _SUFFIXES[kind]:
+            if not names or not all(name.endswith(suffix) and len(name) > len(suffix) for name in names):
+                continue
+            stems = {name[: len(name) - len(suffix)]: name for name in names}
+            seen = {
+                stem: name
+                for stem, name in stems.items()
+                if any(n < len(stem) and _within(stem).search(x) for x, n in longest.items())
+            }
+            if len(seen) > len(best):
+                best = seen
+                pattern = f"{{{kind}}}{suffix}"
+        if best and pattern != f"{{{kind}}}":
+            self.out.columns[f"{kind}_name"] = pattern
+        return best
+
+    # ----------------------------------------------------------------------------------------------------- fields
+
+    def _place(self, family: _Family) -> bool:
+        """Whether a family has become an entry."""
+        if is_desired(family.words) or _GAINS.search(family.words.replace("_", " ")):
+            return False
+        name = self._field(family)
+        if name == "contact_wrench_local" and len(family.axes) == 3:
+            return self._place_force(family)
+        if not name or name in self.given or name in self.out.columns or not self._fits(family, name):
+            return False
+        entry: dict[str, Any] = {"column": family.pattern}
+        if (first := min(family.numbers, default=0)) > 0:
+            entry["first_index"] = first
+        if name == "base_quat_wxyz":
+            name = self._quaternion(family)
+            if "imu" in family.words.lower():
+                self.out.notes[name] = "of the IMU, taken to be that of the base link; " + self.out.notes.get(name, "")
+        if name == "contact_active":
+            self._add_threshold(family, entry)
+        self._add_order(family, name)
+        self.out.columns[name] = entry
+        return True
+
+    def _field(self, family: _Family) -> str:
+        """The field that a family probably is."""
+        name, axes = propose_field(family.words), len(family.axes) == 3
+        of_foot = "{contact}" in family.pattern or _FOOT.search(family.words) is not None
+        of_force = name == "contact_force_normal" or _FORCE.search(family.pattern) or _MOMENT.search(family.pattern)
+        if axes and of_foot and of_force:
+            return "contact_wrench_local"
+        if name == "contact_force_normal" or (not name and of_foot):
+            return "contact_active"  # as a threshold: what it is in newtons nobody knows
+        return "base_position_world" if name == "joint_position" and axes and not any(family.names) else name
+
+    def _fits(self, family: _Family, name: str) -> bool:
+        """Whether a family has as many columns as a field."""
+        first = self.sample[family.columns[0]]
+        if first is None or not first.ndim:
+            return False
+        inner = int(np.prod(first.shape[1:]))
+        count = max(inner, len(family.columns)) if inner == 1 or len(family.columns) == 1 else 0
+        if name == "time":
+            return count == 1
+        if ("{contact}" if name.startswith("joint_") else "{joint}") in family.pattern:
+            return False
+        if name.startswith("joint_"):
+            named = {x for x in family.names if x}
+            enough = count >= len(self.joints) if family.numbers else (len(named) or count) == len(self.joints)
+            return enough and len(self.joints) > 0 and not any(family.axes)
+        if name.startswith("contact_wrench"):
+            return count == 6 * len(self.feet)
+        if name.startswith("contact_"):
+            return count == len(self.feet) > 0 and not any(family.axes)
+        axes = "".join(sorted(family.axes)).lower()
+        return count == (4 if "quat" in name else 3) and (not axes or axes == ("wxyz" if "quat" in name else "xyz"))
+
+    def _place_force(self, family: _Family) -> bool:
+        """Whether a family is the forces or the moments of contacts."""
+        wrench = self.out.columns.setdefault("contact_wrench_local", {})
+        part = "moment" if _MOMENT.search(family.pattern) else "force"
+        complete = "".join(sorted(family.axes)).lower() == "xyz" and len(family.columns) == 3 * len(self.feet)
+        if part in wrench or not complete or "contact_wrench_local" in self.given:
+            if not wrench:
+                del self.out.columns["contact_wrench_local"]
+            return False
+        wrench[part] = {"column": family.pattern}
+        self.out.notes["contact_wrench_local"] = "taken to act on the robot, along the axes of the contact frames"
+        self._add_order(family, "contact_wrench_local")
+        return True
+
+    def _place_law(self, families: Sequence[_Family]) -> list[_Family]:
+        """Families of a PD law, if there are gains."""
+        law: dict[str, Any] = {}
+        used = []
+        for family in families:
+            words = family.words.replace("_", " ").lower()
+            gain, what = _GAINS.search(words), propose_field(family.words, desired=True)
+            key = gain[1].lower() if gain else _LAW.get(what, "")
+            if key and key not in law and (gain or self._fits(family, what)):
+                law[key] = family.pattern
+                used.append(family)
+        if "kp" not in law or "position" not in law:
+            return []
+        self.out.columns["joint_torque"] = {"pd": law}
+        self.out.notes["joint_torque"] = "of the PD law that the columns belong to, as no torque was recorded"
+        return used
+
+    def _quaternion(self, family: _Family) -> str:
+        """The order of a quaternion whose components have numbers: w is the largest of a base that stands upright."""
+        if any(family.axes):
+            return "base_quat_xyzw" if family.axes[0] in "xX" else "base_quat_wxyz"
+        values = [self.sample[column] for column in family.columns]
+        flat = np.concatenate([np.atleast_2d(x).T if x.ndim == 1 else x for x in values if x is not None], axis=1)
+        order = "xyzw" if np.nansum(np.abs(flat[:, 3])) > np.nansum(np.abs(flat[:, 0])) else "wxyz"
+        self.out.notes[f"base_quat_{order}"] = "order of components, with w as the largest"
+        return f"base_quat_{order}"
+
+    def _add_threshold(self, family: _Family, entry: dict[str, Any]) -> None:
+        values = np.concatenate([np.ravel(x) for c in family.columns if (x := self.sample[c]) is not None])
+        values = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+        if not np.isin(values, (0, 1)).all():
+            low, high = np.percentile(values, (2, 98))
+            entry["above"] = float(f"{low + _SHARE * (high - low):.2g}")
+            self.out.notes["contact_active"] = "threshold, from the range of the readings"
+
+    def _add_order(self, family: _Family, name: str) -> None:
+        """An order of names by number, where columns have none."""
+        kind = next((kind for kind in _SUFFIXES if name.startswith(f"{kind}_")), "")
+        key = f"{kind}_order"
+        if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.names_stated):
+            return
+        order, how = _usual_order(self.joints if kind == "joint" else self.feet)
+        self.out.columns[key] = order
+        self.out.notes[key] = f"{how}; compare it with the manual of the robot, and with what torchid check says"
+
+    # ------------------------------------------------------------------------------------------------------ units
+
+    def _add_units(self) -> None:
+        """Units other than SI, where the numbers say so."""
+        time = self._values("time")
+        if time is None or len(time) < 3:
+            return
+        step = float(np.median(np.diff(time[:, 0])))
+        unit = next((u for u in ("s", "ms", "us", "ns") if _STEP[0] <= step * UNITS["time"][u] <= _STEP[1]), "s")
+        self._set_unit("time", unit, f"from steps of {step:.3g}")
+        seconds = time[:, 0] * UNITS["time"][unit]
+        position, velocity = self._values("joint_position"), self._values("joint_velocity")
+        factor = 1.0
+        if position is not None and np.nanpercentile(np.abs(position), 98) > _TURNED:
+            self._set_unit("joint_position", "deg", f"from values up to {np.nanmax(np.abs(position)):.3g}")
+            factor = UNITS["angle"]["deg"]
+        if position is not None and velocity is not None and position.shape == velocity.shape:
+            slope = factor * np.gradient(position, seconds, axis=0)
+            self._add_speed_unit(float(np.sqrt(np.nanmean(velocity**2) / max(np.nanmean(slope**2), 1e-12))))
+        for name, is_it, unit, why in (
+            ("joint_torque", lambda x: _rms(x) > _HEAVY, "N mm", "as they are too large for N m"),
+            ("base_position_world", lambda x: np.nanmax(np.abs(x)) > _FAR, "mm", "as it is too far away for m"),
+            ("imu_specific_force", lambda x: 0.7 < _length(x) < 1.4, "g", "as its length is about 1"),
+            ("imu_angular_velocity", lambda x: _rms(x) > 20.0, "deg/s", "as it is too fast for rad/s"),
+        ):
+            values = self._values(name)
+            if values is not None and is_it(values):
+                self._set_unit(name, unit, why)
+
+    def _add_speed_unit(self, ratio: float) -> None:
+        units = {unit: 1.0 / UNITS["angular velocity"][unit] for unit in ("rad/s", "deg/s", "rpm", "rev/s")}
+        unit = min(units, key=lambda unit: abs(np.log(max(ratio, 1e-9) / units[unit])))
+        self._set_unit("joint_velocity", unit, f"as they are {ratio:.3g} times the slope of the positions")
+
+    def _set_unit(self, name: str, unit: str, why: str) -> None:
+        entry = self.out.columns.get(name)
+        if isinstance(entry, dict) and "column" in entry and unit != _si(name):
+            entry["unit"] = unit
+            self.out.notes[name] = f"{unit}, {why}"
+
+    def _values(self, name: str) -> NDArray[np.float64] | None:
+        """Numbers (N, k) of an entry, in the order of its columns."""
+        entry = self.out.columns.get(name)
+        if not isinstance(entry, dict) or "column" not in entry:
+            return None
+        text = re.escape(entry["column"])
+        text = re.sub(r"\\{(joint|contact)\\}", ".+", text)
+        text = re.sub(r"\\{index(:\d+)?\\}", r"\\d+", re.sub(r"\\{(axis|AXIS)\\}", "[wxyzWXYZ]", text))
+        found = [x for column, x in self.sample.items() if x is not None and x.size and re.fullmatch(text, column)]
+        flat = [np.asarray(x, dtype=float).reshape(len(x), -1) for x in found]
+        values = np.concatenate(flat, axis=1) if flat and len({len(x) for x in flat}) == 1 else np.zeros((0, 1))
+        return values if np.isfinite(values).any() else None
+
+
+def _si(name: str) -> str:
+    return {"time": "s", "joint_velocity": "rad/s"}.get(name, "")
+
+
+def _rms(x: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.nanmean(x**2)))
+
+
+def _length(x: NDArray[np.float64]) -> float:
+    return float(np.nanmedian(np.linalg.norm(x, axis=1)))
+
+
+def _within(stem: str) -> re.Pattern[str]:
+    return re.compile(rf"(?<![A-Za-z0-9]){re.escape(stem)}(?![A-Za-z0-9])")
+
+
+def _pattern(column: str, stems: Mapping[str, Mapping[str, str]]) -> tuple[str, str, str, str]:
+    """A column with placeholders, and the name, number and axis in their places."""
+    number = axis = ""
+    kinds = {stem: kind for kind, of_kind in stems.items() for stem in of_kind}
+    name = max((stem for stem in kinds if _within(stem).search(column)), key=len, default="")
+    if name:
+        column = _within(name).sub(f"{{{kinds[name]}}}", column, count=1)
+    if not name and (found := _NUMBER.search(column)):
+        column, number = f"{column[: found.start()]}{{index}}{column[found.end() :]}", found[0]
+    if found := _AXIS.search(column):
+        axis = found[0]
+        column = f"{column[: found.start()]}{{{'axis' if axis.islower() else 'AXIS'}}}{column[found.end() :]}"
+    return column, name, number, axis
+
+
+def _anything(pattern: str) -> str:
+    return PLACEHOLDER.sub("*", pattern)
+
+
+def _usual_order(names: Sequence[str]) -> tuple[list[str], str]:
+    """Names in the order of motors, and whose that is."""
+    legs = ("FR", "FL", "RR", "RL")
+    if names and all(name.partition("_")[0] in legs for name in names):
+        return sorted(names, key=lambda name: legs.index(name.partition("_")[0])), "as Unitree numbers legs"
+    return list(names), "as in the URDF"

@@ -1,0 +1,397 @@
+"""The fields of a log from foreign columns or arrays: units, signs, orders, and what is computed from them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt
+from torchid.logs.column_map import KEY, Columns, Gains, Part, PdLaw, check_columns, fits, letters_of
+from torchid.logs.column_matching import Matched, match_columns
+from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
+from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, SHAPES, VARIANTS, WRENCHES, FloatArray, parse_names
+from torchid.logs.spill import LazyArray
+from torchid.logs.units import unit_factor
+
+Take = Callable[[str], NDArray[Any]]
+"""The values (N, ...) of a column or an array."""
+
+_PD = "joint_torque.pd"
+X = TypeVar("X")
+
+
+@dataclass(frozen=True)
+class _Values:
+    """How the numbers of an entry come from its columns.
+
+    Attributes:
+        of: the columns.
+        order: which names of these, in the order of the log; None for all as they are.
+        factors: of a sample's elements, units and signs; None for 1.
+    """
+
+    of: Matched
+    order: list[int] | None
+    factors: FloatArray | None
+
+    def read(self, take: Take) -> FloatArray:
+        """The numbers (N, ...), or of gains that hold throughout (1, ...).
+
+        Raises:
+            LogError: a column of another shape or of no numbers.
+        """
+        arrays = [self._numbers(column, take(column)) for column in self.of.columns]
+        lengths = [len(array) for array in arrays]
+        if len(set(lengths)) > 1:
+            other = next(index for index, length in enumerate(lengths) if length != lengths[0])
+            found, accepted = f"{lengths[other]} samples", f"{lengths[0]}, as '{self.of.columns[0]}' has"
+            raise LogError.at_field(f"'{self.of.columns[other]}'", found, accepted)
+        if not self.of.by_name and not self.of.by_component:
+            out = arrays[0]
+        else:
+            inner = self.of.by_name and bool(self.of.part.components) and not self.of.by_component
+            out = np.stack(arrays, axis=1 if inner else -1)
+            if self.of.by_name and self.of.by_component:
+                out = out.reshape(len(out), len(self.of.labels), len(self.of.part.components))
+        if self.order is not None:
+            out = out[:, self.order]
+        return out if self.factors is None else np.asarray(out * self.factors)
+
+    def _numbers(self, column: str, array: NDArray[Any]) -> FloatArray:
+        if array.dtype.kind not in "fiub":
+            raise LogError.at_field(f"'{column}'", f"values of type {array.dtype}", "real numbers")
+        shape = self._shape()
+        if isinstance(self.of.part.entry, Gains) and array.shape == shape:
+            array = array[None]  # the same at all samples
+        if array.ndim == 1 and int(np.prod(shape)) == 1:
+            array = array.reshape(-1, *shape)
+        if array.ndim == 0:
+            raise LogError.at_field(f"'{column}'", "a single value", "a row for each sample")
+        if array.shape[1:] != shape:
+            names = f", one for each name of its order ({self.of.labels[0]}, ...)" if self.of.labels and shape else ""
+            raise LogError.at_field(f"'{column}'", f"shape {_n_by(array.shape[1:])}", f"{_n_by(shape)}{names}")
+        return np.asarray(array, dtype=np.float64)
+
+    def _shape(self) -> tuple[int, ...]:
+        """What a column has of each sample."""
+        names = (len(self.of.labels),) if self.of.part.kind and not self.of.by_name else ()
+        components = (len(self.of.part.components),) if self.of.part.components and not self.of.by_component else ()
+        return names + components
+
+
+@dataclass(frozen=True)
+class MappedFields:
+    """The fields of a file whose columns or arrays a map describes.
+
+    Attributes:
+        names: of joints, contacts and sensors, by field.
+        columns: the map.
+        native: columns of each field that has its name in the log format; arrays have one.
+    """
+
+    names: Mapping[str, tuple[str, ...]]
+    columns: Columns
+    native: Mapping[str, tuple[str, ...]]
+    _values: Mapping[str, _Values]
+    _layout: TableLayout | None = field(default=None)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields with samples."""
+        own = (name for name in self.native if name not in (*NAME_FIELDS, TEXT_COLUMN))
+        return tuple(dict.fromkeys((*self.columns.fields, *own)))
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """All fields, of text too."""
+        text = (TEXT_COLUMN,) if self.columns.imu_frame is not None or TEXT_COLUMN in self.native else ()
+        return (*self.fields, *dict.fromkeys(("joint_names", *self.names)), *text)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """All columns that are read, each once."""
+        every = [x for name in self.fields for x in self.sources_of(name)]
+        return tuple(dict.fromkeys((*every, *self.native.get(TEXT_COLUMN, ()))))
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """Columns of a table that may hold true and false."""
+        of_numbers = self._threshold is not None or "contact_active" not in self.fields
+        return () if of_numbers else self._own("contact_active")
+
+    def sources_of(self, name: str) -> tuple[str, ...]:
+        """The columns that a field comes from."""
+        return (*self._own(name), *(x for other in self._needed(name) for x in self.sources_of(other)))
+
+    def constant_sources(self, name: str) -> tuple[str, ...]:
+        """The columns of a field that may hold one number for each joint instead of samples: arrays of gains."""
+        gains = (one.of for key, one in self._values.items() if isinstance(one.of.part.entry, Gains) and name in key)
+        return tuple(column for of in gains for column in of.columns if not of.by_name)
+
+    def _own(self, name: str) -> tuple[str, ...]:
+        if name in self.native:
+            return self.native[name]
+        of_field = (one for key, one in self._values.items() if key == name or key.startswith(f"{name}."))
+        return tuple(column for one in of_field for column in one.of.columns)
+
+    def _needed(self, name: str) -> tuple[str, ...]:
+        """Other fields that a field is computed from."""
+        if name == "joint_torque" and (law := self._law) is not None:
+            return ("joint_position",) * (law.kp is not None) + ("joint_velocity",) * (law.kd is not None)
+        if name == "contact_active" and name not in self.native and not self._own(name):
+            return ("time",) if self._threshold is None else self._forces
+        return ()
+
+    @property
+    def _forces(self) -> tuple[str, ...]:
+        """The field of contact forces, if there is one."""
+        return tuple(name for name in (FORCE_NORMAL, *WRENCHES) if name in self.fields)[:1]
+
+    @property
+    def _threshold(self) -> float | None:
+        """Above which a contact is active."""
+        return None if self.columns.contact_active is None else self.columns.contact_active.above
+
+    @property
+    def _law(self) -> PdLaw | None:
+        torque = self.columns.joint_torque
+        return None if torque is None else torque.pd
+
+    def text(self, take: Take) -> dict[str, NDArray[Any]]:
+        """Names, and the IMU's frame."""
+        out: dict[str, NDArray[Any]] = {name: np.array(of, dtype=np.str_) for name, of in self.names.items()}
+        out.setdefault("joint_names", np.array([], dtype=np.str_))
+        if self.columns.imu_frame is not None:
+            out[TEXT_COLUMN] = np.array(self.columns.imu_frame)
+        elif TEXT_COLUMN in self.native:
+            out[TEXT_COLUMN] = take(TEXT_COLUMN)
+        return out
+
+    def read(self, take: Take) -> dict[str, NDArray[Any]]:
+        """All fields; `take` is called once for each column."""
+        uses = Counter(x for name in self.fields for x in self.sources_of(name))
+        held: dict[str, NDArray[Any]] = {}
+
+        def once(column: str) -> NDArray[Any]:
+            if column not in held:
+                held[column] = take(column)
+            uses[column] -= 1
+            return held[column] if uses[column] else held.pop(column)
+
+        return self.text(take) | {name: self.value(name, once) for name in self.fields}
+
+    def value(self, name: str, take: Take) -> NDArray[Any]:
+        """A field (N, ...).
+
+        Raises:
+            LogError: columns that do not fit it.
+        """
+        if name in self.native:
+            if self._layout is None:
+                return take(name)
+            flat = [take(column) for column in self.native[name]]
+            return self._layout.field(name, flat)
+        if name in self._values:
+            out = self._values[name].read(take)
+            return _flagged(out, self._threshold) if name == "contact_active" else out
+        if name == "joint_torque":
+            return self._torque(take)
+        return self._active(take) if name == "contact_active" else self._wrench(name, take)
+
+    def _torque(self, take: Take) -> FloatArray:
+        """What a PD law gives, (N, n) [N m or N]."""
+        terms: list[FloatArray] = []
+        for gain, desired, measured in (("kp", "position", "joint_position"), ("kd", "velocity", "joint_velocity")):
+            gains = self._gains(gain, take)
+            if gains is not None:
+                own, key = self.value(measured, take), f"{_PD}.{desired}"
+                terms.append(gains * (self._values[key].read(take) - own if key in self._values else -own))
+        if f"{_PD}.feed_forward" in self._values:
+            terms.append(self._values[f"{_PD}.feed_forward"].read(take))
+        return np.asarray(sum(terms[1:], terms[0]))
+
+    def check(self) -> MappedFields:
+        """The fields themselves.
+
+        Raises:
+            LogError: one is computed from others that are not there, or is there twice.
+            ConfigError: gains that are not those of all joints.
+        """
+        for name in self.columns.fields:
+            if name in self.native:
+                found, accepted = f"beside '{self.native[name][0]}'", f"one of the two, the other in {KEY}.ignore"
+                raise LogError.at_field(f"{KEY}.{name}", found, accepted)
+            for other in self._needed(name):
+                if other not in self.fields:
+                    gain = {"joint_position": ".pd.kp", "joint_velocity": ".pd.kd"}.get(other, "")
+                    raise LogError.at_field(f"{KEY}.{name}{gain}", f"given without {other}", f"{other} in the log too")
+        if self.columns.imu_frame is not None and TEXT_COLUMN in self.native:
+            found, accepted = f"beside '{TEXT_COLUMN}' of the file", f"one of the two, the other in {KEY}.ignore"
+            raise LogError.at_field(f"{KEY}.imu_frame", found, accepted)
+        if self._threshold is not None and not (self._own("contact_active") or self._forces):
+            raise LogError.at_field(
+                f"{KEY}.contact_active.above", "set, without a force", "a column, or contact forces"
+            )
+        for name in ("kp", "kd"):
+            if (gains := getattr(self._law, name, None)) is not None and gains.value:
+                self._stated_gains(name, gains)
+        return self
+
+    def _gains(self, name: str, take: Take) -> FloatArray | None:
+        gains: Gains | None = getattr(self._law, name, None)
+        if gains is None:
+            return None
+        return self._stated_gains(name, gains) if gains.value else self._values[f"{_PD}.{name}"].read(take)
+
+    def _stated_gains(self, name: str, gains: Gains) -> FloatArray:
+        key, joints = f"{KEY}.{_PD}.{name}", self.names["joint_names"]
+        found = _by_label(key, gains.value, joints)
+        without = [joint for joint in joints if joint not in found]
+        if without:
+            raise ConfigError.at_field(key, f"no gain of {without[0]}", "one for every joint; * stands for all others")
+        return np.array([[found[joint] for joint in joints]])
+
+    def _active(self, take: Take) -> NDArray[Any]:
+        """Flags (N, C) of contacts that always touch, or whose force says whether they do."""
+        if self._threshold is None:
+            return np.ones((len(take(self.sources_of("time")[0])), len(self.names["contact_names"])), dtype=np.bool_)
+        force = self.value(self._forces[0], take)
+        with np.errstate(over="ignore"):  # infinite is above any threshold
+            return _flagged(force if force.ndim == 2 else np.linalg.norm(force[..., :3], axis=2), self._threshold)
+
+    def _wrench(self, name: str, take: Take) -> FloatArray:
+        """Forces with moments, or with NaN for these, (N, C, 6)."""
+        force = self._values[f"{name}.force"].read(take)
+        moment = self._values.get(f"{name}.moment")
+        return np.concatenate([force, np.full_like(force, np.nan) if moment is None else moment.read(take)], axis=2)
+
+
+def _n_by(shape: tuple[int, ...]) -> str:
+    return f"({', '.join(map(str, ('N', *shape)))})"
+
+
+def _flagged(values: FloatArray, above: float | None) -> FloatArray:
+    """1 where a number is above a threshold, 0 where it is not; NaN stays, for whoever checks flags."""
+    return values if above is None else np.where(np.isnan(values), np.nan, values > above)
+
+
+def _by_label(key: str, given: Mapping[str, X], labels: Sequence[str]) -> dict[str, X]:
+    """Values by name, of values by pattern: that with most letters counts.
+
+    Raises:
+        ConfigError: two that say as much.
+        UnknownNameError: a pattern that no name fits.
+    """
+    out: dict[str, tuple[int, X]] = {}
+    for pattern, value in given.items():
+        letters, found = letters_of(pattern), [label for label in labels if fits(label, pattern)]
+        if not found and letters:
+            raise UnknownNameError.at_field(key, excerpt(pattern), labels)
+        for label in found:
+            most = out.get(label, (-1, value))
+            if most[0] == letters and most[1] != value:
+                raise ConfigError.at_field(key, f"two values of {label}", "patterns of which one has more letters")
+            out[label] = max(most, (letters, value), key=lambda pair: pair[0])
+    return {label: value for label, (_, value) in out.items()}
+
+
+def _factors(part: Part, names: Sequence[str]) -> FloatArray | None:
+    """What the elements of a sample are multiplied by, (n,), (k,) or (n, k); None where that is 1."""
+    entry, key = part.entry, f"{KEY}.{part.key}"
+    if not entry.unit and not entry.scale:
+        return None
+    of_names, of_components = names if part.kind else ("",), part.components or ("",)
+    elements = [(".".join(filter(None, (name, axis))), axis) for name in of_names for axis in of_components]
+    labels = [label for label, _ in elements]
+    units, scales = _by_label(f"{key}.unit", entry.unit, labels), _by_label(f"{key}.scale", entry.scale, labels)
+    out = np.ones(len(elements))
+    for index, (label, axis) in enumerate(elements):
+        if label in units:
+            out[index] = unit_factor(f"{key}.unit", units[label], part.quantities[axis])
+        out[index] *= scales.get(label, 1.0)
+    shape = ([len(of_names)] if part.kind else []) + ([len(of_components)] if part.components else [])
+    return None if (out == 1.0).all() else out.reshape(shape)
+
+
+def _values(matched: Mapping[str, Matched], names: Mapping[str, tuple[str, ...]]) -> dict[str, _Values]:
+    out = {}
+    for key, one in matched.items():
+        common = names.get(one.part.names_field, ())
+        order = [one.labels.index(name) for name in common]
+        kept = None if order == list(range(len(one.labels))) else order
+        out[key] = _Values(one, kept, _factors(one.part, common))
+    return out
+
+
+def map_table(columns: Columns, header: Sequence[str]) -> MappedFields | None:
+    """The fields of a table; None for one that needs no map.
+
+    Raises:
+        InputError: a map that does not fit the columns, or itself.
+    """
+    check_columns(columns)
+    matching = match_columns(columns, header, is_column)
+    if matching is None:
+        return None
+    layout = parse_header(matching.others, matching.names)
+    values = _values(matching.matched, layout.names)
+    return MappedFields(layout.names, columns, layout.columns, values, layout).check()
+
+
+def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFields | None:
+    """The fields of a file of arrays; None for one that needs no map.
+
+    Args:
+        columns: the map.
+        given: names of the arrays.
+        load: reads one; called for those that hold names.
+
+    Raises:
+        InputError: a map that does not fit the arrays, or itself.
+    """
+    check_columns(columns)
+    named = {name: parse_names(name, load(name)) for name in NAME_FIELDS if name in given}
+    matching = match_columns(columns, given, lambda name: name in SHAPES or name in VARIANTS, named)
+    if matching is None:
+        return None
+    native = {name: (name,) for name in matching.others}
+    values = _values(matching.matched, matching.names)
+    return MappedFields(matching.names, columns, native, values).check()
+
+
+class MappedArray:
+    """A field whose arrays are read where it is sliced."""
+
+    def __init__(self, fields: MappedFields, name: str, arrays: Mapping[str, LazyArray]) -> None:
+        """The field of a name, of open arrays.
+
+        Raises:
+            LogError: arrays that do not fit it.
+        """
+        self._fields, self._name, self._arrays = fields, name, arrays
+        self._constant = fields.constant_sources(name)
+        for source in fields.sources_of(name):
+            if not arrays[source].shape:
+                raise LogError.at_field(f"'{source}'", "a single value", "an array with a row for each sample")
+        sampled = [source for source in fields.sources_of(name) if not self._is_constant(source)]
+        lengths = {source: arrays[source].shape[0] for source in sampled}
+        for source, length in lengths.items():
+            if length != max(lengths.values()):
+                raise LogError.at_field(f"'{source}'", f"{length} samples", f"{max(lengths.values())}, as others have")
+        first = self[slice(0, 1)]
+        self.dtype, self.shape = first.dtype, (max(lengths.values(), default=0), *first.shape[1:])
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        """Some rows."""
+        return self._fields.value(self._name, lambda source: self._read(source, rows))
+
+    def _read(self, source: str, rows: slice) -> NDArray[Any]:
+        return np.asarray(self._arrays[source][slice(None) if self._is_constant(source) else rows])
+
+    def _is_constant(self, source: str) -> bool:
+        return source in self._constant and len(self._arrays[source].shape) == 1

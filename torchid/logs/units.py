@@ -1,0 +1,95 @@
+"""Units of foreign columns, and what each is in SI units."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from torchid.errors import ConfigError, excerpt
+from torchid.parameters import WRENCH_COMPONENTS
+
+_DEG, _TURN, _GRAVITY, _POUND = math.pi / 180.0, 2.0 * math.pi, 9.80665, 4.4482216152605
+
+#: What a unit is in SI units, by the quantity that it is one of. Spaces, dots and powers are written in many ways: see
+#: `_plain`. A kg of force is what a load cell shows under that mass; one of torque is a kg of force with a lever.
+UNITS: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": _DEG, "rev": _TURN},
+    "angular velocity": {"rad/s": 1.0, "deg/s": _DEG, "rpm": _TURN / 60.0, "rev/s": _TURN},
+    "angular acceleration": {"rad/s2": 1.0, "deg/s2": _DEG, "rpm/s": _TURN / 60.0, "rev/s2": _TURN},
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "acceleration": {"m/s2": 1.0, "cm/s2": 1e-2, "mm/s2": 1e-3, "g": _GRAVITY, "mg": 1e-3 * _GRAVITY},
+    "torque": {
+        "Nm": 1.0, "Ncm": 1e-2, "Nmm": 1e-3, "mNm": 1e-3, "kNm": 1e3,
+        "kgm": _GRAVITY, "kgcm": 1e-2 * _GRAVITY, "kgmm": 1e-3 * _GRAVITY, "gcm": 1e-5 * _GRAVITY,
+    },
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3, "kg": _GRAVITY, "g": 1e-3 * _GRAVITY, "lbf": _POUND},
+}  # fmt: skip
+
+_ANGULAR = {"angular_velocity": "angular velocity", "angular_acceleration": "angular acceleration"}
+_LINEAR = {
+    "specific_force": "acceleration", "linear_acceleration": "acceleration", "linear_velocity": "velocity",
+    "position": "length",
+}  # fmt: skip
+_OF_JOINTS = {
+    "joint_position": ("angle", "length"),
+    "joint_velocity": ("angular velocity", "velocity"),
+    "joint_acceleration": ("angular acceleration", "acceleration"),
+    "joint_torque": ("torque", "force"),
+}
+_SPELLINGS = {
+    "°": "deg",
+    "µ": "u",
+    "μ": "u",
+    "²": "2",
+    "kgf": "kg",
+    "degrees": "deg",
+    "degree": "deg",
+    "radians": "rad",
+}
+_MARKS = re.compile(r"[ ·.*^]")
+
+
+def quantities_of(field: str, component: str = "") -> tuple[str, ...]:
+    """The quantities that a field of a log, or one of its components, may have; none for numbers without a unit.
+
+    A joint's are those of a hinge and of a slide.
+    """
+    if field == "time":
+        return ("time",)
+    if field in _OF_JOINTS:
+        return _OF_JOINTS[field]
+    if field == "contact_force_normal":
+        return ("force",)
+    if component in WRENCH_COMPONENTS:
+        return ("force",) if component.startswith("f") else ("torque",)
+    return tuple(quantity for part, quantity in (_ANGULAR | _LINEAR).items() if part in field)
+
+
+def unit_factor(key: str, unit: str, quantities: tuple[str, ...]) -> float:
+    """What a number in a unit is multiplied by.
+
+    Args:
+        key: of the settings file, for messages.
+        unit: such as `deg`, `N mm` or `m/s^2`.
+        quantities: that it may be a unit of, from `quantities_of`.
+
+    Raises:
+        ConfigError: it is a unit of none of them.
+    """
+    plain = _plain(unit)
+    for quantity in quantities:
+        if plain in UNITS[quantity]:
+            return UNITS[quantity][plain]
+    others = [quantity for quantity, units in UNITS.items() if plain in units]
+    found = f"'{excerpt(unit)}', " + (f"a unit of {others[0]}" if others else "an unknown unit")
+    accepted = ", ".join(text for quantity in quantities for text in UNITS[quantity])
+    raise ConfigError.at_field(key, found, accepted or "no unit, as this is a number without one")
+
+
+def _plain(unit: str) -> str:
+    """The unit as the table spells it: without spaces, dots, powers and words in full."""
+    for spelling, plain in _SPELLINGS.items():
+        unit = unit.replace(spelling, plain)
+    return _MARKS.sub("", unit)
