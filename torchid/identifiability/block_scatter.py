@@ -90,12 +90,13 @@ def block_scatter(
     basis = np.zeros((len(problem.nominal), covariance.root.shape[1]))  # of unit variance by the rows alone
     basis[problem.free] = covariance.scale[:, None] * covariance.root
     best = problem.nominal + basis @ (basis.T @ (problem.A.T @ (problem.b - problem.A @ problem.nominal)))
-    gradients, shares = _by_block(parts, numbers, builder, assembly, best, basis)
+    gradients, of_rows, surplus = _by_block(parts, numbers, builder, assembly, best, basis)
+    shares = of_rows - surplus
     scores = gradients["bodies"] @ basis
     noise = (
         problem.oversampling * residual_std(problem.cost(best), problem.rows, basis.shape[1], problem.oversampling) ** 2
     )
-    expected = noise * (np.trace(shares, axis1=1, axis2=2) - np.square(shares).sum((1, 2))).sum()
+    expected = noise * (np.trace(of_rows, axis1=1, axis2=2) - (of_rows * shares).sum((1, 2))).sum()
     factor = np.sqrt((count - 1) / count) * stats.t.ppf(0.975, count - 1) / _NORMAL
     without_ridge = factor * _left_out(scores, shares) @ basis.T
     with_ridge = without_ridge
@@ -142,15 +143,17 @@ def _by_block(
     assembly: Assembly,
     phi: Array,
     basis: Array,
-) -> tuple[dict[str, Array], Array]:
-    """Gradients of half the squared residuals of each block, (G, columns), and its share of the information, (G, r, r).
+) -> tuple[dict[str, Array], Array, Array]:
+    """Gradients of half the squared residuals of each block, (G, columns), its share of information, and its surplus.
 
-    Gradients are by "bodies", all parameters with the extra ones at their best, and by the log of each elimination, its
-    extra parameters with those of single logs at their best.
+    Gradients, of which the surplus is taken off, are by "bodies", all parameters with the extra ones at their best, and
+    by the log of each elimination, its extra parameters with those of single logs at their best. Shares and surplus are
+    (G, r, r), by the columns of the basis.
     """
     count = max(numbers.values()) + 1
     gradients = {name: np.zeros((count, width)) for name, width in _widths(assembly).items()}
-    shares, columns, along = np.zeros((count, basis.shape[1], basis.shape[1])), None, basis
+    shares, surplus = (np.zeros((count, basis.shape[1], basis.shape[1])) for _ in range(2))
+    columns, along = None, basis
     for part in sorted((part for part in parts if not part.unloaded), key=lambda part: part.source):
         if columns is None or columns.source != part.source:
             columns = _Columns.of(builder, assembly, part.source, phi)
@@ -163,11 +166,10 @@ def _by_block(
             projected = rows[:, :-1] @ along[at]
             shares[number] += projected.T @ projected
         for support, tensor in part.factor.surplus.items():
-            surplus, at = np.ascontiguousarray(tensor.cpu().double().numpy()), list(support)
-            off = surplus[:-1, -1] - surplus[:-1, :-1] @ columns.values[at]
-            columns.add_gradient(gradients, number, at, -off)
-            shares[number] -= along[at].T @ surplus[:-1, :-1] @ along[at]
-    return gradients, shares
+            more, at = np.ascontiguousarray(tensor.cpu().double().numpy()), list(support)
+            columns.add_gradient(gradients, number, at, more[:-1, :-1] @ columns.values[at] - more[:-1, -1])
+            surplus[number] += along[at].T @ more[:-1, :-1] @ along[at]
+    return gradients, shares, surplus
 
 
 def _name(log: str) -> str:
