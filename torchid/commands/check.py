@@ -80,7 +80,8 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
             log = read_log_to_check(file, config.logs.topics, config.preprocessing)
-            found = check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz)
+            standing = config.preprocessing.base_motion is not None
+            found = check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz, standing)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
 

@@ -180,10 +180,12 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     if files is None or files.compressed:
         return
     findings: list[tuple[str, Finding]] = []
+    settings = scene.config.preprocessing
     for path in files.train:
         with suppress(InputError):  # larger than memory: it is not checked
-            for log, name in stretches_to_check(path, files.topics, scene.config.preprocessing):
-                checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
+            for log, name in stretches_to_check(path, files.topics, settings):
+                standing = settings.base_motion is not None
+                checked = check(log, scene.robot, scene.contacts, settings.cutoff_hz, standing)
                 severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
                 findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
                 if any(one.condemns_all for _, one in findings):

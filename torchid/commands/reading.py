@@ -22,6 +22,7 @@ from torchid.logs.containers import LogKind, existing_log_kind
 from torchid.logs.preprocess import away_from_changes, preprocess
 from torchid.logs.time_range import LogPart, share_samples, split_range
 from torchid.problem import Samples, bind_log
+from torchid.problem.standing import preprocess_standing
 from torchid.sensing import SensorSet
 
 _WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
@@ -88,7 +89,11 @@ class LogReader:
         recorded = read_log(path, topics, allow_gaps=settings.exclude_condemned)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
-        log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz)
+        rates = settings.cutoff_hz, settings.sample_rate_hz
+        if settings.base_motion is None:
+            log = preprocess(clean, *rates)
+        else:
+            log = preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates)
         samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
         if not fits_contact_offsets(self.scene):
             samples = replace(samples, unloaded=None)
@@ -104,15 +109,26 @@ class LogReader:
     def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
         """A log that does not, with those before it [GB]."""
         settings = self.scene.config.preprocessing
-        if settings.exclude_condemned:
+        if self._needs_whole_logs:
             found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
-            accepted = f"a preprocessing.memory_gb above {together:.2g}, or parts of the logs that torchid check passes"
-            raise LogError(path, "preprocessing.exclude_condemned", found, accepted)
+            accepted = f"a preprocessing.memory_gb above {together:.2g}, or parts of the logs"
+            key, passed = (
+                ("exclude_condemned", " that torchid check passes")
+                if settings.exclude_condemned
+                else ("base_motion", "")
+            )
+            raise LogError(path, f"preprocessing.{key}", found, accepted + passed)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
     def _takes_blocks(self, gigabytes: float) -> bool:
         """Whether a log with so much in arrays is read block by block even if there is memory for it."""
-        return gigabytes > _WHOLE_GB and not self.scene.config.preprocessing.exclude_condemned
+        return gigabytes > _WHOLE_GB and not self._needs_whole_logs
+
+    @property
+    def _needs_whole_logs(self) -> bool:
+        """Whether samples are left out for what is known of a whole log alone."""
+        settings = self.scene.config.preprocessing
+        return settings.exclude_condemned or settings.base_motion is not None
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
@@ -124,7 +140,8 @@ class LogReader:
         settings = self.scene.config.preprocessing
         if not settings.exclude_condemned:
             return None
-        return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz)
+        standing = settings.base_motion is not None
+        return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz, standing)
 
 
 def check_parts(logs: Mapping[str, Sequence[Samples]]) -> None:

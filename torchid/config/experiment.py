@@ -103,6 +103,7 @@ class PreprocessingConfig:
     """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
 
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
+    `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
     `exclude_condemned`: leave out the samples that `torchid check` condemns.
     `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
     `cache_gb`: room [GB] for samples and factors that later runs of `identify` find beside the output; 0 for none.
@@ -111,6 +112,7 @@ class PreprocessingConfig:
     cutoff_hz: Positive | None = None
     sample_rate_hz: Positive | None = None
     contact_margin_s: NotNegative | None = None
+    base_motion: Literal["contacts"] | None = None
     exclude_condemned: bool = False
     memory_gb: Positive = 2.0
     cache_gb: NotNegative = 2.0

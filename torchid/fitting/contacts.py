@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.sensors import ChoiceConfig, ContactConfig
 from torchid.errors import ConfigError, SensorError
+from torchid.problem.floor_pose import FEWEST_POINTS, points_of
+from torchid.problem.standing import FEET
 from torchid.robot import CollisionShapes, Robot, RollingShape
 from torchid.sensing import Contact, validate_contacts
 from torchid.sensing.sensors import NORMAL_FORCE, UP, join_numbers
@@ -47,6 +52,28 @@ def read_along_normals(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tu
     """The contacts, those with a scalar sensor (`fn`) read along the ground's normal."""
     scalar = {frame for frame, names in sensors.contact_wrenches.items() if NORMAL_FORCE in names}
     return tuple(replace(x, along_normal=True) if x.frame in scalar else x for x in contacts)
+
+
+def above_a_floor(contacts: tuple[Contact, ...], config: ExperimentConfig | AnalyzeConfig) -> tuple[Contact, ...]:
+    """The contacts, after making sure that a base's motion can follow from them, where the settings want that.
+
+    Raises:
+        ConfigError: a bolted base, feet that are too few even if all stand, or normals of several floors.
+    """
+    if config.preprocessing.base_motion is None:
+        return contacts
+    field = "preprocessing.base_motion"
+    if config.robot.fixed_base:
+        raise ConfigError.at_field(field, "contacts, though robot.fixed_base is true", "null, or a base that floats")
+    if sum(map(points_of, contacts)) < FEWEST_POINTS:
+        found = f"contacts, but the experiment has {', '.join(f'{c.kind} {c.frame}' for c in contacts) or 'none'}"
+        raise ConfigError.at_field(field, found, f"{FEET} among the contacts")
+    for index, contact in enumerate(contacts):
+        if not np.allclose(contact.normal, contacts[0].normal, rtol=0.0, atol=1e-9):
+            found = f"{join_numbers(contact.normal)}, but contacts[0] has {join_numbers(contacts[0].normal)}"
+            accepted = "one floor for all contacts, or preprocessing.base_motion: null"
+            raise ConfigError.at_field(f"contacts[{index}].normal", found, accepted)
+    return contacts
 
 
 def rolling_shape(shapes: CollisionShapes, contact: Contact) -> RollingShape | None:

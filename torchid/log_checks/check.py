@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchid.errors import LogError, warn
+from torchid.errors import InputError, LogError, warn
 from torchid.log_checks.contacts import (
     check_contact_flags,
     check_limb_sensors,
@@ -38,6 +38,7 @@ from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
 from torchid.problem import Samples
+from torchid.problem.standing import longest_standing
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
@@ -94,7 +95,11 @@ class Checked:
 
 
 def check(
-    log: Log, robot: Robot | None = None, contacts: Sequence[Contact] = (), cutoff_hz: float | None = None
+    log: Log,
+    robot: Robot | None = None,
+    contacts: Sequence[Contact] = (),
+    cutoff_hz: float | None = None,
+    base_from_contacts: bool = False,
 ) -> Checked:
     """Check a log as it was read.
 
@@ -103,6 +108,8 @@ def check(
         robot: the robot; without one, checks against its URDF are skipped.
         contacts: of the robot.
         cutoff_hz: cutoff [Hz] of the filter that the log will be preprocessed with; None for the default.
+        base_from_contacts: whether the motion of the base will follow from the feet that stand; forces are then
+            compared with the URDF in the longest stretch in which enough of them do.
     """
     contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
     results: list[Finding | Skipped] = list(check_magnitudes(log))
@@ -128,12 +135,19 @@ def check(
         results += check_accelerometer(repaired, robot)
     if _blocking_finding(results) is None:
         results += check_standing_feet(repaired, robot, contacts)
+    compared = repaired
+    if base_from_contacts and robot is not None and _blocking_finding(results) is None:
+        try:
+            compared = longest_standing(repaired, robot, contacts)
+        except InputError as error:
+            results.append(Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}"))
     if _blocking_finding(results) is None:
-        results += check_forces_against_urdf(subtract_contact_offsets(repaired), robot, contacts, cutoff_hz)
-        results += check_limb_sensors(repaired, robot, contacts, cutoff_hz)
+        unbiased = subtract_contact_offsets(compared)
+        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, base_from_contacts)
+        results += check_limb_sensors(compared, robot, contacts, cutoff_hz)
     blocking = _blocking_finding(results)
     if blocking is None or blocking.name == "sign":
-        results += check_weight(subtract_contact_offsets(repaired), robot)
+        results += check_weight(subtract_contact_offsets(compared), robot)
     else:
         results.append(_skip_dependent(blocking))
     return _collect(log, repaired, results)
