@@ -26,7 +26,7 @@ FEET = "three point feet, one flat foot, or a line and another foot"
 """Feet that say how a base stands above them, in messages."""
 
 _POSES_TOGETHER = 4096  # samples for which the poses of all links are worked out at once
-_MAX_UNEVEN_M = 0.01  # rms distance of feet that stand from one floor that is worth a warning
+_MAX_UNEVEN_M = 0.005  # rms distance from one floor that is worth a warning: of four feet, one is 2 cm off
 _HEADING_TOLERANCE = 0.02  # of a recorded normal's components against the stated one
 
 
