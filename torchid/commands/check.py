@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.reading import memory_needed
+from torchid.commands.reading import memory_needed, with_flags
 from torchid.config import load_analysis
 from torchid.config.experiment import PreprocessingConfig, load_topics
 from torchid.config.sensors import ContactConfig
@@ -79,9 +79,9 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     checked = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
-            log = read_log_to_check(file, config.logs.topics, config.preprocessing)
-            standing = config.preprocessing.base_motion is not None
-            found = check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz, standing)
+            settings = config.preprocessing
+            log = with_flags(read_log_to_check(file, config.logs.topics, settings), scene)
+            found = check(log, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.commands.check import stretches_to_check
+from torchid.commands.reading import with_flags
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn_about_file
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
@@ -184,8 +185,8 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     for path in files.train:
         with suppress(InputError):  # larger than memory: it is not checked
             for log, name in stretches_to_check(path, files.topics, settings):
-                standing = settings.base_motion is not None
-                checked = check(log, scene.robot, scene.contacts, settings.cutoff_hz, standing)
+                flagged = with_flags(log, scene)
+                checked = check(flagged, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
                 severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
                 findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
                 if any(one.condemns_all for _, one in findings):

@@ -99,7 +99,7 @@ def check(
     robot: Robot | None = None,
     contacts: Sequence[Contact] = (),
     cutoff_hz: float | None = None,
-    base_from_contacts: bool = False,
+    derived: tuple[str, ...] = (),
 ) -> Checked:
     """Check a log as it was read.
 
@@ -108,8 +108,9 @@ def check(
         robot: the robot; without one, checks against its URDF are skipped.
         contacts: of the robot.
         cutoff_hz: cutoff [Hz] of the filter that the log will be preprocessed with; None for the default.
-        base_from_contacts: whether the motion of the base will follow from the feet that stand; forces are then
-            compared with the URDF in the longest stretch in which enough of them do.
+        derived: how names of fields begin that nobody recorded, which are not to blame for anything. contact_active:
+            of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
+            stand; forces are compared with the URDF in the longest stretch in which enough of them do.
     """
     contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
     results: list[Finding | Skipped] = list(check_magnitudes(log))
@@ -126,7 +127,8 @@ def check(
     repaired = repair_log(log, _findings(results))
     if units := list(check_angle_unit(repaired, robot)):  # thresholds of position steps are in radians
         results = [x for x in results if not (isinstance(x, Finding) and x.name == "step" and x.whole)]
-    results += [*units, *check_contact_flags(repaired), *check_scalar_wrenches(repaired)]
+    results += [*units, *([] if "contact_active" in derived else check_contact_flags(repaired))]
+    results += check_scalar_wrenches(repaired)
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
     if blocking is None or blocking.field != "time":
@@ -134,16 +136,16 @@ def check(
         results += check_angular_velocity(repaired, robot)
         results += check_accelerometer(repaired, robot)
     if _blocking_finding(results) is None:
-        results += check_standing_feet(repaired, robot, contacts)
+        results += check_standing_feet(repaired, robot, contacts, derived)
     compared = repaired
-    if base_from_contacts and robot is not None and _blocking_finding(results) is None:
+    if "base_" in derived and robot is not None and _blocking_finding(results) is None:
         try:
             compared = longest_standing(repaired, robot, contacts)
         except InputError as error:
             results.append(Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}"))
     if _blocking_finding(results) is None:
         unbiased = subtract_contact_offsets(compared)
-        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, base_from_contacts)
+        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived)
         results += check_limb_sensors(compared, robot, contacts, cutoff_hz)
     blocking = _blocking_finding(results)
     if blocking is None or blocking.name == "sign":

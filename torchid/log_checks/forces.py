@@ -57,7 +57,7 @@ _FORCE_CHECK = "forces against the URDF"
 
 
 def check_forces_against_urdf(
-    log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None, base_derived: bool = False
+    log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None, derived: tuple[str, ...] = ()
 ) -> Iterator[Finding | Skipped]:
     """Findings about joint torques and contact wrenches.
 
@@ -66,7 +66,7 @@ def check_forces_against_urdf(
         robot: the robot.
         contacts: of it.
         cutoff_hz: of the fit, None for a usual one.
-        base_derived: whether nobody recorded the motion of the base that the log has, so that nobody mistook it.
+        derived: how names of fields begin that nobody recorded, so that nobody mistook them.
     """
     if robot is None:
         yield Skipped(_FORCE_CHECK, "no robot (--urdf)")
@@ -89,7 +89,7 @@ def check_forces_against_urdf(
     fit = fit_nominal_model(samples, robot, contacts)
     explanation = None
     if fit.misfit > MAX_MISFIT:
-        explanation = _best_mistake(log, robot, contacts, cutoff, fit, base_derived)
+        explanation = _best_mistake(log, robot, contacts, cutoff, fit, derived)
     scale = _fit_time_scale(log, robot, contacts) if explanation is None else None
     explanation = explanation or _time_scale_finding(scale)
     if explanation is not None:
@@ -107,12 +107,12 @@ def check_forces_against_urdf(
 
 
 def _best_mistake(
-    log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit, base_derived: bool
+    log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit, derived: tuple[str, ...]
 ) -> Finding | None:
     """The mistake whose correction leaves the least misfit, if that is small enough."""
     best, least = None, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)
     for mistake in possible_mistakes(log):
-        if not _may_explain(mistake.field, fit) or (base_derived and mistake.field.startswith("base_")):
+        if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
             continue
         try:
             pieces = preprocess_pieces(mistake.correct(log), cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES)

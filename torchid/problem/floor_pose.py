@@ -139,7 +139,7 @@ class Walk:
         """Stand on the feet with `points` (N, P, 3) [m] that stand when, (N, P), on a floor with a normal (3,)."""
         self._feet, self._stands = feet, stands
         self._normal = np.array(normal)
-        self._levelled = _levelled(floor.up)  # (N, 3, 3), base to floor but for the heading
+        self._levelled = levelled(floor.up)  # (N, 3, 3), base to floor but for the heading
         self._flat = np.einsum("nij,npj->npi", self._levelled, points)[..., :2]
         self._height = floor.height
         self._places = np.full((points.shape[1], 2), np.nan)  # where points stood at the end of the last stretch
@@ -170,7 +170,7 @@ class Walk:
         return to_world @ rotation, position @ to_world.T
 
     def _follow(self, runs: Sequence[slice], rolled: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Headings (M,) and places (M, 2) [m] of the base, and the final ones (P, 2) of points that have rolled so far."""
+        """Headings (M,) and places (M, 2) [m] of the base, and final ones (P, 2) of points that have rolled so far."""
         offset, anchor = runs[0].start, self._places - rolled[0]
         yaw, place = np.empty(len(rolled)), np.empty((len(rolled), 2))
         for run in runs:
@@ -210,7 +210,7 @@ class Walk:
         return max(both, key=lambda yaw: float(ahead @ (_about_z(np.array([yaw]))[0] @ forward)))
 
 
-def _levelled(up: FloatArray) -> FloatArray:
+def levelled(up: FloatArray) -> FloatArray:
     """Rotations (N, 3, 3) that take upward vectors (N, 3) of the base frame to z."""
     nearest = np.abs(np.nan_to_num(up)).argmin(axis=1)
     x = np.eye(3)[nearest] - up * np.take_along_axis(up, nearest[:, None], axis=1)
