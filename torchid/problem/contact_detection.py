@@ -33,7 +33,7 @@ _RATE_SHARE = 0.2  # of the sample rate: highest cutoff
 _DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
 _FITTED = 4000  # samples, at least half of them, from which actuators' terms are worked out
 _TOGETHER = 2048  # samples whose forces are solved for at once
-_JOINT_SHARE, _BASE_SHARE = 0.1, 0.1  # errors of the URDF and of friction, of the largest torque's rms and the weight
+_JOINT_SHARE, _BASE_SHARE = 0.1, 1.0  # errors of the URDF and of friction, of the largest torque's rms and the weight
 _LEVER_M = 0.3  # arm of the base's moments for a force of the size of its errors
 _FREE = 10.0  # standard deviation of a contact force that nothing determines, in weights
 
