@@ -31,6 +31,8 @@ from torchid.settings import NotNegative, Positive
 GRAVITY = -GRAVITY_WORLD[2]
 _RATE_SHARE = 0.2  # of the sample rate: highest cutoff
 _DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
+_LARGEST = 1.0, 100.0, 100.0  # armature [kg m^2] and friction [N m, N m s/rad] that nothing determines
+_SIGN_WIDTH = 0.001  # rad/s, below which friction is not sure of its sign
 _FITTED = 4000  # samples, at least half of them, from which actuators' terms are worked out
 _TOGETHER = 2048  # samples whose forces are solved for at once
 _JOINT_SHARE, _BASE_SHARE = 0.1, 1.0  # errors of the URDF and of friction, of the largest torque's rms and the weight
@@ -48,8 +50,8 @@ class DetectionConfig:
     `preprocessing.contact_margin_s`.
     """
 
-    touch: Positive = 0.03
-    lift: NotNegative = 0.02
+    touch: Positive = 0.02
+    lift: NotNegative = 0.015
     cutoff_hz: Positive = 20.0
     shortest_s: NotNegative = 0.04
     margin_s: NotNegative = 0.02
@@ -186,7 +188,7 @@ class _Balance:
         free = np.concatenate([_free(contact) for contact in self.contacts]) / (_FREE * self.weight)
         solver = np.linalg.solve(A.swapaxes(1, 2) @ A + np.diag(free**2), A.swapaxes(1, 2))
         velocity, acceleration = samples.joint_velocity.numpy(), samples.joint_acceleration.numpy()
-        terms = np.stack([acceleration, np.sign(velocity), velocity], axis=2)[:, self.rows[6:]]
+        terms = np.stack([acceleration, np.tanh(velocity / _SIGN_WIDTH), velocity], axis=2)[:, self.rows[6:]]
         return _Equations(
             A,
             missing[:, self.rows] / self.error,
@@ -213,7 +215,7 @@ class _Equations:
         maps: of the k components of contact forces to rows, (M, rows, k).
         missing: what contact forces have to make up, (M, rows).
         solver: of that to the components, (M, k, rows).
-        terms: acceleration, sign of the velocity and velocity by joint whose torque was measured, (M, m, 3).
+        terms: acceleration, smoothed sign of the velocity and velocity by joint whose torque was measured, (M, m, 3).
         normals: of the ground in the frame of each contact, (M, 3).
     """
 
@@ -233,9 +235,8 @@ def _fit_actuators(parts: Sequence[_Equations]) -> FloatArray:
         projector = (np.eye(inside.shape[1]) - inside)[:, 6:]
         matrix += np.einsum("njk,nja,nkb->jakb", projector[:, :, 6:], part.terms, part.terms, optimize=True)
         vector -= np.einsum("nj,nja->ja", (projector @ part.missing[..., None])[..., 0], part.terms)
-    flat = matrix.reshape(3 * joints, 3 * joints)
+    flat = matrix.reshape(3 * joints, 3 * joints) + np.diag(np.tile(np.square(_LARGEST), joints) ** -1.0)
     size = np.sqrt(np.diag(flat))
-    size[size == 0.0] = 1.0
     damped = flat / size / size[:, None] + _DAMPING * np.eye(len(flat))
     found: FloatArray = (np.linalg.solve(damped, vector.reshape(-1) / size) / size).reshape(joints, 3)
     return np.maximum(found, 0.0)
