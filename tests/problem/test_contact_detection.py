@@ -14,7 +14,7 @@ from legged.simulate import Exact, simulated
 from motions import value
 from refusals import refused
 from stances import stance
-from synthetic import Array, Oracle
+from synthetic import Array, Oracle, load
 from walking import robot_of
 
 from torchid.errors import LogError, UnknownNameError
@@ -131,6 +131,15 @@ def test_the_order_of_joints_does_not_matter_and_contacts_keep_theirs() -> None:
     )
 
 
+def test_sensors_in_limbs_change_nothing() -> None:
+    true, _ = walked(QUADRUPED)
+    contacts, log = QUADRUPED.contacts(), noisy(QUADRUPED)
+    split = load(QUADRUPED.urdf, None, False, ("front_left_sole",))
+    assert split.n_dofs == true.robot.n + 6
+    found = detect_contacts(log, split, contacts, DEFAULT)
+    assert (found == detect_contacts(log, true.robot, contacts, DEFAULT)).mean() > 0.999
+
+
 def test_gaps_in_a_reading_leave_the_flags_around_them() -> None:
     true, _ = walked(QUADRUPED)
     log = noisy(QUADRUPED)
@@ -152,9 +161,9 @@ def still(loads: Array, samples: int = 200) -> tuple[Log, tuple[Contact, ...]]:
     q = np.concatenate([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], case.log.joint_position[0]])[None]
     zero = np.zeros((1, 18))
     torque = oracle.frictionless_forces(q, zero, zero)[0]
-    for foot, load in zip(case.machine.feet, loads, strict=True):
+    for foot, carried in zip(case.machine.feet, loads, strict=True):
         J, R = oracle.jacobian(q, foot)[0], oracle.pose(q, foot)[0][0]
-        torque = torque - J[:3].T @ (R.T @ np.array([0.0, 0.0, load]))
+        torque = torque - J[:3].T @ (R.T @ np.array([0.0, 0.0, carried]))
     every = np.ones((samples, 1))
     log = Log(
         "still", np.arange(samples) / 100.0, robot.joint_names, every * q[:, 7:], joint_torque=every * torque[6:],

@@ -133,9 +133,10 @@ def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz
         for name in ("position", "velocity", "acceleration", "torque")
     )
     base, rotation = _base(known, robot, contacts)
+    in_limbs = torque.new_full((len(known), robot.n_dofs - robot.n), torch.nan)
     samples = Samples(
-        log.source, torch.from_numpy(known.time), position, velocity, acceleration, base, torque, None, False,
-        torch.ones(len(known), len(contacts), dtype=torch.bool), direction=None,
+        log.source, torch.from_numpy(known.time), position, velocity, acceleration, base,
+        torch.cat([torque, in_limbs], dim=1), None, False, torch.ones(len(known), len(contacts), dtype=torch.bool),
     )  # fmt: skip
     balance = _Balance.of(robot, contacts, torque.numpy())
     chosen = [slice(start, start + _TOGETHER) for start in range(0, len(known), _TOGETHER)]
@@ -176,7 +177,7 @@ class _Balance:
         q, _, _ = samples.coordinates()
         poses = self.robot.link_poses(samples.joint_position)
         missing = predicted[0, :, :n].copy()
-        missing[:, 6:] -= np.zeros(1) if samples.torque is None else samples.torque.numpy()
+        missing[:, 6:] -= np.zeros(1) if samples.torque is None else samples.torque[:, : self.robot.n].numpy()
         maps, normals = [], []
         for contact in self.contacts:
             normal = torch.tensor(contact.normal, dtype=torch.float64)
