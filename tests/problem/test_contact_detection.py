@@ -216,6 +216,20 @@ def test_flags_that_were_made_are_not_condemned_by_the_checks() -> None:
     assert not [x for x in findings if x.field in ("contact_active", "contact_names")]
 
 
+def test_a_leg_without_torques_is_refused() -> None:
+    true, _ = walked(QUADRUPED)
+    log, contacts = noisy(QUADRUPED), QUADRUPED.contacts()
+    torque = value(log.joint_torque).copy()
+    torque[::3, log.joint_names.index("front_left_knee")] = np.nan
+    message = refused(
+        lambda: with_detected_contacts(replace(log, joint_torque=torque), true.robot, contacts),
+        "simulated: joint_torque: measured at front_left_hip, front_left_thigh alone above front_left_foot",
+        LogError,
+    )
+    assert "3 joints or more above each contact" in message
+    assert detect_contacts(log, true.robot, (), DEFAULT).shape == (len(log), 0)
+
+
 def test_a_log_without_torques_or_joints_is_refused_in_one_line() -> None:
     true, _ = walked(QUADRUPED)
     log, contacts = noisy(QUADRUPED), QUADRUPED.contacts()

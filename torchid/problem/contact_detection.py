@@ -30,6 +30,8 @@ from torchid.settings import NotNegative, Positive
 
 GRAVITY = -GRAVITY_WORLD[2]
 _RATE_SHARE = 0.2  # of the sample rate: highest cutoff
+_MAX_GAPS = 0.05  # share of a torque's samples that may be missing, and are interpolated
+_FEWEST_TORQUES = 3  # above a contact, one for each component of a force
 _DAMPING = 1e-3  # of actuators' terms, against the share that samples have of them
 _LARGEST = 1.0, 100.0, 100.0  # armature [kg m^2] and friction [N m, N m s/rad] that nothing determines
 _SIGN_WIDTH = 0.001  # rad/s, below which friction is not sure of its sign
@@ -88,15 +90,17 @@ def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], setting
         settings: thresholds.
 
     Raises:
-        LogError: no torques, joints that are missing, or no contacts.
+        LogError: no torques, fewer than three of joints above a contact, or joints that are missing.
         InputError: a cutoff that does not suit the log.
     """
+    if not contacts:
+        return np.zeros((len(log), 0), dtype=bool)
     weight = GRAVITY * float(robot.nominal[:, 0].sum())
     found = normal_forces(log, robot, contacts, settings.cutoff_hz)
-    shortest = round(settings.shortest_s / float(np.median(np.diff(found.time))))
+    shortest = round(settings.shortest_s / float(np.median(np.diff(found.time)))) if len(found.time) > 1 else 0
     share = found.force.T / weight
     flags = [_without_short(_hysteresis(one, settings.touch, settings.lift), shortest) for one in share]
-    nearest = np.abs(np.searchsorted(0.5 * (found.time[1:] + found.time[:-1]), log.time))
+    nearest = np.searchsorted(0.5 * (found.time[1:] + found.time[:-1]), log.time)
     return np.stack(flags, axis=1)[nearest]
 
 
@@ -122,7 +126,7 @@ def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz
         cutoff_hz: of the filter [Hz], lower where the log is slow.
 
     Raises:
-        InputError: no torques, joints that are missing, or as `preprocess`.
+        InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
     """
     if log.joint_torque is None:
         raise LogError(log.source, "joint_torque", "missing", "the field, from which preprocessing.detect_contacts is")
@@ -132,6 +136,7 @@ def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz
         torch.from_numpy(np.ascontiguousarray(getattr(known, f"joint_{name}")[:, order]))
         for name in ("position", "velocity", "acceleration", "torque")
     )
+    _require_torques(log, robot, contacts, np.isfinite(torque.numpy()).all(axis=0))
     base, rotation = _base(known, robot, contacts)
     in_limbs = torque.new_full((len(known), robot.n_dofs - robot.n), torch.nan)
     samples = Samples(
@@ -144,6 +149,20 @@ def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz
     actuators = _fit_actuators([balance.equations(samples[every], rotation[every])])
     parts = [balance.normal_forces(balance.equations(samples[x], rotation[x]), actuators) for x in chosen]
     return NormalForces(known.time, np.concatenate(parts))
+
+
+def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measured: BoolArray) -> None:
+    """Refuse a log in which fewer than three joints above a contact have a torque, of which measured are (n,)."""
+    for contact in contacts:
+        above, body = set[str](), robot.links[contact.frame][0]
+        while (joint := robot.bodies[body].joint) is not None:
+            above.add(joint.name if joint.mimic is None else joint.mimic.master)
+            body = joint.parent
+        of_contact = [name for name, known in zip(robot.joint_names, measured, strict=True) if known and name in above]
+        if len(of_contact) < _FEWEST_TORQUES:
+            found = f"measured at {', '.join(of_contact) or 'no joint'} alone above {contact.frame}"
+            accepted = f"torques of {_FEWEST_TORQUES} joints or more above each contact, for detect_contacts"
+            raise LogError(log.source, "joint_torque", found, accepted)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,6 +279,9 @@ def _preprocessed(log: Log, cutoff_hz: float) -> Log:
         for name, array in log.arrays().items()
         if name.startswith(("joint_", "base_", "imu_"))
     }
+    torque = filled["joint_torque"]
+    broken = np.isnan(np.asarray(log.joint_torque)).mean(axis=0) > _MAX_GAPS
+    filled["joint_torque"] = np.where(broken, np.nan, torque)
     rate = 1.0 / float(np.median(np.diff(log.time))) if len(log) > 1 else 1.0
     with warnings.catch_warnings():
         warnings.simplefilter(
