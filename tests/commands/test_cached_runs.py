@@ -111,6 +111,8 @@ CHANGED = {
     "cutoff_hz": 7.0,
     "sample_rate_hz": 111.0,
     "contact_margin_s": 0.02,
+    "detect_contacts": True,
+    "base_motion": "contacts",
     "exclude_condemned": True,
     "memory_gb": 3.0,
     "cache_gb": 5.0,

@@ -151,7 +151,7 @@ def _legs(oracle: Oracle, frame: str) -> list[int]:
     return found[::-1]
 
 
-def _reach(oracle: Oracle, machine: Machine, q: Array, targets: Array, turn: Array) -> Array:
+def reach(oracle: Oracle, machine: Machine, q: Array, targets: Array, turn: Array) -> Array:
     """Coordinates q (N, 7 + n) with feet moved to targets (N, C, 3) and, flat ones, to rotations (C, 3, 3)."""
     model, data = oracle.model, oracle.data
     out = np.array([oracle.coordinates(one) for one in q])
@@ -250,7 +250,7 @@ def _walked(
     base[:, 2] -= 0.01
     base[:, 3:] = 4.0 * machine.size * swaying[:, 3:]
     turned = Rotation.from_euler("ZYX", base[:, 3:]).as_quat()
-    q = _reach(oracle, machine, np.hstack([base[:, :3], turned, joints]), gait.feet(knots)[0], turn)
+    q = reach(oracle, machine, np.hstack([base[:, :3], turned, joints]), gait.feet(knots)[0], turn)
     return (make_interp_spline(knots, base, k=5), make_interp_spline(knots, q[:, 7:], k=5)), gait
 
 

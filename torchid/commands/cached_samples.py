@@ -52,7 +52,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
     Of the sensors that are fitted it is whether contacts have offsets: then samples have readings in the air.
     """
     config, robot = scene.config, scene.robot
-    settings = {name: x for name, x in vars(config.preprocessing).items() if name not in NOT_IN_SAMPLES}
+    settings = {name: x for name, x in asdict(config.preprocessing).items() if name not in NOT_IN_SAMPLES}
     topics = None if config.logs is None or config.logs.topics is None else asdict(config.logs.topics)
     columns = None if config.logs is None or config.logs.columns is None else asdict(config.logs.columns)
     return {

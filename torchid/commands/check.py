@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.reading import memory_needed
+from torchid.commands.reading import memory_needed, with_flags
 from torchid.config import load_analysis
 from torchid.config.experiment import PreprocessingConfig, load_columns, load_topics
 from torchid.config.logs import LogsConfig
@@ -82,8 +82,9 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     checked = []
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
-            log = read_log_to_check(file, config.logs, config.preprocessing)
-            found = check(log, scene.robot, scene.contacts, config.preprocessing.cutoff_hz)
+            settings = config.preprocessing
+            log = with_flags(read_log_to_check(file, config.logs, settings), scene)
+            found = check(log, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.commands.check import stretches_to_check
+from torchid.commands.reading import with_flags
 from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn_about_file
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
@@ -180,10 +181,12 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     if files is None or files.compressed:
         return
     findings: list[tuple[str, Finding]] = []
+    settings = scene.config.preprocessing
     for path in files.train:
         with suppress(InputError):  # larger than memory: it is not checked
-            for log, name in stretches_to_check(path, files, scene.config.preprocessing):
-                checked = check(log, scene.robot, scene.contacts, scene.config.preprocessing.cutoff_hz)
+            for log, name in stretches_to_check(path, files, settings):
+                flagged = with_flags(log, scene)
+                checked = check(flagged, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
                 severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
                 findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
                 if any(one.condemns_all for _, one in findings):

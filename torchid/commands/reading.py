@@ -22,6 +22,8 @@ from torchid.logs.containers import LogKind, existing_log_kind
 from torchid.logs.preprocess import away_from_changes, preprocess
 from torchid.logs.time_range import LogPart, share_samples, split_range
 from torchid.problem import Samples, bind_log
+from torchid.problem.contact_detection import with_detected_contacts
+from torchid.problem.standing import preprocess_standing
 from torchid.sensing import SensorSet
 
 _WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
@@ -85,10 +87,15 @@ class LogReader:
         if self._takes_blocks(log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
             return self._large_log(path, required, None).samples(fits_contact_offsets(self.scene))
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
-        recorded = read_log(path, topics, allow_gaps=settings.exclude_condemned, columns=columns)
+        read = read_log(path, topics, allow_gaps=settings.exclude_condemned, columns=columns)
+        recorded = with_flags(read, self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
-        log = preprocess(clean, settings.cutoff_hz, settings.sample_rate_hz, self._stated)
+        rates = settings.cutoff_hz, settings.sample_rate_hz
+        if settings.base_motion is None:
+            log = preprocess(clean, *rates, self._stated)
+        else:
+            log = preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates)
         samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
         if not fits_contact_offsets(self.scene):
             samples = replace(samples, unloaded=None)
@@ -96,23 +103,33 @@ class LogReader:
             count = len(samples)
             samples = drop_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
             self.excluded[str(path)] = count - len(samples)
-        if settings.contact_margin_s is None:
+        if settings.margin_s is None:
             return samples
-        kept = away_from_changes(recorded, samples.time.numpy(), settings.contact_margin_s)
+        kept = away_from_changes(recorded, samples.time.numpy(), settings.margin_s)
         return samples if kept is None else samples[torch.from_numpy(np.flatnonzero(kept))]
 
     def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
         """A log that does not, with those before it [GB]."""
         settings = self.scene.config.preprocessing
-        if settings.exclude_condemned:
+        if self._needs_whole_logs:
             found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
-            accepted = f"a preprocessing.memory_gb above {together:.2g}, or parts of the logs that torchid check passes"
-            raise LogError(path, "preprocessing.exclude_condemned", found, accepted)
+            accepted = f"a preprocessing.memory_gb above {together:.2g}, or parts of the logs"
+            if settings.exclude_condemned:
+                key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
+            else:
+                key = "base_motion" if settings.base_motion is not None else "detect_contacts"
+            raise LogError(path, f"preprocessing.{key}", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
     def _takes_blocks(self, gigabytes: float) -> bool:
         """Whether a log with so much in arrays is read block by block even if there is memory for it."""
-        return gigabytes > _WHOLE_GB and not self.scene.config.preprocessing.exclude_condemned
+        return gigabytes > _WHOLE_GB and not self._needs_whole_logs
+
+    @property
+    def _needs_whole_logs(self) -> bool:
+        """Whether samples are left out for what is known of a whole log alone."""
+        settings = self.scene.config.preprocessing
+        return settings.exclude_condemned or bool(settings.derived)
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
@@ -138,7 +155,13 @@ class LogReader:
         settings = self.scene.config.preprocessing
         if not settings.exclude_condemned:
             return None
-        return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz)
+        return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz, settings.derived)
+
+
+def with_flags(log: Log, scene: Scene) -> Log:
+    """A log as it was read, with contact flags from joint torques if the settings want these."""
+    settings = scene.config.preprocessing.detect_contacts
+    return log if settings is None else with_detected_contacts(log, scene.robot, scene.contacts, settings)
 
 
 def check_parts(logs: Mapping[str, Sequence[Samples]]) -> None:

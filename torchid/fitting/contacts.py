@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from torchid.config import AnalyzeConfig, ExperimentConfig
 from torchid.config.sensors import ChoiceConfig, ContactConfig
 from torchid.errors import ConfigError, SensorError
+from torchid.problem.floor_pose import FEWEST_POINTS, points_of
+from torchid.problem.standing import FEET
 from torchid.robot import CollisionShapes, Robot, RollingShape
 from torchid.sensing import Contact, validate_contacts
 from torchid.sensing.sensors import NORMAL_FORCE, UP, join_numbers
@@ -47,6 +52,44 @@ def read_along_normals(contacts: Sequence[Contact], sensors: ChoiceConfig) -> tu
     """The contacts, those with a scalar sensor (`fn`) read along the ground's normal."""
     scalar = {frame for frame, names in sensors.contact_wrenches.items() if NORMAL_FORCE in names}
     return tuple(replace(x, along_normal=True) if x.frame in scalar else x for x in contacts)
+
+
+def suited_to_preprocessing(
+    contacts: tuple[Contact, ...], config: ExperimentConfig | AnalyzeConfig
+) -> tuple[Contact, ...]:
+    """The contacts, after making sure that flags and a base's motion can follow from them where settings want that.
+
+    Raises:
+        ConfigError: a bolted base, feet that are too few even if all stand, normals of several floors, or thresholds
+            of detection that contradict each other.
+    """
+    settings = config.preprocessing
+    for key in ("detect_contacts", "base_motion"):
+        if getattr(settings, key) is not None and config.robot.fixed_base:
+            accepted = "null, or a base that floats"
+            raise ConfigError.at_field(f"preprocessing.{key}", "set, though robot.fixed_base is true", accepted)
+    if settings.detect_contacts is not None:
+        if not contacts:
+            raise ConfigError.at_field("preprocessing.detect_contacts", "set, without contacts", "contacts to detect")
+        touch, lift = settings.detect_contacts.touch, settings.detect_contacts.lift
+        if lift > touch:
+            found, accepted = f"{lift:g}, above touch ({touch:g})", "a share of the weight up to that of touch"
+            raise ConfigError.at_field("preprocessing.detect_contacts.lift", found, accepted)
+    if settings.base_motion is not None:
+        _require_floor(contacts)
+    return contacts
+
+
+def _require_floor(contacts: tuple[Contact, ...]) -> None:
+    """Refuse contacts that do not say how a base stands above one floor, even if all stand."""
+    if sum(map(points_of, contacts)) < FEWEST_POINTS:
+        found = f"contacts, but the experiment has {', '.join(f'{c.kind} {c.frame}' for c in contacts) or 'none'}"
+        raise ConfigError.at_field("preprocessing.base_motion", found, f"{FEET} among the contacts")
+    for index, contact in enumerate(contacts):
+        if not np.allclose(contact.normal, contacts[0].normal, rtol=0.0, atol=1e-9):
+            found = f"{join_numbers(contact.normal)}, but contacts[0] has {join_numbers(contacts[0].normal)}"
+            accepted = "one floor for all contacts, or preprocessing.base_motion: null"
+            raise ConfigError.at_field(f"contacts[{index}].normal", found, accepted)
 
 
 def rolling_shape(shapes: CollisionShapes, contact: Contact) -> RollingShape | None:

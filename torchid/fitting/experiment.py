@@ -16,7 +16,7 @@ from torchid.config.sensors import ChoiceConfig
 from torchid.errors import ConfigError, LogError, UnknownNameError, warn_about_file
 from torchid.estimators import Conditions, Consistent, Enclosure, LeastSquares, Mirror
 from torchid.fitting.calibration import Calibration, Comparison, calibrations
-from torchid.fitting.contacts import read_along_normals, resolve_contacts
+from torchid.fitting.contacts import read_along_normals, resolve_contacts, suited_to_preprocessing
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
@@ -209,7 +209,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         joints = [body.joint.name for body in robot.bodies if body.joint is not None]
         require_names(config.logs.columns, {"joint": joints, "contact": robot.links})
     contacts, rolling = resolve_contacts(config.contacts, robot)
-    contacts = read_along_normals(contacts, config.sensors)
+    contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
     return Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
 

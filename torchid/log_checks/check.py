@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchid.errors import LogError, warn
+from torchid.errors import InputError, LogError, warn
 from torchid.log_checks.contacts import (
     check_contact_flags,
     check_limb_sensors,
@@ -38,6 +38,7 @@ from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
 from torchid.problem import Samples
+from torchid.problem.standing import longest_standing
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
@@ -94,7 +95,11 @@ class Checked:
 
 
 def check(
-    log: Log, robot: Robot | None = None, contacts: Sequence[Contact] = (), cutoff_hz: float | None = None
+    log: Log,
+    robot: Robot | None = None,
+    contacts: Sequence[Contact] = (),
+    cutoff_hz: float | None = None,
+    derived: tuple[str, ...] = (),
 ) -> Checked:
     """Check a log as it was read.
 
@@ -103,6 +108,9 @@ def check(
         robot: the robot; without one, checks against its URDF are skipped.
         contacts: of the robot.
         cutoff_hz: cutoff [Hz] of the filter that the log will be preprocessed with; None for the default.
+        derived: how names of fields begin that nobody recorded, which are not to blame for anything. contact_active:
+            of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
+            stand; forces are compared with the URDF in the longest stretch in which enough of them do.
     """
     contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
     results: list[Finding | Skipped] = list(check_magnitudes(log))
@@ -119,7 +127,8 @@ def check(
     repaired = repair_log(log, _findings(results))
     if units := list(check_angle_unit(repaired, robot)):  # thresholds of position steps are in radians
         results = [x for x in results if not (isinstance(x, Finding) and x.name == "step" and x.whole)]
-    results += [*units, *check_contact_flags(repaired), *check_scalar_wrenches(repaired)]
+    results += [*units, *([] if "contact_active" in derived else check_contact_flags(repaired))]
+    results += check_scalar_wrenches(repaired)
     repaired = repair_log(log, _findings(results))
     blocking = _blocking_finding(results)
     if blocking is None or blocking.field != "time":
@@ -127,13 +136,20 @@ def check(
         results += check_angular_velocity(repaired, robot)
         results += check_accelerometer(repaired, robot)
     if _blocking_finding(results) is None:
-        results += check_standing_feet(repaired, robot, contacts)
+        results += check_standing_feet(repaired, robot, contacts, derived)
+    compared = repaired
+    if "base_" in derived and robot is not None and _blocking_finding(results) is None:
+        try:
+            compared = longest_standing(repaired, robot, contacts)
+        except InputError as error:
+            results.append(Finding("does not fit", CONDEMNED, error.field, error.found, f"give {error.accepted}"))
     if _blocking_finding(results) is None:
-        results += check_forces_against_urdf(subtract_contact_offsets(repaired), robot, contacts, cutoff_hz)
-        results += check_limb_sensors(repaired, robot, contacts, cutoff_hz)
+        unbiased = subtract_contact_offsets(compared)
+        results += check_forces_against_urdf(unbiased, robot, contacts, cutoff_hz, derived)
+        results += check_limb_sensors(compared, robot, contacts, cutoff_hz)
     blocking = _blocking_finding(results)
     if blocking is None or blocking.name == "sign":
-        results += check_weight(subtract_contact_offsets(repaired), robot)
+        results += check_weight(subtract_contact_offsets(compared), robot)
     else:
         results.append(_skip_dependent(blocking))
     return _collect(log, repaired, results)

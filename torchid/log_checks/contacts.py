@@ -204,8 +204,10 @@ _CORRECTED_FIELDS = ("joint_names", "joint_position", "base_quat_xyzw", "contact
 _STANDING_FEET_CHECK = "feet that stand"
 
 
-def check_standing_feet(log: Log, robot: Robot | None, contacts: Sequence[Contact]) -> Iterator[Finding | Skipped]:
-    """Findings about feet that move while their flag is set."""
+def check_standing_feet(
+    log: Log, robot: Robot | None, contacts: Sequence[Contact], derived: tuple[str, ...] = ()
+) -> Iterator[Finding | Skipped]:
+    """Findings about feet that move while their flag is set, not to be blamed on fields that begin with `derived`."""
     if robot is None or not contacts or robot.fixed_base:
         return
     log = log.select(slice(None, None, max(1, len(log) // _MAX_COMPARED_SAMPLES)))
@@ -218,7 +220,7 @@ def check_standing_feet(log: Log, robot: Robot | None, contacts: Sequence[Contac
         return
     best, least = None, MAX_RESIDUAL_SHARE * slip
     for mistake in possible_mistakes(log):
-        if mistake.field not in _CORRECTED_FIELDS:
+        if mistake.field not in _CORRECTED_FIELDS or mistake.field.startswith(derived):
             continue
         trial = measure_foot_slip(mistake.correct(log), robot, contacts)
         if trial is not None and trial < least:

@@ -57,9 +57,17 @@ _FORCE_CHECK = "forces against the URDF"
 
 
 def check_forces_against_urdf(
-    log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None
+    log: Log, robot: Robot | None, contacts: Sequence[Contact], cutoff_hz: float | None, derived: tuple[str, ...] = ()
 ) -> Iterator[Finding | Skipped]:
-    """Findings about joint torques and contact wrenches; `cutoff_hz` is that of the fit, None for a usual one."""
+    """Findings about joint torques and contact wrenches.
+
+    Args:
+        log: the log.
+        robot: the robot.
+        contacts: of it.
+        cutoff_hz: of the fit, None for a usual one.
+        derived: how names of fields begin that nobody recorded, so that nobody mistook them.
+    """
     if robot is None:
         yield Skipped(_FORCE_CHECK, "no robot (--urdf)")
         return
@@ -79,7 +87,9 @@ def check_forces_against_urdf(
         yield Skipped(_FORCE_CHECK, "neither joint torques nor contact wrenches")
         return
     fit = fit_nominal_model(samples, robot, contacts)
-    explanation = _best_mistake(log, robot, contacts, cutoff, fit) if fit.misfit > MAX_MISFIT else None
+    explanation = None
+    if fit.misfit > MAX_MISFIT:
+        explanation = _best_mistake(log, robot, contacts, cutoff, fit, derived)
     scale = _fit_time_scale(log, robot, contacts) if explanation is None else None
     explanation = explanation or _time_scale_finding(scale)
     if explanation is not None:
@@ -96,11 +106,13 @@ def check_forces_against_urdf(
         yield from _gain_and_point_findings(log, samples, robot, contacts)
 
 
-def _best_mistake(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit) -> Finding | None:
+def _best_mistake(
+    log: Log, robot: Robot, contacts: Sequence[Contact], cutoff: float, fit: ModelFit, derived: tuple[str, ...]
+) -> Finding | None:
     """The mistake whose correction leaves the least misfit, if that is small enough."""
     best, least = None, MAX_RESIDUAL_SHARE * min(fit.misfit, 1.0)
     for mistake in possible_mistakes(log):
-        if not _may_explain(mistake.field, fit):
+        if not _may_explain(mistake.field, fit) or mistake.field.startswith(derived):
             continue
         try:
             pieces = preprocess_pieces(mistake.correct(log), cutoff, MAX_TRIAL_DIFFERENTIATED_SAMPLES)

@@ -179,7 +179,7 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
         UnknownNameError: a joint or contact that the robot does not have.
         LogError: a missing joint, contact, motion or force.
     """
-    order = _joint_order(log, robot)
+    order = joint_order(log, robot)
     position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
     base = base_motion(log, robot)
     chosen, active = _contacts(log, robot, contacts)
@@ -305,7 +305,8 @@ def _columns(x: np.ndarray, order: list[int]) -> np.ndarray:
     return x if order == list(range(x.shape[1])) else x[:, order]
 
 
-def _joint_order(log: Log, robot: Robot) -> list[int]:
+def joint_order(log: Log, robot: Robot) -> list[int]:
+    """Columns of the log's joints in the robot's order; InputError unless it has them all and no other."""
     known = {body.joint.name for body in robot.bodies if body.joint is not None}
     for name in log.joint_names:
         if name not in known:

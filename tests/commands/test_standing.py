@@ -1,0 +1,297 @@
+"""`preprocessing.base_motion: contacts` in the commands: the same results, and refusals in one line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from demo import DEMO
+from experiments import changed, load
+from legged.robots import GO2
+from motions import value
+from refusals import refusal, refused
+from repository import SHARED
+from walking import MACHINES, recorded, truth
+
+from torchid.cli import main
+from torchid.commands.check import check_experiment
+from torchid.commands.reading import LogReader
+from torchid.config import load_config
+from torchid.errors import ConfigError, InputError, TorchidWarning
+from torchid.fitting.experiment import set_up
+from torchid.logs import Log, write_log
+from torchid.problem.contact_detection import DetectionConfig
+
+MACHINE = MACHINES["quadruped"]
+FEET = [{"frame": name, "type": "point"} for name in MACHINE.feet]
+NO_BASE: dict[str, Any] = {"base_quat_xyzw": None, "base_position_world": None}
+
+
+@pytest.fixture(scope="module")
+def logs() -> tuple[Log, Log]:
+    """A walk and another of a quadruped, recorded with the pose of its base."""
+    one, other = (recorded(MACHINE, truth(MACHINE, 0, seconds=4.0), seed=seed, noise=0.1) for seed in (0, 1))
+    return replace(one, contact_wrench_local=None), replace(other, contact_wrench_local=None)
+
+
+Written = Callable[..., Path]
+
+
+@pytest.fixture
+def written(tmp_path: Path, logs: tuple[Log, Log]) -> Written:
+    """Writes an experiment file with these logs, without what they have of the base's motion."""
+
+    def write(change: Callable[[Log], Log] = lambda log: replace(log, **NO_BASE), **preprocessing: Any) -> Path:
+        for name, log in zip(("train", "test"), logs, strict=True):
+            write_log(change(log), tmp_path / f"{name}.npz")
+        settings = {
+            "robot": {"urdf": str(DEMO / "quadruped.urdf")},
+            "contacts": FEET,
+            "logs": {"train": ["train.npz"], "test": ["test.npz"]},
+            "preprocessing": {"cutoff_hz": 15, "cache_gb": 0} | preprocessing,
+            "sensors": "joints",
+            "estimator": {"name": "least_squares", "ridge": 1e-3},
+            "output": str(tmp_path / "run"),
+        }
+        (tmp_path / "walk.yaml").write_text(json.dumps(settings))
+        return tmp_path / "walk.yaml"
+
+    return write
+
+
+def metrics_of(run: Path) -> dict[str, Any]:
+    return dict(json.loads((run / "metrics.json").read_text()))
+
+
+def test_a_fit_without_the_pose_of_the_base_predicts_as_well_as_with_it(written: Written, tmp_path: Path) -> None:
+    file = written(lambda log: log)
+    assert main(["identify", str(file), f"output={tmp_path / 'measured'}"]) == 0
+    file = written(base_motion="contacts")
+    assert main(["identify", str(file)]) == 0
+    measured, derived = (metrics_of(tmp_path / name)["test"]["nullspace_rms"] for name in ("measured", "run"))
+    nominal = metrics_of(tmp_path / "run")["test_nominal"]["nullspace_rms"]
+    assert derived < 1.1 * measured
+    assert derived < 0.3 * nominal
+    assert main(["evaluate", str(tmp_path / "run"), "--log", str(tmp_path / "test.npz")]) == 0
+    again = metrics_of(tmp_path / "run" / "evaluation" / "test")["test"]["identified"]["nullspace_rms"]
+    assert again == pytest.approx(derived, rel=1e-12)
+
+
+def test_factors_of_such_logs_give_the_fit_of_the_logs(written: Written, tmp_path: Path) -> None:
+    file = written(base_motion="contacts")
+    noise = "sensors={set: joints, noise: {joint_torque: 0.1, base_force: 1, base_moment: 0.2}}"
+    assert main(["compress", str(file), noise, "--output", str(tmp_path / "factors")]) == 0
+    assert main(["identify", str(file), noise, f"output={tmp_path / 'logs'}"]) == 0
+    train = f"logs.train=[{tmp_path / 'factors' / 'train.factor'}]"
+    assert main(["identify", str(file), noise, train, f"output={tmp_path / 'fleet'}"]) == 0
+    one, other = (metrics_of(tmp_path / name)["test"]["nullspace_rms"] for name in ("logs", "fleet"))
+    assert one == pytest.approx(other, rel=1e-9)
+
+
+def test_the_checks_compare_forces_of_a_log_without_the_base(written: Written) -> None:
+    lacking = check_experiment(written())[0]
+    assert any(finding.name == "does not fit" and finding.field == "base_quat_xyzw" for finding in lacking.findings)
+    checked = check_experiment(written(base_motion="contacts"))[0]
+    assert checked.usable
+    assert not any("base_" in finding.field for finding in checked.findings)
+    assert not any(skip.name.startswith("forces against") for skip in checked.skipped)
+
+
+def test_the_checks_find_reversed_torques_without_the_base(written: Written) -> None:
+    def reversed_torque(log: Log) -> Log:
+        return replace(log, **NO_BASE, joint_torque=-value(log.joint_torque))
+
+    checked = check_experiment(written(reversed_torque, base_motion="contacts"))[0]
+    assert not checked.usable
+    assert any(finding.field == "joint_torque" for finding in checked.findings)
+
+
+def test_the_checks_condemn_a_log_in_which_nothing_stands(written: Written) -> None:
+    def in_the_air(log: Log) -> Log:
+        return replace(log, **NO_BASE, contact_active=np.zeros_like(value(log.contact_active)))
+
+    checked = check_experiment(written(in_the_air, base_motion="contacts"))[0]
+    (finding,) = [one for one in checked.findings if one.name == "does not fit"]
+    assert finding.found.startswith("no contact stands in any sample")
+
+
+def test_samples_that_the_checks_condemn_are_left_out_too(written: Written) -> None:
+    def with_spike(log: Log) -> Log:
+        position = log.joint_position.copy()
+        position[500:503, 2] += 1.5
+        return replace(log, **NO_BASE, joint_position=position)
+
+    scene = set_up(load_config(written(with_spike, base_motion="contacts", exclude_condemned=True)))
+    reader = LogReader(scene)
+    with pytest.warns(TorchidWarning, match="samples excluded"):
+        (samples,) = reader.read(scene.config.logs.train, scene.sensors)
+    assert sum(reader.excluded.values()) > 3
+    assert float(value(samples.base.angular_acceleration).abs().max()) < 20.0
+
+
+def test_a_log_that_would_be_read_in_blocks_is_taken_whole(written: Written, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = set_up(load_config(written(base_motion="contacts")))
+    (one,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+    monkeypatch.setattr("torchid.commands.reading._WHOLE_GB", 0.0)
+    (other,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+    np.testing.assert_array_equal(value(one.base.specific_force), value(other.base.specific_force))
+
+
+def test_a_log_larger_than_memory_is_refused(
+    written: Written, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["identify", str(written(base_motion="contacts", memory_gb=1e-4))]
+    line = refusal(arguments, tmp_path, capsys)
+    assert "preprocessing.base_motion: set for arrays of" in line
+    assert "a preprocessing.memory_gb above" in line
+
+
+def test_cached_samples_of_one_setting_are_not_those_of_the_other(written: Written, tmp_path: Path) -> None:
+    file = written(lambda log: log, cache_gb=1)
+    assert main(["identify", str(file), f"output={tmp_path / 'one'}"]) == 0
+    override = "preprocessing.base_motion=contacts"
+    assert main(["identify", str(file), f"output={tmp_path / 'two'}", override]) == 0
+    assert main(["identify", str(file), f"output={tmp_path / 'again'}", override]) == 0
+    one, two, again = (metrics_of(tmp_path / name)["test"]["nullspace_rms"] for name in ("one", "two", "again"))
+    assert one != two
+    assert again == two
+
+
+# ---------------------------------------------------------------------------------------------------- detected contacts
+
+
+NO_FLAGS: dict[str, Any] = {"contact_names": (), "contact_active": None}
+
+
+def test_a_fit_with_detected_contacts_predicts_far_better_than_the_urdf(written: Written, tmp_path: Path) -> None:
+    """A foot here carries a twentieth of the weight for a while, which friction of 15 % of each torque hides."""
+    file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts=True)
+    assert main(["identify", str(file)]) == 0
+    metrics = metrics_of(tmp_path / "run")
+    assert metrics["test"]["nullspace_rms"] < 0.4 * metrics["test_nominal"]["nullspace_rms"]
+
+
+def test_samples_near_changes_of_detected_contacts_are_dropped(written: Written) -> None:
+    counts = []
+    for margin in (0.0, 0.05):
+        file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts={"margin_s": margin})
+        scene = set_up(load_config(file))
+        counts.append(len(LogReader(scene).read(scene.config.logs.train, scene.sensors)[0]))
+    assert counts[1] < counts[0] - 50
+
+
+def test_the_checks_do_not_condemn_flags_that_they_were_not_given(written: Written) -> None:
+    file = written(lambda log: replace(log, **NO_FLAGS), detect_contacts=True)
+    checked = check_experiment(file)[0]
+    assert checked.usable
+    assert not any("contact" in finding.field for finding in checked.findings)
+
+
+def test_thresholds_of_detection_are_checked(tmp_path: Path) -> None:
+    def refused_detection(detection: object, start: str, contacts: object = None, **robot: Any) -> str:
+        settings = changed(
+            robot={"urdf": str(DEMO / "quadruped.urdf")} | robot,
+            contacts=FEET if contacts is None else contacts,
+            preprocessing={"detect_contacts": detection},
+        )
+        np.savez(tmp_path / "a.npz")
+        return refused(lambda: set_up(load(tmp_path / "x.yaml", settings)), start, InputError)
+
+    field = "preprocessing.detect_contacts"
+    assert "above touch (0.02)" in refused_detection({"lift": 0.1}, f"{field}.lift: 0.1")
+    refused_detection(True, f"{field}: set, without contacts", [])
+    refused_detection(True, f"{field}: set, though robot.fixed_base", fixed_base=True)
+    place = f"{tmp_path / 'x.yaml'}: {field}"
+    assert "touch" in refused_detection({"tuch": 0.1}, f"{place}: unknown name 'tuch'")
+    refused_detection({"touch": -0.1}, f"{place}.touch: ")
+    off = load(tmp_path / "y.yaml", changed(preprocessing={"detect_contacts": False}))
+    on = load(tmp_path / "y.yaml", changed(preprocessing={"detect_contacts": True}), f"{field}.lift=0.01")
+    assert off.preprocessing.detect_contacts is None
+    assert on.preprocessing.detect_contacts == DetectionConfig(lift=0.01)
+
+
+# ------------------------------------------------------------------------------------------------------------- settings
+
+
+def refused_settings(folder: Path, contacts: list[dict[str, Any]], **robot: Any) -> str:
+    settings = changed(
+        robot={"urdf": str(DEMO / "quadruped.urdf")} | robot,
+        contacts=contacts,
+        preprocessing={"base_motion": "contacts"},
+    )
+    np.savez(folder / "a.npz")
+    return refused(lambda: set_up(load(folder / "x.yaml", settings)), "preprocessing.base_motion: ", ConfigError)
+
+
+def test_contacts_that_can_never_say_how_the_base_stands_are_refused(tmp_path: Path) -> None:
+    assert "the experiment has none; accepted: three point feet" in refused_settings(tmp_path, [])
+    assert "the experiment has point front_left_foot, point" in refused_settings(tmp_path, FEET[:2])
+    assert "robot.fixed_base is true" in refused_settings(tmp_path, FEET, fixed_base=True)
+    set_up(load(tmp_path / "y.yaml", changed(
+        robot={"urdf": str(DEMO / "quadruped.urdf")}, contacts=FEET[:3], preprocessing={"base_motion": "contacts"},
+    )))  # fmt: skip
+
+
+def test_one_floor_has_one_normal(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz")
+    tilted = [*FEET[:3], FEET[3] | {"normal": [0.1, 0, 1]}]
+    settings = changed(
+        robot={"urdf": str(DEMO / "quadruped.urdf")}, contacts=tilted, preprocessing={"base_motion": "contacts"}
+    )
+    line = refused(lambda: set_up(load(tmp_path / "x.yaml", settings)), "contacts[3].normal: [0.0995", ConfigError)
+    assert "contacts[0] has [0, 0, 1]" in line
+    set_up(load(tmp_path / "y.yaml", settings | {"preprocessing": {}}))
+
+
+def test_another_source_of_the_base_motion_is_refused_by_the_place_of_the_key(tmp_path: Path) -> None:
+    settings = changed(preprocessing={"base_motion": "imu"})
+    line = refused(lambda: load(tmp_path / "x.yaml", settings), f"{tmp_path / 'x.yaml'}: preprocessing.base_motion: ")
+    assert "'contacts'" in line
+
+
+# --------------------------------------------------------------------------------------------------------- a real robot
+
+
+REAL = pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded Go2 (../shared/data) is not here")
+
+
+def standing_go2(folder: Path, **preprocessing: Any) -> dict[str, Any]:
+    """What an experiment on the recording makes of its second half, without an IMU or flags that anybody recorded."""
+    if not GO2.available:
+        pytest.skip("the package example-robot-data is not installed")
+    with np.load(SHARED / "go2_standing" / "log.npz") as raw:
+        fields = {"time": raw["time"], "joint_names": raw["joint_names"], "joint_position": raw["joint_position"]}
+        fields["joint_torque"] = raw["torque_estimate"]
+    fields |= {"contact_names": np.array(GO2.feet), "contact_active": np.ones((len(fields["time"]), 4), dtype=bool)}
+    np.savez(folder / "stand.npz", **fields)
+    settings = {
+        "robot": {"urdf": str(GO2.urdf)},
+        "contacts": [{"frame": foot, "type": "point"} for foot in GO2.feet],
+        "logs": {"train": ["stand.npz[:50%]"], "test": ["stand.npz[50%:]"]},
+        "preprocessing": {"cutoff_hz": 4, "base_motion": "contacts"} | preprocessing,
+        "sensors": "joints",
+        "estimator": {"name": "consistent", "ridge": 1e-5},
+        "output": str(folder / "run"),
+    }
+    (folder / "stand.yaml").write_text(json.dumps(settings))
+    assert main(["identify", str(folder / "stand.yaml")]) == 0
+    return metrics_of(folder / "run")
+
+
+@REAL
+def test_a_standing_go2_without_an_imu_is_predicted_better_than_by_its_urdf(tmp_path: Path) -> None:
+    metrics = standing_go2(tmp_path)
+    assert metrics["test"]["nullspace_rms_relative"] < 0.40
+    assert metrics["test_nominal"]["nullspace_rms_relative"] > 0.41
+
+
+@REAL
+def test_a_go2_is_predicted_much_better_while_its_feet_carry_it_and_not_its_belly(tmp_path: Path) -> None:
+    metrics = standing_go2(tmp_path, detect_contacts=True)
+    assert metrics["test"]["nullspace_rms_relative"] < 0.25
+    assert metrics["test_nominal"]["nullspace_rms_relative"] > 0.30

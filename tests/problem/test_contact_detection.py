@@ -1,0 +1,246 @@
+"""Contacts detected from joint torques: those of simulated walkers, whatever else was recorded, and refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from legged.gait import Reference
+from legged.recording import Noise, record
+from legged.robots import G1, GO2, QUADRUPED, Legged, TrueRobot
+from legged.simulate import Exact, simulated
+from motions import value
+from refusals import refused
+from stances import stance
+from synthetic import Array, Oracle, load
+from walking import robot_of
+
+from torchid.errors import LogError, UnknownNameError
+from torchid.log_checks.check import check
+from torchid.logs import Log
+from torchid.problem.contact_detection import (
+    DetectionConfig,
+    _hysteresis,
+    _without_short,
+    detect_contacts,
+    normal_forces,
+    with_detected_contacts,
+)
+from torchid.sensing import Contact
+
+INSTALLED = pytest.mark.skipif(
+    not (GO2.available and G1.available), reason="the package example-robot-data is not installed"
+)
+WALKERS = [
+    pytest.param(GO2, id="Go2", marks=INSTALLED),
+    pytest.param(G1, id="G1", marks=INSTALLED),
+    pytest.param(QUADRUPED, id="quadruped"),
+]
+SECONDS, AGREEING = 5.0, 0.97
+DEFAULT = DetectionConfig()
+NO_IMU = {"imu_frame": "", "imu_specific_force": None, "imu_angular_velocity": None}
+NO_BASE = NO_IMU | {"base_quat_xyzw": None, "contact_wrench_world": None}
+
+
+@cache
+def walked(legged: Legged, seconds: float = SECONDS, seed: int = 0) -> tuple[TrueRobot, Exact]:
+    """Crawls and trots, or steps, of a robot whose masses, friction and armature are not its URDF's."""
+    true = TrueRobot.unlike_its_urdf(legged, seed)
+    return true, simulated(true, Reference(true, seconds, seed=seed), seconds)
+
+
+@cache
+def noisy(legged: Legged, seconds: float = SECONDS, seed: int = 0) -> Log:
+    true, exact = walked(legged, seconds, seed)
+    return record(exact, true.robot.base_link, Noise(), np.random.default_rng(seed))
+
+
+def agreement(found: Array, true: Array, margin: int) -> tuple[float, float]:
+    """Share of flags that agree, and of samples whose flags all do further than a margin from a detected change."""
+    kept = np.ones(len(found), dtype=bool)
+    for change in np.flatnonzero((found[1:] != found[:-1]).any(axis=1)):
+        kept[max(0, change - margin + 1) : change + margin + 1] = False
+    assert kept.mean() > 0.7
+    return float((found == true).mean()), float((found == true)[kept].all(axis=1).mean())
+
+
+def assert_agrees(legged: Legged, seconds: float, seed: int, least: float) -> None:
+    true, exact = walked(legged, seconds, seed)
+    active = value(exact.log.contact_active)
+    assert 0.05 < 1.0 - active.mean() < 0.5, "feet must be in the air for a while"
+    found = detect_contacts(noisy(legged, seconds, seed), true.robot, legged.contacts(), DEFAULT)
+    margin = round(DEFAULT.margin_s / float(np.median(np.diff(exact.log.time))))
+    each, together = agreement(found, active, margin)
+    assert each >= least
+    assert together >= least
+
+
+@pytest.mark.parametrize("legged", WALKERS)
+def test_flags_of_a_noisy_recording_are_those_of_the_simulator(legged: Legged) -> None:
+    assert_agrees(legged, SECONDS, 0, 0.94 if legged is G1 else AGREEING)  # one foot carries 2 % of G1 for a second
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("legged", WALKERS[:2])
+def test_flags_of_a_long_noisy_recording_are_those_of_the_simulator(legged: Legged, seed: int) -> None:
+    assert_agrees(legged, 20.0, seed, AGREEING)  # 0.977 to 0.988 measured
+
+
+@pytest.mark.parametrize("recorded", [NO_IMU, NO_BASE], ids=["orientation alone", "nothing of the base"])
+@pytest.mark.parametrize("legged", [WALKERS[0], WALKERS[2]])
+def test_point_feet_are_told_without_an_imu(legged: Legged, recorded: dict[str, None]) -> None:
+    true, exact = walked(legged)
+    found = detect_contacts(replace(noisy(legged), **recorded), true.robot, legged.contacts(), DEFAULT)
+    each, _ = agreement(found, value(exact.log.contact_active), 10)
+    assert each >= AGREEING
+
+
+def test_armature_and_friction_are_not_taken_for_loads() -> None:
+    true, exact = walked(QUADRUPED)
+    found = normal_forces(noisy(QUADRUPED), true.robot, QUADRUPED.contacts(), DEFAULT.cutoff_hz)
+    samples = np.searchsorted(exact.log.time, found.time - 1e-9)
+    air = ~value(exact.log.contact_active)[samples]
+    force = value(exact.log.contact_wrench_world)[samples, :, 2]
+    weight = 9.81 * float(true.robot.nominal[:, 0].sum())
+    assert np.percentile(np.abs(found.force[air]), 80.0) < 0.02 * weight
+    assert np.sqrt(np.square(found.force - force).mean()) < 0.04 * weight
+
+
+def test_the_order_of_joints_does_not_matter_and_contacts_keep_theirs() -> None:
+    true, _ = walked(QUADRUPED)
+    log, rng = noisy(QUADRUPED), np.random.default_rng(0)
+    joints = rng.permutation(len(log.joint_names))
+    shuffled = replace(
+        log,
+        joint_names=tuple(log.joint_names[x] for x in joints),
+        joint_position=log.joint_position[:, joints],
+        joint_torque=value(log.joint_torque)[:, joints],
+    )
+    contacts = QUADRUPED.contacts()
+    found = detect_contacts(log, true.robot, contacts, DEFAULT)
+    np.testing.assert_array_equal(detect_contacts(shuffled, true.robot, contacts, DEFAULT), found)
+    flagged = with_detected_contacts(log, true.robot, contacts[::-1])
+    assert flagged.contact_names == log.contact_names, "wrenches keep their columns"
+    assert (value(flagged.contact_active) == found).mean() > 0.999
+    bare = replace(log, contact_names=(), contact_active=None, contact_wrench_world=None)
+    assert with_detected_contacts(bare, true.robot, contacts[::-1]).contact_names == tuple(
+        contact.frame for contact in contacts[::-1]
+    )
+
+
+def test_sensors_in_limbs_change_nothing() -> None:
+    true, _ = walked(QUADRUPED)
+    contacts, log = QUADRUPED.contacts(), noisy(QUADRUPED)
+    split = load(QUADRUPED.urdf, None, False, ("front_left_sole",))
+    assert split.n_dofs == true.robot.n + 6
+    found = detect_contacts(log, split, contacts, DEFAULT)
+    assert (found == detect_contacts(log, true.robot, contacts, DEFAULT)).mean() > 0.999
+
+
+def test_gaps_in_a_reading_leave_the_flags_around_them() -> None:
+    true, _ = walked(QUADRUPED)
+    log = noisy(QUADRUPED)
+    torque, position = value(log.joint_torque).copy(), log.joint_position.copy()
+    torque[700:704, 2], position[900, 5] = np.nan, np.nan
+    found = detect_contacts(log, true.robot, QUADRUPED.contacts(), DEFAULT)
+    holed = replace(log, joint_torque=torque, joint_position=position)
+    assert (detect_contacts(holed, true.robot, QUADRUPED.contacts(), DEFAULT) == found).mean() > 0.99
+
+
+# ----------------------------------------------------------------------------------------------- known loads, no motion
+
+
+def still(loads: Array, samples: int = 200) -> tuple[Log, tuple[Contact, ...]]:
+    """A quadruped that is held still while its feet are pressed up with loads (4,) [N]."""
+    case = stance("quadruped")
+    robot = robot_of(case.machine)
+    oracle = Oracle.of(robot)
+    q = np.concatenate([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], case.log.joint_position[0]])[None]
+    zero = np.zeros((1, 18))
+    torque = oracle.frictionless_forces(q, zero, zero)[0]
+    for foot, carried in zip(case.machine.feet, loads, strict=True):
+        J, R = oracle.jacobian(q, foot)[0], oracle.pose(q, foot)[0][0]
+        torque = torque - J[:3].T @ (R.T @ np.array([0.0, 0.0, carried]))
+    every = np.ones((samples, 1))
+    log = Log(
+        "still", np.arange(samples) / 100.0, robot.joint_names, every * q[:, 7:], joint_torque=every * torque[6:],
+        base_quat_xyzw=every * q[:, 3:7],
+    )  # fmt: skip
+    return log, case.contacts()
+
+
+def test_loads_of_a_robot_that_stands_are_worked_out() -> None:
+    weight = 9.81 * float(robot_of(stance("quadruped").machine).nominal[:, 0].sum())
+    loads = weight * np.array([0.3, 0.2, 0.3, 0.2])
+    log, contacts = still(loads)
+    found = normal_forces(log, robot_of(stance("quadruped").machine), contacts, 10.0)
+    np.testing.assert_allclose(found.force, np.tile(loads, (len(found.time), 1)), rtol=0.0, atol=0.02 * weight)
+
+
+@pytest.mark.parametrize("carried", [0.0, 0.01], ids=["held in the air", "lying on its belly"])
+def test_feet_of_a_robot_that_something_else_carries_do_not_stand(carried: float) -> None:
+    robot = robot_of(stance("quadruped").machine)
+    weight = 9.81 * float(robot.nominal[:, 0].sum())
+    log, contacts = still(np.full(4, carried * weight))
+    assert not detect_contacts(log, robot, contacts, DEFAULT).any()
+    log, contacts = still(np.array([0.25, 0.25, 0.25, 0.0]) * weight)
+    np.testing.assert_array_equal(
+        detect_contacts(log, robot, contacts, DEFAULT), np.tile([True, True, True, False], (len(log), 1))
+    )
+
+
+def test_a_force_between_both_thresholds_keeps_its_flag() -> None:
+    force = np.array([0.0, 0.04, 0.06, 0.04, 0.02, 0.04, 0.06, 0.01])
+    assert _hysteresis(force, 0.05, 0.03).tolist() == [False, False, True, True, False, False, True, False]
+    assert _hysteresis(np.full(3, 0.045), 0.05, 0.03).all()
+    assert not _hysteresis(np.full(3, 0.035), 0.05, 0.03).any()
+    flags = np.array([1, 1, 1, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1], dtype=bool)
+    assert _without_short(flags, 2).tolist() == [True] * 4 + [False] * 8 + [True] * 2
+    assert _without_short(flags, 1).tolist() == flags.tolist()
+
+
+# -------------------------------------------------------------------------------------------------- checks and refusals
+
+
+def test_flags_that_were_made_are_not_condemned_by_the_checks() -> None:
+    true, _ = walked(QUADRUPED)
+    log, contacts = noisy(QUADRUPED), QUADRUPED.contacts()
+    late = replace(log, contact_active=np.roll(value(log.contact_active), 20, axis=0))
+    condemned = [x.field for x in check(late, true.robot, contacts).findings if x.severity == "condemned"]
+    assert "contact_active" in condemned
+    for made in (late, with_detected_contacts(late, true.robot, contacts)):
+        findings = check(made, true.robot, contacts, derived=("contact_active",)).findings
+        assert not [x for x in findings if x.field in ("contact_active", "contact_names")]
+
+
+def test_a_leg_without_torques_is_refused() -> None:
+    true, _ = walked(QUADRUPED)
+    log, contacts = noisy(QUADRUPED), QUADRUPED.contacts()
+    torque = value(log.joint_torque).copy()
+    torque[::3, log.joint_names.index("front_left_knee")] = np.nan
+    message = refused(
+        lambda: with_detected_contacts(replace(log, joint_torque=torque), true.robot, contacts),
+        "simulated: joint_torque: measured at front_left_hip, front_left_thigh alone above front_left_foot",
+        LogError,
+    )
+    assert "3 joints or more above each contact" in message
+    assert detect_contacts(log, true.robot, (), DEFAULT).shape == (len(log), 0)
+
+
+def test_a_log_without_torques_or_joints_is_refused_in_one_line() -> None:
+    true, _ = walked(QUADRUPED)
+    log, contacts = noisy(QUADRUPED), QUADRUPED.contacts()
+    without = replace(log, joint_torque=None)
+    refused(lambda: with_detected_contacts(without, true.robot, contacts), "simulated: joint_torque: missing", LogError)
+    other = replace(log, joint_names=("knie", *log.joint_names[1:]))
+    line = "simulated: joint_names: unknown name 'knie'"
+    refused(lambda: with_detected_contacts(other, true.robot, contacts), line, UnknownNameError)
+    unnamed = replace(log, contact_names=("toe", *log.contact_names[1:]))
+    line = f"simulated: contact_names: contact '{log.contact_names[0]}' missing"
+    refused(lambda: with_detected_contacts(unnamed, true.robot, contacts), line, LogError)
+    refused(
+        lambda: with_detected_contacts(log.select(slice(0, 3)), true.robot, contacts), "simulated: time: ", LogError
+    )

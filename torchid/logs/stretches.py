@@ -1,0 +1,95 @@
+"""Stretches of a log that are preprocessed each by itself, so that nothing is differentiated across their ends."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from torchid.errors import LogError, about_file
+from torchid.logs.coverage import measure_coverage, warn_of_gaps
+from torchid.logs.log import Log
+from torchid.logs.preprocess import (
+    gapless_fields,
+    lacks_derivatives,
+    make_timeline,
+    move_to_timeline,
+    unloaded_readings,
+)
+from torchid.logs.rate_noise import warn_of_noisy_accelerations
+from torchid.logs.signal_noise import signal_noise
+from torchid.logs.timeline import DROPPED_PERIODS, FEWEST_DIFFERENTIATED, Timeline
+
+
+def preprocess_stretches(
+    log: Log, stretches: Sequence[slice], cutoff_hz: float | None, sample_rate_hz: float | None
+) -> tuple[Log, int]:
+    """As `preprocess`, of stretches of a log without what is between them.
+
+    Args:
+        log: as recorded; between stretches fields may be NaN that have no gaps else.
+        stretches: of its samples.
+        cutoff_hz: as of `preprocess`.
+        sample_rate_hz: likewise.
+
+    Returns:
+        One log of all stretches, and how many samples were in stretches too short for the filter or for derivatives.
+
+    Raises:
+        InputError: as `preprocess`, or all stretches are too short.
+
+    Warns:
+        TorchidWarning: as `preprocess`.
+    """
+    with about_file(log.source):
+        whole = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
+        if whole is None:
+            return _joined([log.select(stretch) for stretch in stretches]), 0
+        usable = [stretch for stretch in stretches if _is_long_enough(log, stretch, whole)]
+        if not usable:
+            longest = max((log.time[x.stop - 1] - log.time[x.start] for x in stretches), default=0.0)
+            needed = f"more than {2.0 * DROPPED_PERIODS / cutoff_hz:.3g} s" if cutoff_hz else "more samples"
+            found = f"stretches of at most {longest:.3g} s without a gap"
+            raise LogError.at_field("time", found, f"{needed}, of which both ends are dropped, or a higher cutoff_hz")
+    coverage = {name: measure_coverage(log, name) for name in gapless_fields(log, whole)}
+    for name, found_of in coverage.items():
+        warn_of_gaps(log, name, found_of)
+    log = dataclasses.replace(log, contact_unloaded=unloaded_readings(log))
+    parts = []
+    longest_of = max(usable, key=lambda stretch: stretch.stop - stretch.start)
+    for stretch in usable:
+        part = log.select(stretch)
+        with about_file(log.source):
+            timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz)
+        if timeline is None:
+            raise ValueError("nothing to derive")
+        parts.append(move_to_timeline(part, timeline, coverage))
+        if stretch is longest_of:
+            with about_file(log.source):
+                warn_of_noisy_accelerations(part, parts[-1], timeline, signal_noise(part, timeline))
+    return _joined(parts), sum(x.stop - x.start for x in stretches) - sum(x.stop - x.start for x in usable)
+
+
+def _is_long_enough(log: Log, stretch: slice, whole: Timeline) -> bool:
+    """Whether two samples or more of a stretch are left, and two of those that it is resampled to."""
+    count = stretch.stop - stretch.start
+    if count <= FEWEST_DIFFERENTIATED:
+        return False
+    if whole.low_pass is None or whole.cutoff_hz is None:
+        return True
+    step = float(np.median(np.diff(log.time)))
+    left = log.time[stretch.stop - 1] - log.time[stretch.start] - 2.0 * DROPPED_PERIODS / whole.cutoff_hz
+    rate = step if whole.output is None else max(step, float(np.median(np.diff(whole.output))))
+    return bool(left > 2.0 * rate and count > 2 * whole.low_pass.padding)
+
+
+def _joined(logs: Sequence[Log]) -> Log:
+    """Logs of one recording as one."""
+    changed: dict[str, Any] = {}
+    for name, first in vars(logs[0]).items():
+        if isinstance(first, np.ndarray):
+            changed[name] = np.concatenate([getattr(log, name) for log in logs])
+    bandwidths = [log.noise_bandwidth_hz for log in logs if log.noise_bandwidth_hz is not None]
+    return dataclasses.replace(logs[0], **changed, noise_bandwidth_hz=min(bandwidths, default=None))
