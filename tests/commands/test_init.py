@@ -145,7 +145,8 @@ def test_joints_feet_and_units_of_robots_are_found_by_name_and_number(
     np.testing.assert_allclose(
         np.gradient(again.joint_position, again.time, axis=0)[5:-5], again.joint_velocity[5:-5], atol=1e-3
     )
-    assert written.missing == ["motion of the base: neither its pose nor an IMU"]
+    assert written.missing == ["motion of the base: neither its pose nor an IMU; taken from the feet that stand"]
+    assert config.preprocessing.base_motion == "contacts"
     set_up(config)
 
 

@@ -158,6 +158,22 @@ def _is_fixed(contacts: Sequence[_Contact], fields: set[str]) -> bool:
     return not contacts and not {*_POSE, *_IMU} & fields
 
 
+def _lacks_base_motion(contacts: Sequence[_Contact], fields: set[str]) -> bool:
+    pose = set(_POSE) & fields and "base_position_world" in fields
+    return not _is_fixed(contacts, fields) and not pose and not set(_IMU) <= fields
+
+
+def _from_feet(contacts: Sequence[_Contact], fields: set[str]) -> dict[str, object]:
+    """Keys of preprocessing that take what nobody recorded from joints and feet, if there are enough of these."""
+    out: dict[str, object] = {}
+    kinds = [contact.type for contact in contacts]
+    if _lacks_base_motion(contacts, fields) and ("flat" in kinds or len(kinds) > 2):
+        out["base_motion"] = "contacts"
+    if contacts and "contact_active" not in fields and "joint_torque" in fields:
+        out["detect_contacts"] = True
+    return out
+
+
 def _describe(
     out: Initiated, robot: Robot, contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal
 ) -> None:
@@ -181,11 +197,13 @@ def _describe(
             out.missing.append(f"{name}: no columns that look like it, of all {len(robot.joint_names)} joints")
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
+    from_feet = _from_feet(contacts, fields)
     if contacts and "contact_active" not in fields:
-        out.missing.append("contact_active: which foot touches when; set to touch throughout")
-    pose = set(_POSE) & fields and "base_position_world" in fields
-    if not _is_fixed(contacts, fields) and not pose and not set(_IMU) <= fields:
-        out.missing.append("motion of the base: neither its pose nor an IMU")
+        instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"
+        out.missing.append(f"contact_active: which foot touches when; {instead}")
+    if _lacks_base_motion(contacts, fields):
+        instead = "; taken from the feet that stand" if "base_motion" in from_feet else ""
+        out.missing.append(f"motion of the base: neither its pose nor an IMU{instead}")
 
 
 def _try(out: Initiated, path: Path, proposal: MapProposal) -> None:
@@ -212,7 +230,8 @@ def _text(
     proposal: MapProposal,
 ) -> str:
     """The experiment file, with comments."""
-    if contacts and "contact_active" not in fields:
+    from_feet = _from_feet(contacts, fields)
+    if contacts and "contact_active" not in fields and "detect_contacts" not in from_feet:
         proposal.columns["contact_active"] = {"always": [contact.frame for contact in contacts]}
         proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
     own = {"urdf": _relative(Path(urdf), output)} | ({"fixed_base": True} if _is_fixed(contacts, fields) else {})
@@ -232,6 +251,9 @@ def _text(
             note = proposal.notes.get(key, "")
             lines += [f"    # guessed: {note}"] if note else []
             lines += [f"    {line}" for line in _entry(key, value)]
+    if from_feet:
+        lines.append("# nobody recorded these; add cutoff_hz, above the motion and below the noise")
+        lines += _entry("preprocessing", from_feet)
     lines += _entry("sensors", _sensors(fields))
     lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
     lines += _entry("output", f"runs/{output.stem}")
