@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -74,6 +75,7 @@ def compare(options: argparse.Namespace) -> None:
     builder = torchid.RowBuilder(robot, experiment.contacts, experiment.sensors)
     reader = LogReader(experiment)
     train, test = (reader.read(paths, experiment.sensors) for paths in (config.logs.train, config.logs.test))
+    train = [replace(log, motion_noise=None) for log in train]  # a descent sees samples as they are
     problem = torchid.linear_problem(torchid.compress(train, builder), builder, robot, config.estimator.friction)
     settings = Sgd(
         ridge=config.estimator.numeric_ridge,

@@ -95,7 +95,8 @@ class Trainer:
 
         Args:
             settings: of the descent.
-            problem: the compressed training logs: for the preconditioner, the prior, and the closed form.
+            problem: the compressed training logs: for the preconditioner, the prior, and the closed form. Of samples
+                whose `motion_noise` is None: the descent sees them one by one, with whatever noise they have.
             batches: of the training logs.
             held_out: of logs for early stopping.
             residual: any module r(q, v, a) -> (B, n_rows) [N, N m], on the device of the batches, whose output adds to
