@@ -37,6 +37,7 @@ class World:
 
     @classmethod
     def of(cls, robot: Robot, builder: RowBuilder, logs: list[Samples], batch_size: int) -> World:
+        logs = [replace(log, motion_noise=None) for log in logs]
         problem = linear_problem(compress(logs, builder), builder, robot)
         return cls(robot, builder, logs, MiniBatches(logs, builder, batch_size), problem)
 

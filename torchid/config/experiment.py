@@ -36,8 +36,10 @@ from torchid.logs.ros_topics import check_topics
 from torchid.problem.contact_detection import DetectionConfig
 from torchid.settings import NotNegative, Positive, Seed
 
-COLUMNS_ACCEPTED = "the name of a column, a pattern such as {joint}_q, or a mapping with column, unit, scale, ..."
-"""Accepted for an entry of a map of columns, in messages."""
+COLUMNS_ACCEPTED = {f"logs.columns.{key}": "a list of names" for key in ("*_order", "ignore")} | {
+    "logs.columns.*": "the name of a column, a pattern such as {joint}_q, or a mapping with column, unit, scale, ..."
+}
+"""Accepted for entries of a map of columns, in messages."""
 
 JOINTS_ACCEPTED = "the name of a topic, or a mapping with topic and joints"
 """Accepted for the one topic that every bag needs, in messages."""
@@ -212,7 +214,7 @@ _EXPERIMENT = FileKind(
         "analysis.compare.*": CHOICE_ACCEPTED,
         "estimator.robust": ROBUST_ACCEPTED,
         "logs.topics.joint_states": JOINTS_ACCEPTED,
-        "logs.columns.*": COLUMNS_ACCEPTED,
+        **COLUMNS_ACCEPTED,
     },
 )
 _ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": "robot, contacts, output"}))
@@ -314,7 +316,7 @@ _COLUMNS = FileKind(
     keys="logs.columns",
     list_example="logs.columns.joint_order=[l_knee]",
     prepare=_alone("columns"),
-    accepted={"logs.columns.*": COLUMNS_ACCEPTED},
+    accepted=COLUMNS_ACCEPTED,
 )
 
 

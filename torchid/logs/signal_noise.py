@@ -44,6 +44,13 @@ _ORDERS = (7, 9)  # of the differences that show noise: smooth motion vanishes i
 _WHITE = 0.7  # least ratio of the estimates by both orders: less, and what is there is motion or was filtered
 _LEAST = 1e-12  # share of a channel's largest value: less is rounding
 _LARGEST = 0.02  # [rad, m] noise of joint positions; beyond, successive samples are postures, not motion
+# nobody's readings: what looks like noise in them is as often motion, such as the trembling of contacts
+_DERIVED = (
+    "joint_acceleration",
+    "base_linear_acceleration_world",
+    "base_angular_acceleration_base",
+    "imu_angular_acceleration",
+)
 _ORIENTATION = "base_quat_xyzw"
 
 
@@ -95,7 +102,7 @@ def signal_noise(log: Log, timeline: Timeline | None, stated: Mapping[str, float
 
 def _estimate(name: str, time: FloatArray, values: FloatArray) -> FloatArray:
     """Standard deviation of the noise in a field (N, c), by channel."""
-    if len(time) < _FEWEST or not values.size or not np.isfinite(values).all():
+    if name in _DERIVED or len(time) < _FEWEST or not values.size or not np.isfinite(values).all():
         return np.zeros(values.shape[1])
     if name != _ORIENTATION:
         return _rounded(white_noise(time, values))
