@@ -18,7 +18,7 @@ STATED_FIELDS = {
     "joint_velocity": ("joint_velocity",),
     "base_orientation": ("base_quat_xyzw",),
     "angular_velocity": ("imu_angular_velocity", "base_angular_velocity_base"),
-    "specific_force": ("imu_specific_force",),
+    "specific_force": ("imu_specific_force", "base_linear_acceleration_world"),
 }
 """Fields of a log by the keys under which their noise can be stated [rad or m, rad/s or m/s, rad, rad/s, m/s^2]."""
 
@@ -45,12 +45,7 @@ _WHITE = 0.7  # least ratio of the estimates by both orders: less, and what is t
 _LEAST = 1e-12  # share of a channel's largest value: less is rounding
 _LARGEST = 0.02  # [rad, m] noise of joint positions; beyond, successive samples are postures, not motion
 # nobody's readings: what looks like noise in them is as often motion, such as the trembling of contacts
-_DERIVED = (
-    "joint_acceleration",
-    "base_linear_acceleration_world",
-    "base_angular_acceleration_base",
-    "imu_angular_acceleration",
-)
+_DERIVED = ("joint_acceleration", "base_angular_acceleration_base", "imu_angular_acceleration")
 _ORIENTATION = "base_quat_xyzw"
 
 
