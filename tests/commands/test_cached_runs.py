@@ -25,8 +25,9 @@ from torchid.commands.cached_reading import CachedReader, open_cache
 from torchid.commands.cached_samples import NOT_IN_SAMPLES, content_of_scene
 from torchid.commands.reading import LogReader
 from torchid.config import load_config
-from torchid.config.experiment import ActuatorsConfig, ContactConfig, PreprocessingConfig, RobotConfig
-from torchid.config.sensors import NoiseConfig
+from torchid.config.experiment import ActuatorsConfig, RobotConfig
+from torchid.config.preprocessing import PreprocessingConfig
+from torchid.config.sensors import ContactConfig, NoiseConfig
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import set_up, with_noise
 from torchid.fitting.noise import NoiseSummary

@@ -13,8 +13,9 @@ import numpy as np
 from torchid.commands.folder import check_free_file
 from torchid.commands.reading import memory_needed, with_flags
 from torchid.config import load_analysis
-from torchid.config.experiment import PreprocessingConfig, load_columns, load_topics
 from torchid.config.logs import LogsConfig
+from torchid.config.maps import load_columns, load_topics
+from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.sensors import ContactConfig
 from torchid.errors import ConfigError, LogError, about_file
 from torchid.fitting.contacts import resolve_contacts

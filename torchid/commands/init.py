@@ -14,7 +14,7 @@ import yaml
 
 from torchid.commands.folder import check_free_file
 from torchid.commands.reading import memory_needed
-from torchid.config.experiment import PreprocessingConfig
+from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, excerpt, format_count, join_names
 from torchid.logs import Columns, read_log
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind

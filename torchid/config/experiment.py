@@ -1,17 +1,18 @@
-"""The experiment file of `torchid identify` and `torchid analyze`, and the part of it that reading a bag needs."""
+"""The experiment file of `torchid identify` and `torchid analyze`."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
+from torchid.config.analysis import AnalysisConfig
 from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, validate_keys
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
+from torchid.config.maps import MAPS_ACCEPTED
+from torchid.config.preprocessing import PreprocessingConfig
 from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
@@ -19,71 +20,18 @@ from torchid.config.sensors import (
     SCOPES_ACCEPTED,
     STRICT,
     WRENCHES_ACCEPTED,
-    Choice,
     ContactConfig,
     Device,
-    FileName,
     Sensors,
     SensorsConfig,
     spelled_out,
     validate_choice,
 )
 from torchid.errors import ConfigError, about_file
-from torchid.logs import Columns, Topics
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.problem.contact_detection import DetectionConfig
-from torchid.settings import NotNegative, Positive, Seed
-
-COLUMNS_ACCEPTED = {f"logs.columns.{key}": "a list of names" for key in ("*_order", "ignore")} | {
-    "logs.columns.*": "the name of a column, a pattern such as {joint}_q, or a mapping with column, unit, scale, ..."
-}
-"""Accepted for entries of a map of columns, in messages."""
-
-JOINTS_ACCEPTED = "the name of a topic, or a mapping with topic and joints"
-"""Accepted for the one topic that every bag needs, in messages."""
-
-Name = Annotated[str, Field(min_length=1)]
-Scenarios = dict[FileName, Annotated[list[list[str]], Field(min_length=1)]]
-
-
-@dataclass(config=STRICT, frozen=True)
-class CandidatesConfig:
-    """Sensors that could be mounted: torques of `joint_torques` (None: all), and at the contacts devices or axes.
-
-    `ft_sensors`: fixed joints that could carry a force/torque sensor, a device unless `contacts` are axes.
-    `normal_forces`: contacts that could carry a scalar sensor, `fn`, beside a device or alone.
-    """
-
-    joint_torques: list[str] | None = None
-    contacts: Literal["device", "axis", "none"] = "device"
-    ft_sensors: list[str] = dataclasses.field(default_factory=list)
-    normal_forces: list[str] = dataclasses.field(default_factory=list)
-
-
-@dataclass(config=STRICT, frozen=True)
-class AnalysisConfig:
-    """Which sensors to plan for, and which sensor sets to compare.
-
-    `scenarios`: contact states by scenario, each a list of the frames in contact; None: the states of the training
-    logs, or, without logs, all contacts at once. `keep`: candidates that every plan has, `exclude`: that none has;
-    `costs` per channel, by candidate or by kind (joint_torque, contact, normal_force, ft_sensor). `criterion`:
-    per_sample, the base survives the projection of every sample (None, for a floating base); stack, many samples
-    together determine all that full sensing would (None, for a fixed one). `compare`: sensor sets whose accuracy is
-    predicted from the training logs and measured on the test logs; `prior_error`: standard deviation of the URDF's
-    parameters, as a share of the size of each body.
-    """
-
-    scenarios: Annotated[Scenarios, Field(min_length=1)] | None = None
-    candidates: CandidatesConfig = dataclasses.field(default_factory=CandidatesConfig)
-    keep: list[str] = dataclasses.field(default_factory=list)
-    exclude: list[str] = dataclasses.field(default_factory=list)
-    costs: dict[str, Positive] = dataclasses.field(default_factory=dict)
-    criterion: Literal["per_sample", "stack"] | None = None
-    compare: dict[Name, Choice] = dataclasses.field(default_factory=dict)
-    prior_error: Annotated[Positive, Field(le=100.0)] = 0.2
-    seed: Seed = 0
+from torchid.settings import Positive
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -107,46 +55,6 @@ class ActuatorsConfig:
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
     sign_width: Positive | None = None
-
-
-def _switch(value: object) -> object:
-    """All settings at their defaults for true, none for false."""
-    return ({} if value else None) if isinstance(value, bool) else value
-
-
-@dataclass(config=STRICT, frozen=True)
-class PreprocessingConfig:
-    """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
-
-    `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
-    `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
-    recorded ones.
-    `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
-    `exclude_condemned`: leave out the samples that `torchid check` condemns.
-    `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
-    `cache_gb`: room [GB] for samples and factors that later runs of `identify` find beside the output; 0 for none.
-    """
-
-    cutoff_hz: Positive | None = None
-    sample_rate_hz: Positive | None = None
-    contact_margin_s: NotNegative | None = None
-    detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
-    base_motion: Literal["contacts"] | None = None
-    exclude_condemned: bool = False
-    memory_gb: Positive = 2.0
-    cache_gb: NotNegative = 2.0
-
-    @property
-    def margin_s(self) -> float | None:
-        """Samples that are dropped before and after each change of contact [s], None for none."""
-        margins = [self.contact_margin_s, None if self.detect_contacts is None else self.detect_contacts.margin_s]
-        return max((margin for margin in margins if margin is not None), default=None)
-
-    @property
-    def derived(self) -> tuple[str, ...]:
-        """How names of fields of a log begin that are worked out of others, whatever was recorded."""
-        flags = () if self.detect_contacts is None else ("contact_active",)
-        return flags if self.base_motion is None else (*flags, "base_")
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
@@ -213,8 +121,7 @@ _EXPERIMENT = FileKind(
         "sensors.scales": SCOPES_ACCEPTED,
         "analysis.compare.*": CHOICE_ACCEPTED,
         "estimator.robust": ROBUST_ACCEPTED,
-        "logs.topics.joint_states": JOINTS_ACCEPTED,
-        **COLUMNS_ACCEPTED,
+        **MAPS_ACCEPTED,
     },
 )
 _ANALYSIS = FileKind(**(vars(_EXPERIMENT) | {"settings": AnalyzeConfig, "keys": "robot, contacts, output"}))
@@ -270,75 +177,6 @@ def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:
 def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
     """The resolved configuration as YAML; `load_config` reads it back."""
     return dump(config)
-
-
-@dataclass(config=STRICT, frozen=True)
-class _TopicsOfLogs:
-    topics: Topics
-
-
-@dataclass(config=STRICT, frozen=True)
-class _TopicsFile:
-    logs: _TopicsOfLogs
-
-
-@dataclass(config=STRICT, frozen=True)
-class _ColumnsOfLogs:
-    columns: Columns
-
-
-@dataclass(config=STRICT, frozen=True)
-class _ColumnsFile:
-    logs: _ColumnsOfLogs
-
-
-def _alone(name: str) -> Callable[[Settings, Settings], Settings]:
-    """What leaves one key of `logs` alone of all settings."""
-
-    def prepare(settings: Settings, _: Settings) -> Settings:
-        logs = settings.get("logs")
-        return {"logs": {key: x for key, x in logs.items() if key == name} if isinstance(logs, dict) else {}}
-
-    return prepare
-
-
-_TOPICS = FileKind(
-    settings=_TopicsFile,
-    name="experiment",
-    keys="logs.topics",
-    list_example="logs.topics.joint_states.joints=[l_knee]",
-    prepare=_alone("topics"),
-    accepted={"logs.topics.joint_states": JOINTS_ACCEPTED},
-)
-_COLUMNS = FileKind(
-    settings=_ColumnsFile,
-    name="experiment",
-    keys="logs.columns",
-    list_example="logs.columns.joint_order=[l_knee]",
-    prepare=_alone("columns"),
-    accepted=COLUMNS_ACCEPTED,
-)
-
-
-def load_topics(path: str | Path) -> Topics:
-    """Read `logs.topics` from an experiment file, whatever its other keys are.
-
-    Raises:
-        ConfigError: unreadable file, no `logs.topics`, a value of the wrong kind.
-        UnknownNameError: a key that does not exist; the message names the nearest that do.
-    """
-    topics = load(_TOPICS, Path(path)).logs.topics
-    with about_file(path):
-        check_topics(topics)
-    return topics
-
-
-def load_columns(path: str | Path) -> Columns:
-    """Read `logs.columns` from an experiment file, as `load_topics` does `logs.topics`."""
-    columns = load(_COLUMNS, Path(path)).logs.columns
-    with about_file(path):
-        check_columns(columns)
-    return columns
 
 
 def _check_extras(config: _Common) -> None:

@@ -1,0 +1,52 @@
+"""The block `preprocessing` of an experiment file: filters, rates, and what is worked out of other signals."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator
+from pydantic.dataclasses import dataclass
+
+from torchid.config.sensors import STRICT
+from torchid.problem.contact_detection import DetectionConfig
+from torchid.settings import NotNegative, Positive
+
+
+def _switch(value: object) -> object:
+    """All settings at their defaults for true, none for false."""
+    return ({} if value else None) if isinstance(value, bool) else value
+
+
+@dataclass(config=STRICT, frozen=True)
+class PreprocessingConfig:
+    """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
+
+    `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
+    `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
+    recorded ones.
+    `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
+    `exclude_condemned`: leave out the samples that `torchid check` condemns.
+    `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
+    `cache_gb`: room [GB] for samples and factors that later runs of `identify` find beside the output; 0 for none.
+    """
+
+    cutoff_hz: Positive | None = None
+    sample_rate_hz: Positive | None = None
+    contact_margin_s: NotNegative | None = None
+    detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
+    base_motion: Literal["contacts"] | None = None
+    exclude_condemned: bool = False
+    memory_gb: Positive = 2.0
+    cache_gb: NotNegative = 2.0
+
+    @property
+    def margin_s(self) -> float | None:
+        """Samples that are dropped before and after each change of contact [s], None for none."""
+        margins = [self.contact_margin_s, None if self.detect_contacts is None else self.detect_contacts.margin_s]
+        return max((margin for margin in margins if margin is not None), default=None)
+
+    @property
+    def derived(self) -> tuple[str, ...]:
+        """How names of fields of a log begin that are worked out of others, whatever was recorded."""
+        flags = () if self.detect_contacts is None else ("contact_active",)
+        return flags if self.base_motion is None else (*flags, "base_")
