@@ -13,13 +13,17 @@ import torch
 from synthetic import Oracle, load, random_states
 from urdfs import joint, link, write
 
+from torchid.parameters import Array
+from torchid.problem import RowBuilder, Samples, compress, linear_problem
+from torchid.problem.chunks import one_thread
 from torchid.problem.contact_state import ContactState
 from torchid.robot import Robot
-from torchid.sensing import Contact, SensorSet
+from torchid.sensing import Contact, SensorNoise, SensorSet
 from torchid.sensing.projection import base_rank, base_singular_values, null_space
 from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
 
 RANDOM = "random"  # an axis
+NOISE = SensorNoise(joint_torque=0.7, contact_force=3.0, contact_moment=0.4, base_force=5.0, base_moment=1.0)
 
 
 def states_of(*rows: str) -> tuple[ContactState, ...]:
@@ -209,3 +213,13 @@ def tried(name: str) -> tuple[Robot, tuple[Candidate, ...], np.ndarray]:
         robot = machine.robot(Path(folder))
         choice = axes_and_devices(machine, robot)
         return robot, choice, sufficient_sets(machine, robot, choice)
+
+
+@one_thread()
+def bits(
+    robot: Robot, contacts: tuple[Contact, ...], logs: list[Samples], chosen: tuple[Candidate, ...], prior: Array
+) -> float:
+    """log2 det(I + H) / 2, of all rows."""
+    builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, chosen, NOISE))
+    A = linear_problem(compress(logs, builder), builder, robot).A * prior
+    return float(np.log1p(np.linalg.svd(A, compute_uv=False) ** 2).sum() / np.log(4.0))

@@ -15,6 +15,7 @@ from legged.simulate import Exact, prescribed, simulated
 from motions import value
 from scipy.spatial.transform import Rotation
 from synthetic import PINOCCHIO_ORDER, Array, Oracle
+from walkers import INSTALLED, WALKERS
 
 from torchid.logs import Log
 from torchid.logs.preprocess import preprocess
@@ -23,14 +24,6 @@ from torchid.problem.predict import force_series
 from torchid.sensing import Contact
 
 SECONDS = 1.6
-INSTALLED = pytest.mark.skipif(
-    not (GO2.available and G1.available), reason="the package example-robot-data is not installed"
-)
-EVERY = [
-    pytest.param(GO2, id="Go2", marks=INSTALLED),
-    pytest.param(G1, id="G1", marks=INSTALLED),
-    pytest.param(QUADRUPED, id="quadruped"),
-]
 
 
 @cache
@@ -67,7 +60,7 @@ def missed(true: TrueRobot, log: Log, sign_width: float | None) -> float:
 # ----------------------------------------------------------------------------------------------------------- exactness
 
 
-@pytest.mark.parametrize("legged", EVERY)
+@pytest.mark.parametrize("legged", WALKERS)
 def test_forces_of_a_simulated_log_are_those_of_the_true_parameters(legged: Legged) -> None:
     true, log = true_robot(legged), walked(legged).log
     assert missed(true, log, FRICTION_WIDTH) < 1e-10
@@ -75,7 +68,7 @@ def test_forces_of_a_simulated_log_are_those_of_the_true_parameters(legged: Legg
     assert missed(still, log, FRICTION_WIDTH) > 1e-2, "another robot's are not"
 
 
-@pytest.mark.parametrize("legged", EVERY)
+@pytest.mark.parametrize("legged", WALKERS)
 def test_forces_along_a_prescribed_motion_are_those_of_the_true_parameters(legged: Legged) -> None:
     assert missed(true_robot(legged), planned(legged).log, None) < 1e-10
 
@@ -90,7 +83,7 @@ def of_truth(true: TrueRobot) -> Oracle:
     return oracle
 
 
-@pytest.mark.parametrize("legged", EVERY)
+@pytest.mark.parametrize("legged", WALKERS)
 def test_forces_along_a_prescribed_motion_are_pinocchios(legged: Legged) -> None:
     true, log = true_robot(legged), planned(legged).log.select(slice(None, None, 40))
     turn = Rotation.from_quat(value(log.base_quat_xyzw))
@@ -112,7 +105,7 @@ def test_forces_along_a_prescribed_motion_are_pinocchios(legged: Legged) -> None
     assert np.abs(needed - given).max() < 1e-9 * np.abs(given).max()
 
 
-@pytest.mark.parametrize("legged", EVERY)
+@pytest.mark.parametrize("legged", WALKERS)
 def test_rates_are_those_of_the_positions(legged: Legged) -> None:
     for exact, tolerance in ((planned(legged), 2e-3), (walked(legged), 0.02)):
         log = exact.log
@@ -144,7 +137,7 @@ def test_the_ground_acts_a_radius_below_the_middle_of_a_ball_foot() -> None:
     np.testing.assert_allclose(lowest, np.broadcast_to([0.0, 0.0, -0.022], lowest.shape), atol=1e-12)
 
 
-@pytest.mark.parametrize("legged", EVERY)
+@pytest.mark.parametrize("legged", WALKERS)
 def test_feet_are_lifted_push_and_do_not_slip(legged: Legged) -> None:
     exact = walked(legged)
     on, force = value(exact.log.contact_active), value(exact.log.contact_wrench_world)[..., :3]
@@ -167,7 +160,7 @@ def test_a_balanced_path_has_its_zero_moment_point_where_it_was_asked_for() -> N
 # ---------------------------------------------------------------------------------------------- the truth, and sensors
 
 
-@pytest.mark.parametrize("legged", EVERY)
+@pytest.mark.parametrize("legged", WALKERS)
 def test_true_robots_are_possible_and_unlike_their_urdfs(legged: Legged) -> None:
     true = true_robot(legged)
     nominal = true.robot.nominal
@@ -179,7 +172,7 @@ def test_true_robots_are_possible_and_unlike_their_urdfs(legged: Legged) -> None
     np.testing.assert_allclose(same.phi[:, :10], nominal[:, :10], atol=1e-12)
 
 
-@pytest.mark.parametrize("legged", EVERY)
+@pytest.mark.parametrize("legged", WALKERS)
 def test_errors_are_one_for_the_urdf_and_zero_for_the_truth(legged: Legged) -> None:
     true = true_robot(legged)
     urdf, truth = (parameter_errors(true, phi) for phi in (true.robot.nominal, true.phi))

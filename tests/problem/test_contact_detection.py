@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from legged.gait import Reference
 from legged.recording import Noise, record
-from legged.robots import G1, GO2, QUADRUPED, Legged, TrueRobot
+from legged.robots import G1, QUADRUPED, Legged, TrueRobot
 from legged.simulate import Exact, simulated
 from motions import value
 from refusals import refused
 from stances import stance
 from synthetic import Array, Oracle, load
+from walkers import WALKERS
 from walking import robot_of
 
 from torchid.errors import LogError, UnknownNameError
@@ -30,14 +31,6 @@ from torchid.problem.contact_detection import (
 )
 from torchid.sensing import Contact
 
-INSTALLED = pytest.mark.skipif(
-    not (GO2.available and G1.available), reason="the package example-robot-data is not installed"
-)
-WALKERS = [
-    pytest.param(GO2, id="Go2", marks=INSTALLED),
-    pytest.param(G1, id="G1", marks=INSTALLED),
-    pytest.param(QUADRUPED, id="quadruped"),
-]
 SECONDS, AGREEING = 5.0, 0.97
 DEFAULT = DetectionConfig()
 NO_IMU = {"imu_frame": "", "imu_specific_force": None, "imu_angular_velocity": None}

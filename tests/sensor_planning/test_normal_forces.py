@@ -7,17 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planning import RANDOM, SIX, Machine, minimal_of, sees_the_base, states_of, sufficient_sets
+from planning import NOISE, RANDOM, SIX, Machine, bits, minimal_of, sees_the_base, states_of, sufficient_sets
 from synthetic import G1, SOLO12, load
 
 from torchid.errors import SensorError, UnknownNameError
 from torchid.identifiability.structure import structural_samples
-from torchid.parameters import Array
-from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.chunks import one_thread
 from torchid.problem.linear import parameter_scale
-from torchid.robot import Robot
-from torchid.sensing import Contact, SensorNoise, chosen_sensors, named_sensors
+from torchid.sensing import Contact, chosen_sensors, named_sensors
 from torchid.sensor_planning.demands import (
     Candidate,
     candidates,
@@ -34,7 +30,6 @@ from torchid.sensor_planning.search import all_minimal_sets, cheapest_set, deman
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
 NAMES = tuple(foot.frame for foot in FEET)
 GAIT = states_of("1111", "1001", "0110", "0000")
-NOISE = SensorNoise(joint_torque=0.7, contact_force=3.0, contact_moment=0.4, base_force=5.0, base_moment=1.0)
 MACHINES = {
     "a leg on a point": Machine({"leg": ("base", (RANDOM,) * 3)}, (Contact("leg3", "point"),), states_of("1")),
     "a leg on a flat foot": Machine({"leg": ("base", SIX)}, (Contact("leg6", "flat"),), states_of("1")),
@@ -168,13 +163,3 @@ def test_they_are_remedies_where_no_single_axes_of_the_contact_are_read() -> Non
 
 def names(chosen: tuple[Candidate, ...]) -> frozenset[str]:
     return frozenset(c.name for c in chosen)
-
-
-@one_thread()
-def bits(
-    robot: Robot, contacts: tuple[Contact, ...], logs: list[Samples], chosen: tuple[Candidate, ...], prior: Array
-) -> float:
-    """log2 det(I + H) / 2, of all rows."""
-    builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, chosen, NOISE))
-    A = linear_problem(compress(logs, builder), builder, robot).A * prior
-    return float(np.log1p(np.linalg.svd(A, compute_uv=False) ** 2).sum() / np.log(4.0))

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from planning import NOISE, bits
 from synthetic import G1, PANDA, SOLO12, load
 
 from torchid.identifiability.structure import structural_samples
 from torchid.parameters import Array
 from torchid.problem import RowBuilder, Samples, compress, linear_problem
-from torchid.problem.chunks import one_thread
 from torchid.robot import Robot
-from torchid.sensing import Contact, SensorNoise
+from torchid.sensing import Contact
 from torchid.sensor_planning.demands import Candidate, candidates, sensor_set
 from torchid.sensor_planning.ranking import SetRanking, rank_sets
 
-NOISE = SensorNoise(joint_torque=0.7, contact_force=3.0, contact_moment=0.4, base_force=5.0, base_moment=1.0)
 FEET = tuple(Contact(f"{leg}_FOOT", "point") for leg in ("FL", "FR", "HL", "HR"))
 SOLES = (Contact("left_ankle_roll_link", "flat"), Contact("right_ankle_roll_link", "line"))
 CASES = {
@@ -60,13 +59,3 @@ def prior_of(robot: Robot, contacts: tuple[Contact, ...], logs: list[Samples], o
     builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, offered))
     problem = linear_problem(compress(logs, builder), builder, robot)
     return problem.scale * problem.free
-
-
-@one_thread()
-def bits(
-    robot: Robot, contacts: tuple[Contact, ...], logs: list[Samples], chosen: tuple[Candidate, ...], prior: Array
-) -> float:
-    """log2 det(I + H) / 2, of all rows."""
-    builder = RowBuilder(robot, contacts, sensor_set(robot, contacts, chosen, NOISE))
-    A = linear_problem(compress(logs, builder), builder, robot).A * prior
-    return float(np.log1p(np.linalg.svd(A, compute_uv=False) ** 2).sum() / np.log(4.0))
