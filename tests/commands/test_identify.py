@@ -106,6 +106,7 @@ def test_parameters_json_judges_every_contact_state_alone(run: Path) -> None:
 def test_metrics_json_has_the_documented_fields(run: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")
+    groups += ("base_force_rms_by_axis", "base_moment_rms_by_axis")
     for name in ("train", "test"):
         every = (*groups, "projected_residual")
         assert set(metrics[name]) == {*every, *(f"{group}_relative" for group in every)}

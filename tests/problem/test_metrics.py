@@ -53,6 +53,16 @@ def test_errors_by_group_are_those_of_the_series(tmp_path: Path, fixed_base: boo
     expected["nullspace"] = (rms(np.concatenate(inside)), 1e-9)
     for group, (size, accuracy) in expected.items():
         assert found.rms[group] == pytest.approx(size, rel=accuracy), group
+    vectors = {group: (limbs[:, :, k], limbs_measured[:, :, k]) for k, group in enumerate(("ft_force", "ft_moment"))}
+    if base:
+        vectors |= {"base_force": (off[:, :3], measured[:, :3]), "base_moment": (off[:, 3:6], measured[:, 3:6])}
+    assert found.by_axis_rms.keys() == found.by_axis_relative.keys() == vectors.keys()
+    for group, (error, size) in vectors.items():
+        for axis, name in enumerate("xyz"):
+            assert found.by_axis_rms[group][name] == pytest.approx(rms(error[..., axis]), rel=1e-12)
+            share = rms(error[..., axis]) / rms(size[..., axis])
+            assert found.by_axis_relative[group][name] == pytest.approx(share, rel=1e-12)
+            assert found.as_dict()[f"{group}_rms_by_axis"] == found.by_axis_rms[group]
     if base:
         about_mean = rms(measured[:, :3] - measured[:, :3].mean(axis=0))
         assert found.base_force_of_variation == pytest.approx(rms(off[:, :3]) / about_mean, rel=1e-12)

@@ -65,8 +65,9 @@ class Metrics:
     `by_joint_relative` by joint. Relative means rms of the error over
     rms of what was measured. `rms` of "joint_torque" is the mean over joints of their rms, relative to the same mean of
     the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
-    mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs. `noise`,
-    by group, is the rms that the stated noise of the readings leaves after the filter, which no model predicts; None
+    mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
+    `by_axis_rms` and `by_axis_relative` of forces and moments by group and axis: of the base link, or of a sensor's
+    frame, all sensors in limbs together. `noise`, by group, is the rms that the stated noise of the readings leaves after the filter, which no model predicts; None
     where it is not known.
     """
 
@@ -77,16 +78,19 @@ class Metrics:
     base_force_of_variation: float | None
     limb_rms: dict[str, float | None] = field(default_factory=dict)
     limb_relative: dict[str, float | None] = field(default_factory=dict)
+    by_axis_rms: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    by_axis_relative: dict[str, dict[str, float | None]] = field(default_factory=dict)
     noise: dict[str, float | None] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
         """As `metrics.json` has it."""
         out: dict[str, object] = {}
-        for suffix, groups, joints, limbs in (
-            ("rms", self.rms, self.by_joint_rms, self.limb_rms),
-            ("rms_relative", self.relative, self.by_joint_relative, self.limb_relative),
+        for suffix, groups, joints, limbs, axes in (
+            ("rms", self.rms, self.by_joint_rms, self.limb_rms, self.by_axis_rms),
+            ("rms_relative", self.relative, self.by_joint_relative, self.limb_relative, self.by_axis_relative),
         ):
             out |= {f"{group}_{suffix}": x for group, x in limbs.items()}
+            out |= {f"{group}_{suffix.replace('rms', 'rms_by_axis')}": x for group, x in axes.items()}
             for group in ROW_GROUPS:
                 out[f"{group}_{suffix}"] = groups[group]
                 if group == "joint_torque":
@@ -166,6 +170,7 @@ class Evaluation:
         by_joint, joint_size = errors.rows.rms(joints), measured.rows.rms(joints)
         groups = ERROR_GROUPS if errors.whitened.count.any() else ROW_GROUPS
         names, limbs = self.robot.joint_names, LIMB_GROUPS if self.robot.ft_names else {}
+        axes, axis_size = errors.rows_by_axis(base, n), measured.rows_by_axis(base, n)
         return Metrics(
             {group: finite_or_none(rms[group]) for group in groups},
             {group: _ratio(rms[group], size[group]) for group in groups},
@@ -174,6 +179,8 @@ class Evaluation:
             _ratio(rms["base_force"], measured.rows.deviation(slice(0, 3)) if base else np.nan),
             {group: finite_or_none(rms[group]) for group in limbs},
             {group: _ratio(rms[group], size[group]) for group in limbs},
+            {group: dict(zip("xyz", map(finite_or_none, x), strict=True)) for group, x in axes.items()},
+            {group: dict(zip("xyz", map(_ratio, x, axis_size[group]), strict=True)) for group, x in axes.items()},
             {} if self.noise is None else measured.noise_rms(base, n),
         )
 
@@ -287,23 +294,30 @@ class ForceSums:
     def rms(self, base_rows: int, n: int) -> dict[str, float]:
         """Rms by group of rows, NaN for an empty group, of a robot with `base_rows` and n joints."""
         joints = self.rows.rms(slice(base_rows, base_rows + n))
-        force, moment = self._in_limbs(base_rows + n)
+        squares, count = self._in_limbs(base_rows + n)
+        force, moment = _root_mean(squares.sum(1), count.sum(1))
         return {
             "joint_torque": float(np.nanmean(joints)) if np.isfinite(joints).any() else np.nan,
             "base_force": self.rows.pooled(slice(0, 3)) if base_rows else np.nan,
             "base_moment": self.rows.pooled(slice(3, 6)) if base_rows else np.nan,
-            "ft_force": force,
-            "ft_moment": moment,
+            "ft_force": float(force),
+            "ft_moment": float(moment),
             "nullspace": self.projected.pooled(slice(None)),
             WHITENED: self.whitened.pooled(slice(None)),
         }
 
-    def _in_limbs(self, first: int) -> tuple[float, float]:
-        """Rms of forces and of moments of force/torque sensors in limbs."""
-        squares, count = (x[first:].reshape(-1, 2, 3).sum((0, 2)) for x in (self.rows.squares, self.rows.count))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            force, moment = np.sqrt(squares / count)
-        return float(force), float(moment)
+    def rows_by_axis(self, base_rows: int, n: int) -> dict[str, Array]:
+        """Rms of forces and moments of the base, and of force/torque sensors in limbs, (3,) by group of rows."""
+        out = dict(zip(("base_force", "base_moment"), self.rows.rms(slice(0, base_rows)).reshape(-1, 3), strict=False))
+        squares, count = self._in_limbs(base_rows + n)
+        if len(self.rows.count) > base_rows + n:
+            out |= dict(zip(LIMB_GROUPS, _root_mean(squares, count), strict=True))
+        return out
+
+    def _in_limbs(self, first: int) -> tuple[Array, Array]:
+        """Squares and their number, (2, 3): forces and moments by axis, of all force/torque sensors in limbs."""
+        squares, count = (x[first:].reshape(-1, 2, 3).sum(0) for x in (self.rows.squares, self.rows.count))
+        return squares, count
 
 
 class SumsOfSquares:
@@ -330,8 +344,7 @@ class SumsOfSquares:
 
     def rms(self, rows: slice = slice(None)) -> Array:
         """Rms row by row."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.sqrt(self.squares[rows] / self.count[rows])
+        return _root_mean(self.squares[rows], self.count[rows])
 
     def pooled(self, rows: slice) -> float:
         """Rms over all components of some rows."""
@@ -351,6 +364,12 @@ class SumsOfSquares:
         self.sum += other.sum
         self.squares += other.squares
         self.count += other.count
+
+
+def _root_mean(squares: Array, count: Array) -> Array:
+    """Square root of a mean, NaN of nothing."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.sqrt(squares / count)
 
 
 def finite_or_none(x: float) -> float | None:

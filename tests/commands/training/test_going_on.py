@@ -55,7 +55,7 @@ def test_the_run_folder_is_that_of_any_run_and_nothing_is_left_beside_it(run: Pa
 def test_metrics_and_parameters_are_those_of_the_best_epoch(run: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     groups = ("joint_torque_rms", "joint_torque_rms_by_joint", "base_force_rms", "base_moment_rms", "nullspace_rms")
-    groups += ("projected_residual",)
+    groups += ("base_force_rms_by_axis", "base_moment_rms_by_axis", "projected_residual")
     for name in ("train", "test"):
         assert set(metrics[name]) == {*groups, *(f"{group}_relative" for group in groups)}
         for group in ("joint_torque_rms", "base_force_rms", "base_moment_rms", "nullspace_rms"):
