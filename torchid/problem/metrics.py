@@ -67,8 +67,8 @@ class Metrics:
     the measured. `base_force_of_variation` is relative to the rms of the measured base force about its mean, which is
     mostly weight. `limb_rms` and `limb_relative` by `LIMB_GROUPS`, empty for a robot without sensors in limbs.
     `by_axis_rms` and `by_axis_relative` of forces and moments by group and axis: of the base link, or of a sensor's
-    frame, all sensors in limbs together. `noise`, by group, is the rms that the stated noise of the readings leaves after the filter, which no model predicts; None
-    where it is not known.
+    frame, all sensors in limbs together. `noise`, by group, is the rms that the stated noise of the readings leaves
+    after the filter, which no model predicts; None where it is not known.
     """
 
     rms: dict[str, float | None]
