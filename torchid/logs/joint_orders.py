@@ -11,6 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from torchid.errors import ConfigError
+from torchid.logs.name_matching import KnownRobot
 
 GO, HG = "unitree_go/msg/LowState", "unitree_hg/msg/LowState"
 MOTORS = {GO: 20, HG: 35}
@@ -84,10 +85,29 @@ def order_by_name(kind: str, order: object) -> object:
     return [*robot.joints, *[None] * (MOTORS[robot.message] - len(robot.joints))]
 
 
-def suitable_orders(joints: Collection[str]) -> list[str]:
-    """Robots whose joints a URDF has, those with most of them first."""
+def suitable_orders(joints: Collection[str], robot: str = "") -> list[str]:
+    """Robots whose joints a URDF has, those with most of them first, then one that a text names."""
     fitting = [name for name, order in JOINT_ORDERS.items() if set(order.names) <= set(joints)]
-    return sorted(fitting, key=lambda name: -len(JOINT_ORDERS[name].names))
+    return sorted(fitting, key=lambda name: (-len(JOINT_ORDERS[name].names), name not in robot))
+
+
+def usual_order(kind: str, robot: KnownRobot, count: int) -> tuple[list[str] | str, str]:
+    """The order of numbers that joints or feet probably have, or the name of the robot that has it; and whose that is.
+
+    Args:
+        kind: joint or contact.
+        robot: whose names they are.
+        count: of the numbers.
+    """
+    names = robot.joints if kind == "joint" else robot.feet
+    for name in suitable_orders(robot.joints, robot.name) if kind == "joint" else ():
+        order = JOINT_ORDERS[name]
+        if set(order.names) == set(names) and count >= len(order.joints):
+            return name, f"that of {name}, whose joints the URDF has"
+    is_alike = any("thigh" in joint or "calf" in joint for joint in robot.joints)
+    if names and is_alike and all(name.partition("_")[0] in _LEGS for name in names):
+        return sorted(names, key=lambda name: _LEGS.index(name.partition("_")[0])), "as Unitree numbers legs"
+    return list(names), "as in the URDF"
 
 
 def require_joints_of(field: str, robot: str, joints: Collection[str]) -> None:

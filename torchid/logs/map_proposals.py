@@ -16,14 +16,15 @@ from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
+from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, suitable_orders, usual_order
 from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS
+from torchid.logs.name_matching import SUFFIXES, KnownRobot, within
 from torchid.logs.tables import sample_table
 from torchid.logs.units import UNITS
 
 Columns = Mapping[str, NDArray[Any] | None]
 """Columns of a table or arrays with some of their rows; None for one without numbers."""
 
-_SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact", "_link", "_ankle_roll_link")}
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_])([WXYZ])$|(?<=[a-z])([wxyz])$")
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
@@ -33,22 +34,26 @@ _FOOT = re.compile(r"foot|feet", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
 _STEP = (2e-4, 0.2)  # [s]: of recordings
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
-_HEAVY = 500.0  # [N m]: rms of no torque is as large
+_LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
 _FAR = 60.0  # [m]: no base is recorded as far away
 _SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
 
 
 @dataclass
 class MapProposal:
-    """What `logs.columns` may say of a log.
+    """What `logs.columns`, or `logs.topics`, may say of a log.
 
     Attributes:
         columns: the map, as it stands in a file.
         notes: what was guessed, by key.
         left_out: columns that it ignores.
+        key: columns or topics.
+        fields: of the log, that a map of topics gives.
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
+    key: str = "columns"
+    fields: set[str] = field(default_factory=set)
     notes: dict[str, str] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
 
@@ -92,26 +97,26 @@ def stated_names(sample: Columns, field: str) -> list[str]:
     return [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names]
 
 
-def propose_map(sample: Columns, joints: Sequence[str], feet: Sequence[str]) -> MapProposal:
+def propose_map(sample: Columns, robot: KnownRobot) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called and what is in them.
 
     Args:
         sample: from `read_sample`.
-        joints: of the robot.
-        feet: frames of its contacts.
+        robot: whose log it is.
     """
     native = [name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)]
     foreign = [name for name in sample if name not in native]
-    return _Proposer(sample, native, joints, feet).propose(foreign)
+    return _Proposer(sample, native, robot).propose(foreign)
 
 
 class _Proposer:
-    def __init__(self, sample: Columns, native: Sequence[str], joints: Sequence[str], feet: Sequence[str]) -> None:
-        self.sample, self.joints, self.feet, self.native = sample, joints, feet, native
+    def __init__(self, sample: Columns, native: Sequence[str], robot: KnownRobot) -> None:
+        self.sample, self.native, self.robot = sample, native, robot
+        self.joints, self.feet = robot.joints, robot.feet
         self.given = {name.partition(".")[0] for name in native}
         self.out = MapProposal()
         stated = stated_names(sample, "joint_names")
-        self.names_stated = bool(stated) and set(stated) <= set(joints)
+        self.names_stated = bool(stated) and set(stated) <= set(self.joints)
 
     def propose(self, foreign: Sequence[str]) -> MapProposal:
         numeric = [name for name in foreign if self.sample[name] is not None]
@@ -157,16 +162,16 @@ class _Proposer:
 
     def _stems(self, kind: str, columns: Sequence[str], others: Mapping[str, str]) -> dict[str, str]:
         """What the file calls joints or feet, where no longer one of others fits, with the name of the URDF."""
-        longest = {column: max((len(x) for x in others if _within(x).search(column)), default=0) for column in columns}
+        longest = {column: max((len(x) for x in others if within(x).search(column)), default=0) for column in columns}
         names, best = (self.joints if kind == "joint" else self.feet), dict[str, str]()
-        for suffix in _SUFFIXES[kind]:
+        for suffix in SUFFIXES[kind]:
             if not names or not all(name.endswith(suffix) and len(name) > len(suffix) for name in names):
                 continue
             stems = {name[: len(name) - len(suffix)]: name for name in names}
             seen = {
                 stem: name
                 for stem, name in stems.items()
-                if any(n < len(stem) and _within(stem).search(x) for x, n in longest.items())
+                if any(n < len(stem) and within(stem).search(x) for x, n in longest.items())
             }
             if len(seen) > len(best):
                 best = seen
@@ -223,7 +228,9 @@ class _Proposer:
             return False
         if name.startswith("joint_"):
             named = {x for x in family.names if x}
-            enough = count >= len(self.joints) if family.numbers else (len(named) or count) == len(self.joints)
+            slots = {MOTORS[JOINT_ORDERS[name].message] for name in suitable_orders(self.joints)}
+            whole = (len(named) or count) in (len(self.joints), *(() if named else slots))
+            enough = count >= len(self.joints) if family.numbers else whole
             return enough and len(self.joints) > 0 and not any(family.axes)
         if name.startswith("contact_wrench"):
             return count == 6 * len(self.feet)
@@ -275,19 +282,19 @@ class _Proposer:
 
     def _add_threshold(self, family: _Family, entry: dict[str, Any]) -> None:
         values = np.concatenate([np.ravel(x) for c in family.columns if (x := self.sample[c]) is not None])
-        values = values[np.isfinite(values)] if values.dtype.kind == "f" else values
         if not np.isin(values, (0, 1)).all():
-            low, high = np.percentile(values, (2, 98))
-            entry["above"] = float(f"{low + _SHARE * (high - low):.2g}")
+            entry["above"] = threshold(values)
             self.out.notes["contact_active"] = "threshold, from the range of the readings"
 
     def _add_order(self, family: _Family, name: str) -> None:
         """An order of names by number, where columns have none."""
-        kind = next((kind for kind in _SUFFIXES if name.startswith(f"{kind}_")), "")
+        kind = next((kind for kind in SUFFIXES if name.startswith(f"{kind}_")), "")
         key = f"{kind}_order"
         if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.names_stated):
             return
-        order, how = _usual_order(self.joints if kind == "joint" else self.feet)
+        first = self.sample[family.columns[0]]
+        numbers = len(family.numbers) or (1 if first is None else int(np.prod(first.shape[1:2])))
+        order, how = usual_order(kind, self.robot, numbers)
         self.out.columns[key] = order
         self.out.notes[key] = f"{how}; compare it with the manual of the robot, and with what torchid check says"
 
@@ -311,7 +318,7 @@ class _Proposer:
             slope = factor * np.gradient(position, seconds, axis=0)
             self._add_speed_unit(float(np.sqrt(np.nanmean(velocity**2) / max(np.nanmean(slope**2), 1e-12))))
         for name, is_it, unit, why in (
-            ("joint_torque", lambda x: _rms(x) > _HEAVY, "N mm", "as they are too large for N m"),
+            ("joint_torque", lambda x: _rms(x) > _LEVER * self.robot.weight, "N mm", "as they are too large for N m"),
             ("base_position_world", lambda x: np.nanmax(np.abs(x)) > _FAR, "mm", "as it is too far away for m"),
             ("imu_specific_force", lambda x: 0.7 < _length(x) < 1.4, "g", "as its length is about 1"),
             ("imu_angular_velocity", lambda x: _rms(x) > 20.0, "deg/s", "as it is too fast for rad/s"),
@@ -345,6 +352,13 @@ class _Proposer:
         return values if np.isfinite(values).any() else None
 
 
+def threshold(readings: Any) -> float:
+    """A reading above which a contact is probably active, by the range of all of its sensor, in two digits."""
+    values = np.asarray(readings, dtype=float)
+    low, high = np.percentile(values[np.isfinite(values)], (2, 98)) if np.isfinite(values).any() else (0.0, 0.0)
+    return float(f"{low + _SHARE * (high - low):.2g}")
+
+
 def _si(name: str) -> str:
     return {"time": "s", "joint_velocity": "rad/s"}.get(name, "")
 
@@ -357,17 +371,13 @@ def _length(x: NDArray[np.float64]) -> float:
     return float(np.nanmedian(np.linalg.norm(x, axis=1)))
 
 
-def _within(stem: str) -> re.Pattern[str]:
-    return re.compile(rf"(?<![A-Za-z0-9]){re.escape(stem)}(?![A-Za-z0-9])")
-
-
 def _pattern(column: str, stems: Mapping[str, Mapping[str, str]]) -> tuple[str, str, str, str]:
     """A column with placeholders, and the name, number and axis in their places."""
     number = axis = ""
     kinds = {stem: kind for kind, of_kind in stems.items() for stem in of_kind}
-    name = max((stem for stem in kinds if _within(stem).search(column)), key=len, default="")
+    name = max((stem for stem in kinds if within(stem).search(column)), key=len, default="")
     if name:
-        column = _within(name).sub(f"{{{kinds[name]}}}", column, count=1)
+        column = within(name).sub(f"{{{kinds[name]}}}", column, count=1)
     if not name and (found := _NUMBER.search(column)):
         column, number = f"{column[: found.start()]}{{index}}{column[found.end() :]}", found[0]
     if found := _AXIS.search(column):
@@ -378,11 +388,3 @@ def _pattern(column: str, stems: Mapping[str, Mapping[str, str]]) -> tuple[str, 
 
 def _anything(pattern: str) -> str:
     return PLACEHOLDER.sub("*", pattern)
-
-
-def _usual_order(names: Sequence[str]) -> tuple[list[str], str]:
-    """Names in the order of motors, and whose that is."""
-    legs = ("FR", "FL", "RR", "RL")
-    if names and all(name.partition("_")[0] in legs for name in names):
-        return sorted(names, key=lambda name: legs.index(name.partition("_")[0])), "as Unitree numbers legs"
-    return list(names), "as in the URDF"

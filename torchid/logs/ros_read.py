@@ -195,14 +195,7 @@ def read_bag(
     files = list_bag_files(path)
     if topics is not None:
         check_topics(topics)
-    channels: dict[str, Channel] = {}
-    for file in files:
-        with _open_bag_file(file) as opened:
-            for channel in opened.channels():
-                first = channels.setdefault(channel.topic, channel)
-                if first != channel:
-                    found = f"both {first.type} and {channel.type}"
-                    raise LogError.at_field(channel.topic, found, "one type of message per topic")
+    channels = list_channels(files)
     if topics is None:
         raise LogError.at_field("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
     bag = _Bag(topics, channels)
@@ -223,8 +216,25 @@ def read_bag(
     }
 
 
+def list_channels(files: list[Path]) -> dict[str, Channel]:
+    """The topics of a bag.
+
+    Raises:
+        LogError: it is damaged, or a topic has several types.
+    """
+    channels: dict[str, Channel] = {}
+    for file in files:
+        with open_bag_file(file) as opened:
+            for channel in opened.channels():
+                first = channels.setdefault(channel.topic, channel)
+                if first != channel:
+                    found = f"both {first.type} and {channel.type}"
+                    raise LogError.at_field(channel.topic, found, "one type of message per topic")
+    return channels
+
+
 @contextmanager
-def _open_bag_file(path: Path) -> Iterator[BagFile]:
+def open_bag_file(path: Path) -> Iterator[BagFile]:
     """Open a .bag, .mcap or .db3 file.
 
     Raises:
@@ -272,7 +282,7 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
         users.setdefault(rows.topic, []).append(rows)
     make = {topic: make_deserializer(topic, bag.channels[topic]) for topic in users}
     for i, file in enumerate(files):
-        with _open_bag_file(file) as opened:
+        with open_bag_file(file) as opened:
             for n, record in enumerate(opened.records(users.keys())):
                 message = make[record.topic](record.data)
                 for rows in users[record.topic]:
