@@ -19,7 +19,7 @@ from torchid.errors import ConfigError, InputError, LogError, about_file, excerp
 from torchid.logs import Columns, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
-from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names
+from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names, texts_in
 from torchid.logs.name_matching import KnownRobot, within
 from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
@@ -102,7 +102,7 @@ def _of_columns(file: Path, robot: Robot) -> tuple[list[_Contact], set[str], Map
         accepted = "a log of a part of the recording, whose map holds for all of it"
         raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
     sample = read_sample(file)
-    contacts = _guess_contacts(robot, _stated_contacts(sample, robot), list(sample))
+    contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts))
     fields = _fields_of(sample, proposal)
     _add_imu_frame(robot, fields, proposal)

@@ -45,6 +45,12 @@ def within(stem: str) -> re.Pattern[str]:
     return re.compile(rf"(?<![A-Za-z0-9]){re.escape(stem)}(?![A-Za-z0-9])")
 
 
+def spelled(stem: str) -> re.Pattern[str]:
+    """A name as a part of another, whatever its capitals and separators: left_hip_pitch in `LeftHipPitch.Position`."""
+    words = [re.escape(word) for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", stem)] or [re.escape(stem)]
+    return re.compile(rf"(?<![A-Za-z0-9])(?i:{'[ _./-]?'.join(words)})(?![a-z0-9])")
+
+
 def limbs(text: str) -> frozenset[str]:
     """Left or right (l, r) and front or back (f, b), as far as a name says it, in words or letters."""
     return frozenset("".join(_LIMBS.get(word.lower(), "") for word in _WORD.findall(text)))
