@@ -1,4 +1,4 @@
-"""`torchid init` of ten robots from logs in many dialects: what is found has the numbers that were recorded."""
+"""`torchid init` of twelve robots from logs in many dialects: what is found has the numbers that were recorded."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ MACHINES = {
     "talos": ("talos_data/robots/talos_reduced.urdf", ("left_sole_link", "right_sole_link"), ""),
     "icub": ("icub_description/robots/icub_reduced.urdf", ("l_sole", "r_sole"), ""),
     "romeo": ("romeo_description/urdf/romeo_small.urdf", ("l_sole", "r_sole"), ""),
+    "romeo with mixed names": ("romeo_description/urdf/romeo_laas_small.urdf", ("l_sole", "r_sole"), ""),
+    "alexander": ("alexander_description/urdf/alexander_v1.lowerBodyOnly.urdf", ("LEFT_FOOT", "RIGHT_FOOT"), ""),
     "panda": ("panda_description/urdf/panda.urdf", (), ""),
 }  # fmt: skip
 #: Guesses that nothing in the file could have told: a Go2's feet without names, in another order than its maker's.

@@ -29,6 +29,7 @@ from torchid.robot import CollisionShapes, Robot, load_robot
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
 
+_ON_FEET = r"sensor|imu|camera|bumper|laser"
 _NAMED = r"foot|feet|sole"
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
@@ -144,8 +145,8 @@ def _guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) -
     for words, links in ((_NAMED, named), *((words, list(robot.links)) for words in _FEET)) if not frames else ():
         by_body: dict[int, list[str]] = {}
         for name in links:
-            body = robot.links[name][0]
-            if body and body not in inner and re.search(words, name, re.IGNORECASE):
+            body, is_foot = robot.links[name][0], re.search(words, name, re.IGNORECASE)
+            if body and body not in inner and is_foot and not re.search(_ON_FEET, name, re.IGNORECASE):
                 by_body.setdefault(body, []).append(name)
         frames = [min(names, key=lambda name: (shapes.about(name) is None, len(name))) for names in by_body.values()]
         if len(frames) > 1:

@@ -113,9 +113,9 @@ def _stems(kind: str, columns: Sequence[str], names: Sequence[str], others: _Ste
     }
     for exact, find in ((True, within), (False, spelled)):
         for suffix in SUFFIXES[kind]:
-            if not names or not all(name.endswith(suffix) and len(name) > len(suffix) for name in names):
+            if not names or (exact and not all(name.endswith(suffix) and len(name) > len(suffix) for name in names)):
                 continue
-            stems = {name[: len(name) - len(suffix)]: name for name in names}
+            stems = {name.removesuffix(suffix) or name: name for name in names}
             seen = {}
             for stem, name in stems.items():
                 regex = find(stem)
