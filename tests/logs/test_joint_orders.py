@@ -18,6 +18,7 @@ from torchid.cli import main
 from torchid.config import load_config
 from torchid.config.maps import load_columns
 from torchid.logs import Columns, Log, read_log
+from torchid.logs.blocks import open_log_blocks
 from torchid.logs.joint_orders import HG, JOINT_ORDERS
 
 URDF = ROBOTS / "go2_description/urdf/go2.urdf"
@@ -70,6 +71,8 @@ def test_arrays_may_have_the_motors_that_are_not_used(tmp_path: Path, width: int
     again = read_log(tmp_path / "x.npz", columns=columns)
     np.testing.assert_array_equal(again.joint_position, log.joint_position)
     np.testing.assert_array_equal(again.joint_torque, log.joint_torque)
+    with open_log_blocks(tmp_path / "x.npz", None, columns) as blocks:
+        np.testing.assert_array_equal(blocks.read(slice(7, 9)).joint_position, log.joint_position[7:9])
 
 
 @pytest.mark.parametrize("width", [11, 21])

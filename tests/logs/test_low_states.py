@@ -345,6 +345,18 @@ def test_topics_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
     )
 
 
+def test_infinite_positions_of_unused_motors_are_left_out_or_refused(tmp_path: Path) -> None:
+    log = moving((*GO2, "wheel"), 4)
+    for share, message in ((1, ""), (2, "motor 12 moves, where 'go2' has no joint")):
+        log.joint_position[::share, 12] = np.inf
+        path = write_low_states(tmp_path / "x.mcap", log, log.joint_names)
+        if message:
+            assert message in refused(lambda: read(path, robot="go2"), f"{path}: {TOPIC}: ")  # noqa: B023
+        else:
+            np.testing.assert_array_equal(read(path, robot="go2").joint_position, log.joint_position[:, :12])
+        log.joint_position[:, 12] = 0.0
+
+
 def test_messages_of_any_bytes_give_a_log_or_one_line(tmp_path: Path) -> None:
     rng, refusals = np.random.default_rng(4), 0
     size = len(packed(layout(GO), {}))

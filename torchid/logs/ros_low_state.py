@@ -90,12 +90,13 @@ class LowState:
         alive = np.asarray(np.any(motors != 0.0, axis=(0, 1)))
         listed = [*self._order, *[None] * (len(alive) - len(self._order))]
         name = self._settings.robot
+        with np.errstate(invalid="ignore"):  # of infinite positions
+            moves = np.ptp(motors[:, 0], axis=0) > _MOVED
         for number, joint in enumerate(listed):
             if joint is not None and not alive[number]:
                 found = f"motor {number}, '{joint}', is 0 throughout: no such motor"
                 raise LogError.at_field(self._topic, found, self._others(alive, number))
-            moved = np.ptp(motors[:, 0, number]) > _MOVED
-            if joint is None and moved and (name is not None or number >= len(self._order)):
+            if joint is None and moves[number] and (name is not None or number >= len(self._order)):
                 owner = f"'{name}' has" if name is not None else f"{KEY}.joints names"
                 found = f"motor {number} moves, where {owner} no joint"
                 raise LogError.at_field(self._topic, found, self._others(alive, number))
