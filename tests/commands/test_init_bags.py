@@ -8,7 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from bags import FLAG, IMU, JOINT_STATE, NUMBERS, WRENCH, Entry, entries_of, imu, joint_state, wrench, write_bag
+from bags import (
+    FLAG,
+    IMU,
+    JOINT_STATE,
+    NUMBERS,
+    WRENCH,
+    Entry,
+    entries_of,
+    imu,
+    joint_state,
+    wrench,
+    write_bag,
+    write_folder,
+)
 from dialects import with_velocity
 from low_states import FEET, GO2, START, low_states, moving, write_low_states
 from repository import DEMO
@@ -107,6 +120,18 @@ def test_a_state_at_a_low_rate_is_the_second_choice(tmp_path: Path) -> None:
     _, topics, again = started(GO2_URDF, write_bag(tmp_path / "x.mcap", entries))
     assert topics["low_state"]["topic"] == "/lowstate"
     assert len(again) == 40
+
+
+def test_folders_parts_and_bags_of_ros_1_are_looked_at_as_well(tmp_path: Path) -> None:
+    write_folder(tmp_path / "walk", ".mcap", low_states(moving(GO2), GO2))
+    said = init(GO2_URDF, tmp_path / "walk", tmp_path / "a.yaml")
+    assert "train: ['walk[:80%]']" in (tmp_path / "a.yaml").read_text()
+    assert any(text.startswith("40 samples") for text in said.found)
+    log = read_log(DEMO / "sway_train.npz").select(slice(0, 100))
+    path = write_bag(tmp_path / "z.bag", entries_of(log))
+    said = init(URDF, f"{path}[0:0.5]", tmp_path / "b.yaml")
+    assert "train: ['z.bag[0:0.5]']" in (tmp_path / "b.yaml").read_text()
+    assert any(text.startswith("50 samples over 0.49 s") for text in said.found)
 
 
 def legged(names: list[str], more: list[tuple[str, str, Any]], samples: int = 20) -> list[Entry]:
