@@ -30,7 +30,7 @@ _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
 _EVALUATE = "predict the forces of further logs with the parameters of a run"
 _ANALYZE = "analyze what sensors and motion determine, and plan the smallest sensor set"
-_INIT = "write an experiment file for a robot and a log, with a map of its columns, and say what was guessed"
+_INIT = "write an experiment file for a robot and a log, with a map of its columns or topics, and say what was guessed"
 _CONVERT = "write a log of any type as .npz, .h5, .csv or .parquet"
 _CHECK = "check logs for errors before a fit"
 _SIMULATE = "simulate a robot and write the logs of its sensors (needs the extra [sim])"
@@ -123,7 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     convert.set_defaults(command=_convert)
     init = commands.add_parser("init", help=_INIT, description=_INIT)
     init.add_argument("urdf", metavar="URDF", help="the robot")
-    init.add_argument("log", metavar="LOG", help="table or arrays: .csv, .parquet, .npz or .h5")
+    init.add_argument("log", metavar="LOG", help="table, arrays or bag: .csv, .parquet, .npz, .h5, .mcap, .db3 or .bag")
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")
     init.set_defaults(command=_init)
     for name, command in commands.choices.items():

@@ -142,6 +142,7 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
         "contacts.0={type: point, radius: 0.02}",
         "contacts.0={type: point, normal: [0, 0.1, 1]}",
         "logs.topics.joint_states=/joints",
+        "logs.topics.low_state={topic: /lowstate, joints: [front_left_hip]}",
     ],
 )
 def test_robot_contacts_and_topics_change_the_name_of_samples(demo: Path, tmp_path: Path, other: str) -> None:

@@ -301,7 +301,10 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
         ("actuators.sign_width=wide", "actuators.sign_width: found 'wide'; accepted: a number"),
         ("estimator.training.epochs=2.5", "estimator.training.epochs: found 2.5; accepted: a whole number"),
         ("overwrite=perhaps", "overwrite: found 'perhaps'; accepted: true or false"),
-        ("logs.topics={}", "logs.topics.joint_states: missing; accepted: the name of a topic, or a mapping with topic"),
+        (
+            "logs.topics={}",
+            "logs.topics: neither joint_states nor low_state; accepted: one of the two, joint_states: the",
+        ),
         ("estimator.symmetry={left: l}", "estimator.symmetry.right: missing; accepted: a name"),
         ("contacts=[{frame: a}]", "contacts.0.type: missing; accepted: point, line, flat"),
         (

@@ -69,8 +69,12 @@ def filled(store: Any, kind: str, content: Mapping[str, Any]) -> Any:
             values[name] = filled(store, what, value or {})
         elif int(node) == 1:  # a number or a text
             values[name] = value if value is not None else "" if what[0] == "string" else 0
+        elif int(what[0][0]) == 2:  # messages
+            values[name] = [filled(store, what[0][1], inner) for inner in value or [{}] * what[1]]
         else:
-            empty = np.zeros(what[1] if int(node) == 3 else 0)
+            empty = np.zeros(
+                what[1] if int(node) == 3 else 0, dtype=None if what[0][1][0] == "string" else what[0][1][0]
+            )
             values[name] = empty if value is None else value
     return store.types[kind](**values)
 

@@ -15,19 +15,26 @@ import yaml
 from torchid.commands.folder import check_free_file
 from torchid.commands.reading import memory_needed
 from torchid.config.preprocessing import PreprocessingConfig
-from torchid.errors import ConfigError, InputError, LogError, excerpt, format_count, join_names
-from torchid.logs import Columns, read_log
+from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
+from torchid.logs import Columns, Topics, read_log
+from torchid.logs.bag_samples import read_bag_sample
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
-from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names
+from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names, texts_in
+from torchid.logs.name_matching import KnownRobot, within
 from torchid.logs.time_range import split_range
+from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
+from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
 
+_ON_FEET = r"sensor|imu|camera|bumper|laser"
+_NAMED = r"foot|feet|sole"
 _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "contact_force_normal", "ft_wrench")
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
+_WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
 _LINE = 118
 
 
@@ -64,7 +71,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
 
     Args:
         urdf: of the robot.
-        log: a table or arrays, in the log format or not.
+        log: a table or arrays, in the log format or not, or a bag.
         output: the file; nothing that is there is replaced.
 
     Raises:
@@ -77,24 +84,46 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
         raise ConfigError(target, "--output", "exists", "a new file: torchid init replaces none")
     check_free_file(target, "--output", False, [urdf, path])
     file = split_range(path).file
-    if existing_log_kind(file) is LogKind.BAG:
-        raise LogError(file, "file", "a bag of messages", "a table or arrays; logs.topics says what a bag holds")
+    is_bag = existing_log_kind(file) is LogKind.BAG
     robot = load_robot(urdf)
-    size = memory_needed(file, PreprocessingConfig().memory_gb)
-    if size > PreprocessingConfig().memory_gb:
-        accepted = "a log of a part of the recording, whose map holds for all of it"
-        raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
-    sample = read_sample(file)
-    contacts = _guess_contacts(robot, _stated_contacts(sample, robot))
-    proposal = propose_map(sample, robot.joint_names, [contact.frame for contact in contacts])
-    out, fields = Initiated(target), _fields_of(sample, proposal)
-    _add_imu_frame(robot, fields, proposal)
+    contacts, fields, proposal = _of_bag(file, robot) if is_bag else _of_columns(file, robot)
+    out = Initiated(target)
     text = _text(robot, urdf, path, target, contacts, fields, proposal)
     _describe(out, robot, contacts, fields, proposal)
     _try(out, path, proposal)
     with atomic_output(target) as new:
         new.write_text(text, encoding="utf-8")
     return out
+
+
+def _of_columns(file: Path, robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
+    """Contacts, fields and a map of a table or arrays."""
+    size = memory_needed(file, PreprocessingConfig().memory_gb)
+    if size > PreprocessingConfig().memory_gb:
+        accepted = "a log of a part of the recording, whose map holds for all of it"
+        raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
+    sample = read_sample(file)
+    contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
+    proposal = propose_map(sample, _known(robot, contacts))
+    fields = _fields_of(sample, proposal)
+    _add_imu_frame(robot, fields, proposal)
+    return contacts, fields, proposal
+
+
+def _of_bag(file: Path, robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
+    """Contacts, fields and a map of the topics of a bag."""
+    with about_file(file):
+        sample = read_bag_sample(file, USED_TYPES)
+    contacts = _guess_contacts(robot, [], [f"{frame_of(topic)} {name}" for name, topic in sample.items()])
+    proposal = propose_topics(sample, _known(robot, contacts))
+    return contacts, proposal.fields, proposal
+
+
+def _known(robot: Robot, contacts: Sequence[_Contact]) -> KnownRobot:
+    """What the proposal of a map knows of the robot."""
+    on_base, elsewhere = ([name for name, (body, _) in robot.links.items() if bool(body) == x] for x in (False, True))
+    feet, weight = [contact.frame for contact in contacts], -GRAVITY_WORLD[2] * float(robot.nominal[:, 0].sum())
+    return KnownRobot(robot.joint_names, feet, robot.path.stem, weight, robot.base_link, on_base, elsewhere)
 
 
 def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
@@ -104,15 +133,20 @@ def _stated_contacts(sample: Any, robot: Robot) -> list[str]:
     return [name for name in dict.fromkeys(names) if name in robot.links]
 
 
-def _guess_contacts(robot: Robot, stated: Sequence[str]) -> list[_Contact]:
-    """Feet: links of outermost bodies with the surest word in their names, one of each body, spheres first."""
+def _guess_contacts(robot: Robot, stated: Sequence[str], texts: Sequence[str]) -> list[_Contact]:
+    """Feet: links of outermost bodies with the surest word in their names, one of each body, spheres first.
+
+    Those that the log names, in one of its texts, count before all others.
+    """
     shapes = CollisionShapes(robot)
     inner = {body.parent for body in robot.bodies}
+    named = [name for name in robot.links if any(within(name.lower()).search(text.lower()) for text in texts)]
     frames = list(stated)
-    for words in _FEET if not frames else ():
+    for words, links in ((_NAMED, named), *((words, list(robot.links)) for words in _FEET)) if not frames else ():
         by_body: dict[int, list[str]] = {}
-        for name, (body, _) in robot.links.items():
-            if body and body not in inner and re.search(words, name, re.IGNORECASE):
+        for name in links:
+            body, is_foot = robot.links[name][0], re.search(words, name, re.IGNORECASE)
+            if body and body not in inner and is_foot and not re.search(_ON_FEET, name, re.IGNORECASE):
                 by_body.setdefault(body, []).append(name)
         frames = [min(names, key=lambda name: (shapes.about(name) is None, len(name))) for names in by_body.values()]
         if len(frames) > 1:
@@ -178,23 +212,18 @@ def _describe(
     out: Initiated, robot: Robot, contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal
 ) -> None:
     """What was found, guessed and missed, in lines."""
-    known = [name for name in proposal.columns if name in fields and not name.endswith(("_order", "_name", "ignore"))]
-    frames = join_names([contact.frame for contact in contacts])
-    out.found.append(f"{len(robot.joint_names)} joints" + f", contacts {frames}" * bool(contacts))
-    if known:
-        out.found.append(f"columns of {', '.join(known)}")
+    what = proposal.key.removesuffix("s")
+    _describe_found(out, robot, contacts, fields, proposal)
     out.guessed += [f"{key}: {note}" for key, note in proposal.notes.items()]
     if contacts:
         out.guessed.append("contacts: from names of links; point where there is a ball or more than two of them")
     if _is_fixed(contacts, fields):
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
     if proposal.left_out:
-        out.guessed.append(
-            f"{format_count(len(proposal.left_out), 'column')} not needed: {join_names(proposal.left_out)}"
-        )
+        out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
     for name in ("time", "joint_position"):
         if name not in fields:
-            out.missing.append(f"{name}: no columns that look like it, of all {len(robot.joint_names)} joints")
+            out.missing.append(f"{name}: no {what}s that look like it, of all {len(robot.joint_names)} joints")
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
     from_feet = _from_feet(contacts, fields)
@@ -206,11 +235,27 @@ def _describe(
         out.missing.append(f"motion of the base: neither its pose nor an IMU{instead}")
 
 
+def _describe_found(
+    out: Initiated, robot: Robot, contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal
+) -> None:
+    """The robot, and what of a map there is."""
+    frames = join_names([contact.frame for contact in contacts])
+    out.found.append(f"{len(robot.joint_names)} joints" + f", contacts {frames}" * bool(contacts))
+    if proposal.key == "topics":
+        known = list(proposal.columns)
+    else:
+        names = [name for name in proposal.columns if name in fields]
+        known = [name for name in names if not name.endswith(("_order", "_name", "ignore"))]
+    if known:
+        out.found.append(f"{proposal.key} of {', '.join(known)}")
+
+
 def _try(out: Initiated, path: Path, proposal: MapProposal) -> None:
     """Read the log with the map, and say why that fails if it does."""
     try:
-        columns = Columns(**proposal.columns) if proposal.columns else None
-        log = read_log(path, allow_gaps=True, columns=columns)
+        maps = {"columns": Columns, "topics": Topics}[proposal.key]
+        given = {proposal.key: maps(**proposal.columns)} if proposal.columns else {}
+        log = read_log(path, allow_gaps=True, **given)
     except InputError as error:
         out.missing.append(f"the log is not read with this file yet: {error.field}: {error.found}")
         return
@@ -230,9 +275,10 @@ def _text(
     proposal: MapProposal,
 ) -> str:
     """The experiment file, with comments."""
-    from_feet = _from_feet(contacts, fields)
+    from_feet, is_map = _from_feet(contacts, fields), proposal.key == "columns"
     if contacts and "contact_active" not in fields and "detect_contacts" not in from_feet:
-        proposal.columns["contact_active"] = {"always": [contact.frame for contact in contacts]}
+        always = [contact.frame for contact in contacts]
+        proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
         proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
     own = {"urdf": _relative(Path(urdf), output)} | ({"fixed_base": True} if _is_fixed(contacts, fields) else {})
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
@@ -246,7 +292,7 @@ def _text(
     lines += ["logs:", f"  train: {_flow([name if whole else f'{name}[:80%]'])}"]
     lines += [] if whole else [f"  test: {_flow([f'{name}[80%:]'])}"]
     if proposal.columns:
-        lines.append("  columns:  # names, units and orders of the file: docs/logs.md")
+        lines.append(f"  {proposal.key}:  # {_WHAT[proposal.key]}: docs/logs.md")
         for key, value in proposal.columns.items():
             note = proposal.notes.get(key, "")
             lines += [f"    # guessed: {note}"] if note else []

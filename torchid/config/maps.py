@@ -12,11 +12,16 @@ from torchid.config.sensors import STRICT
 from torchid.errors import about_file
 from torchid.logs import Columns, Topics
 from torchid.logs.column_map import check_columns
+from torchid.logs.joint_orders import JOINT_ORDERS
 from torchid.logs.ros_topics import check_topics
 
-MAPS_ACCEPTED = {f"logs.columns.{key}": "a list of names" for key in ("*_order", "ignore")} | {
+_ORDER = f"a list of names, or a robot: {', '.join(JOINT_ORDERS)}"
+MAPS_ACCEPTED = {
+    **{f"logs.columns.{kind}_order": _ORDER for kind in ("joint", "contact")},
+    **{f"logs.columns.{key}": "a list of names" for key in ("sensor_order", "ignore")},
     "logs.columns.*": "the name of a column, a pattern such as {joint}_q, or a mapping with column, unit, scale, ...",
     "logs.topics.joint_states": "the name of a topic, or a mapping with topic and joints",
+    "logs.topics.low_state": "a mapping with topic and robot, or joints by number of the motor",
 }
 """Accepted for entries of maps, in messages, where their types alone say too little."""
 

@@ -22,6 +22,7 @@ from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
 from torchid.logs.column_map import require_names
+from torchid.logs.ros_topics import require_joints
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
@@ -205,9 +206,11 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         raise UnknownNameError.at_field(field, error.name, error.valid, error.what) from error
     if not robot.nv:
         raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
-    if config.logs is not None and config.logs.columns is not None:
+    if config.logs is not None:
         joints = [body.joint.name for body in robot.bodies if body.joint is not None]
-        require_names(config.logs.columns, {"joint": joints, "contact": robot.links})
+        require_joints(config.logs.topics, joints)
+        if config.logs.columns is not None:
+            require_names(config.logs.columns, {"joint": joints, "contact": robot.links})
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]

@@ -6,6 +6,7 @@ import dataclasses
 import re
 from collections.abc import Collection, Iterable, Mapping
 from fnmatch import fnmatchcase
+from functools import partial
 from typing import Annotated
 
 from pydantic import BeforeValidator, ConfigDict, Field
@@ -13,6 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, UnknownNameError, excerpt
 from torchid.logs.columns import KINDS, component_names, names_field
+from torchid.logs.joint_orders import order_by_name, require_joints_of, robot_with_order
 from torchid.logs.units import quantities_of, unit_factor
 from torchid.settings import Number
 
@@ -132,7 +134,8 @@ class Columns:
 
     Attributes:
         imu_frame: the frame of the URDF that the IMU sits at: no column, but the name itself.
-        joint_order: names of joints by number, for entries without `order`; `contact_order`, `sensor_order`: as well.
+        joint_order: names of joints by number, for entries without `order`, or the robot whose order it is (`go2`);
+            `contact_order`, `sensor_order`: as well.
         joint_name: what the joint that the file calls {joint} is called in the URDF, such as `{joint}_joint`.
         contact_name: as well, of {contact}.
         ignore: columns that are not needed; * and ? stand for others.
@@ -164,8 +167,8 @@ class Columns:
     imu_specific_force: _Entry | None = None
     imu_angular_velocity: _Entry | None = None
     imu_angular_acceleration: _Entry | None = None
-    joint_order: list[_Name | None] | None = None
-    contact_order: list[_Name | None] | None = None
+    joint_order: Annotated[list[_Name | None], BeforeValidator(partial(order_by_name, "joint"))] | None = None
+    contact_order: Annotated[list[_Name | None], BeforeValidator(partial(order_by_name, "contact"))] | None = None
     sensor_order: list[_Name | None] | None = None
     joint_name: _Name = "{joint}"
     contact_name: _Name = "{contact}"
@@ -377,8 +380,10 @@ def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> Non
         known: names by their kind: joint, contact.
 
     Raises:
-        UnknownNameError: one that is not.
+        InputError: one that is not.
     """
+    if (robot := robot_with_order(columns.joint_order)) and "joint" in known:
+        require_joints_of(f"{KEY}.joint_order", robot, known["joint"])
     stated: list[tuple[str, str, Iterable[str | None]]] = []
     for kind in known:
         stated.append((kind, f"{kind}_order", getattr(columns, f"{kind}_order") or ()))

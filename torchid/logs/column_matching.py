@@ -40,6 +40,10 @@ class Matched:
         """The labels that are names."""
         return tuple(label for label in self.labels if label is not None)
 
+    def has_all_names(self, width: tuple[int, ...]) -> bool:
+        """Whether all that an array with so many columns (k,) lacks are the last numbers of an order, without names."""
+        return not self.by_name and len(width) == 1 and not any(self.labels[width[0] :]) and width[0] < len(self.labels)
+
 
 @dataclass(frozen=True)
 class Matching:

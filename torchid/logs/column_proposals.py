@@ -29,6 +29,7 @@ _WORDS = (
     ("joint_position", r"\b(qs?|qpos|pos|positions?|angles?)\b"),
     ("time", r"\b(t|ts|time|timestamps?|stamps?|ticks?|clock|sec|secs|seconds)\b"),
 )
+_APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torque"), ("world", "base", "local"))
 _DESIRED = re.compile(r"\b(des|desired|cmd|command|ref|target|goal|setpoint|ff)\b")
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
 
@@ -45,13 +46,19 @@ def propose_field(column: str, desired: bool = False) -> str:
         column: its name.
         desired: whether a desired value counts as one that was measured.
     """
-    close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
-    if close:
-        return close[0]
     words = " ".join(_words(column))
+    close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
+    if close and not _contradicts(words, " ".join(_words(close[0]))):
+        return close[0]
     if not desired and _DESIRED.search(words):
         return ""
     return next((field for field, pattern in _WORDS if re.search(pattern, words)), "")
+
+
+def _contradicts(words: str, others: str) -> bool:
+    """Whether two names differ in a word that makes them different quantities, such as linear and angular."""
+    pairs = ((set(group) & set(words.split()), set(group) & set(others.split())) for group in _APART)
+    return any(one and other and one != other for one, other in pairs)
 
 
 def _words(column: str) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,20 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.logs.column_families import Family, find_families
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_desired, propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
-from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS
+from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, suitable_orders, usual_order
+from torchid.logs.log import SHAPES, VARIANTS
+from torchid.logs.name_matching import SUFFIXES, KnownRobot, match_names
 from torchid.logs.tables import sample_table
 from torchid.logs.units import UNITS
 
 Columns = Mapping[str, NDArray[Any] | None]
-"""Columns of a table or arrays with some of their rows; None for one without numbers."""
+"""Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
 
-_SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact", "_link", "_ankle_roll_link")}
-_NUMBER = re.compile(r"\d+")
-_AXIS = re.compile(r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_])([WXYZ])$|(?<=[a-z])([wxyz])$")
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
 _FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
 _MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
@@ -33,39 +32,29 @@ _FOOT = re.compile(r"foot|feet", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
 _STEP = (2e-4, 0.2)  # [s]: of recordings
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
-_HEAVY = 500.0  # [N m]: rms of no torque is as large
+_LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
 _FAR = 60.0  # [m]: no base is recorded as far away
+_NAMES = 300  # elements of a list of names
 _SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
 
 
 @dataclass
 class MapProposal:
-    """What `logs.columns` may say of a log.
+    """What `logs.columns`, or `logs.topics`, may say of a log.
 
     Attributes:
         columns: the map, as it stands in a file.
         notes: what was guessed, by key.
         left_out: columns that it ignores.
+        key: columns or topics.
+        fields: of the log, that a map of topics gives.
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
+    key: str = "columns"
+    fields: set[str] = field(default_factory=set)
     notes: dict[str, str] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class _Family:
-    """Columns that differ in a name, a number or an axis alone."""
-
-    pattern: str
-    columns: list[str]
-    names: tuple[str, ...]
-    numbers: tuple[int, ...]  # no element of columns without
-    axes: tuple[str, ...]
-
-    @property
-    def words(self) -> str:
-        return PLACEHOLDER.sub(" ", self.pattern)
 
 
 def read_sample(path: Path) -> Columns:
@@ -81,7 +70,8 @@ def read_sample(path: Path) -> Columns:
         for name in container.declared_bytes():
             with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
                 array = container.load(name)
-            out[name] = array if array.dtype.kind in "fiub" or name in NAME_FIELDS else None
+            is_list = array.ndim == 1 and len(array) <= _NAMES
+            out[name] = array if array.dtype.kind in "fiub" or is_list else None
     return out
 
 
@@ -92,40 +82,47 @@ def stated_names(sample: Columns, field: str) -> list[str]:
     return [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names]
 
 
-def propose_map(sample: Columns, joints: Sequence[str], feet: Sequence[str]) -> MapProposal:
+def texts_in(sample: Columns) -> list[str]:
+    """Names of columns and arrays, and all that lists of names in them have."""
+    listed = [name for name, x in sample.items() if x is not None and x.dtype.kind not in "fiub"]
+    return [*sample, *(text for name in listed for text in stated_names(sample, name))]
+
+
+def propose_map(sample: Columns, robot: KnownRobot) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called and what is in them.
 
     Args:
         sample: from `read_sample`.
-        joints: of the robot.
-        feet: frames of its contacts.
+        robot: whose log it is.
     """
     native = [name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)]
     foreign = [name for name in sample if name not in native]
-    return _Proposer(sample, native, joints, feet).propose(foreign)
+    return _Proposer(sample, native, robot).propose(foreign)
 
 
 class _Proposer:
-    def __init__(self, sample: Columns, native: Sequence[str], joints: Sequence[str], feet: Sequence[str]) -> None:
-        self.sample, self.joints, self.feet, self.native = sample, joints, feet, native
+    def __init__(self, sample: Columns, native: Sequence[str], robot: KnownRobot) -> None:
+        self.sample, self.native, self.robot = sample, native, robot
+        self.joints, self.feet = robot.joints, robot.feet
         self.given = {name.partition(".")[0] for name in native}
         self.out = MapProposal()
         stated = stated_names(sample, "joint_names")
-        self.names_stated = bool(stated) and set(stated) <= set(joints)
+        self.names_stated = bool(stated) and set(stated) <= set(self.joints)
 
     def propose(self, foreign: Sequence[str]) -> MapProposal:
-        numeric = [name for name in foreign if self.sample[name] is not None]
-        families = self._families(numeric)
-        used: list[_Family] = [one for one in families if self._place(one)]
+        numeric = [name for name in foreign if self._is_numeric(name)]
+        families, more = find_families(numeric, self.robot)
+        self.out.columns |= {f"{kind}_name": pattern for kind, pattern in more.items()}
+        used: list[Family] = [one for one in families if self._place(one)]
         if "joint_torque" not in {*self.given, *self.out.columns}:
             used += self._place_law([one for one in families if one not in used])
         if set(wrench := self.out.columns.get("contact_wrench_local", {})) == {"moment"}:  # of no use without forces
-            used = [one for one in used if one.pattern != wrench["moment"]["column"]]
+            used = [one for one in used if one.entry != wrench["moment"]]
             del self.out.columns["contact_wrench_local"]
         taken = {column for one in used for column in one.columns}
         self.out.left_out = [name for name in foreign if name not in taken]
         ignored = {_anything(one.pattern) for one in families if one not in used}
-        ignored |= {name for name in foreign if self.sample[name] is None}
+        ignored |= {name for name in foreign if not self._is_numeric(name)}
         ignored |= {_anything(one.pattern) for one in used if len(one.numbers) > len(self.joints)}
         if ignored:
             self.out.columns["ignore"] = sorted(ignored)
@@ -133,51 +130,13 @@ class _Proposer:
             self._add_units()
         return self.out
 
-    # --------------------------------------------------------------------------------------------------- patterns
-
-    def _families(self, columns: Sequence[str]) -> list[_Family]:
-        """Columns by pattern, in their order."""
-        joints = self._stems("joint", columns, {})
-        stems = {"joint": joints, "contact": self._stems("contact", columns, joints)}
-        found = defaultdict[str, list[tuple[str, str, str, str]]](list)
-        for column in columns:
-            pattern, name, number, axis = _pattern(column, stems)
-            found[pattern].append((column, name, number, axis))
-        out = []
-        for pattern, members in found.items():
-            texts, names, numbers, axes = ([x for x in dict.fromkeys(of)] for of in zip(*members, strict=True))
-            if "{index}" in pattern and (widths := {len(x) for x in numbers}) == {2} and numbers[0].startswith("0"):
-                pattern = pattern.replace("{index}", f"{{index:0{widths.pop()}}}")
-            whole = len(members) == max(len(names), 1) * max(len(numbers), 1) * max(len(axes), 1)
-            if whole and (len(members) > 1 or not PLACEHOLDER.search(pattern)):
-                out.append(_Family(pattern, texts, tuple(names), tuple(int(x) for x in numbers if x), tuple(axes)))
-            else:
-                out += [_Family(column, [column], ("",), (), ("",)) for column in texts]
-        return out
-
-    def _stems(self, kind: str, columns: Sequence[str], others: Mapping[str, str]) -> dict[str, str]:
-        """What the file calls joints or feet, where no longer one of others fits, with the name of the URDF."""
-        longest = {column: max((len(x) for x in others if _within(x).search(column)), default=0) for column in columns}
-        names, best = (self.joints if kind == "joint" else self.feet), dict[str, str]()
-        for suffix in _SUFFIXES[kind]:
-            if not names or not all(name.endswith(suffix) and len(name) > len(suffix) for name in names):
-                continue
-            stems = {name[: len(name) - len(suffix)]: name for name in names}
-            seen = {
-                stem: name
-                for stem, name in stems.items()
-                if any(n < len(stem) and _within(stem).search(x) for x, n in longest.items())
-            }
-            if len(seen) > len(best):
-                best = seen
-                pattern = f"{{{kind}}}{suffix}"
-        if best and pattern != f"{{{kind}}}":
-            self.out.columns[f"{kind}_name"] = pattern
-        return best
+    def _is_numeric(self, name: str) -> bool:
+        values = self.sample[name]
+        return values is not None and values.dtype.kind in "fiub"
 
     # ----------------------------------------------------------------------------------------------------- fields
 
-    def _place(self, family: _Family) -> bool:
+    def _place(self, family: Family) -> bool:
         """Whether a family has become an entry."""
         if is_desired(family.words) or _GAINS.search(family.words.replace("_", " ")):
             return False
@@ -186,7 +145,7 @@ class _Proposer:
             return self._place_force(family)
         if not name or name in self.given or name in self.out.columns or not self._fits(family, name):
             return False
-        entry: dict[str, Any] = {"column": family.pattern}
+        entry: dict[str, Any] = family.entry
         if (first := min(family.numbers, default=0)) > 0:
             entry["first_index"] = first
         if name == "base_quat_wxyz":
@@ -199,7 +158,7 @@ class _Proposer:
         self.out.columns[name] = entry
         return True
 
-    def _field(self, family: _Family) -> str:
+    def _field(self, family: Family) -> str:
         """The field that a family probably is."""
         name, axes = propose_field(family.words), len(family.axes) == 3
         of_foot = "{contact}" in family.pattern or _FOOT.search(family.words) is not None
@@ -210,7 +169,7 @@ class _Proposer:
             return "contact_active"  # as a threshold: what it is in newtons nobody knows
         return "base_position_world" if name == "joint_position" and axes and not any(family.names) else name
 
-    def _fits(self, family: _Family, name: str) -> bool:
+    def _fits(self, family: Family, name: str) -> bool:
         """Whether a family has as many columns as a field."""
         first = self.sample[family.columns[0]]
         if first is None or not first.ndim:
@@ -223,7 +182,9 @@ class _Proposer:
             return False
         if name.startswith("joint_"):
             named = {x for x in family.names if x}
-            enough = count >= len(self.joints) if family.numbers else (len(named) or count) == len(self.joints)
+            slots = {MOTORS[JOINT_ORDERS[name].message] for name in suitable_orders(self.joints)}
+            whole = (len(named) or count) in (len(self.joints), *(() if named else slots))
+            enough = count >= len(self.joints) if family.numbers else whole
             return enough and len(self.joints) > 0 and not any(family.axes)
         if name.startswith("contact_wrench"):
             return count == 6 * len(self.feet)
@@ -232,7 +193,7 @@ class _Proposer:
         axes = "".join(sorted(family.axes)).lower()
         return count == (4 if "quat" in name else 3) and (not axes or axes == ("wxyz" if "quat" in name else "xyz"))
 
-    def _place_force(self, family: _Family) -> bool:
+    def _place_force(self, family: Family) -> bool:
         """Whether a family is the forces or the moments of contacts."""
         wrench = self.out.columns.setdefault("contact_wrench_local", {})
         part = "moment" if _MOMENT.search(family.pattern) else "force"
@@ -241,12 +202,12 @@ class _Proposer:
             if not wrench:
                 del self.out.columns["contact_wrench_local"]
             return False
-        wrench[part] = {"column": family.pattern}
+        wrench[part] = family.entry
         self.out.notes["contact_wrench_local"] = "taken to act on the robot, along the axes of the contact frames"
         self._add_order(family, "contact_wrench_local")
         return True
 
-    def _place_law(self, families: Sequence[_Family]) -> list[_Family]:
+    def _place_law(self, families: Sequence[Family]) -> list[Family]:
         """Families of a PD law, if there are gains."""
         law: dict[str, Any] = {}
         used = []
@@ -255,7 +216,7 @@ class _Proposer:
             gain, what = _GAINS.search(words), propose_field(family.words, desired=True)
             key = gain[1].lower() if gain else _LAW.get(what, "")
             if key and key not in law and (gain or self._fits(family, what)):
-                law[key] = family.pattern
+                law[key] = family.entry if family.by_name else family.pattern
                 used.append(family)
         if "kp" not in law or "position" not in law:
             return []
@@ -263,7 +224,7 @@ class _Proposer:
         self.out.notes["joint_torque"] = "of the PD law that the columns belong to, as no torque was recorded"
         return used
 
-    def _quaternion(self, family: _Family) -> str:
+    def _quaternion(self, family: Family) -> str:
         """The order of a quaternion whose components have numbers: w is the largest of a base that stands upright."""
         if any(family.axes):
             return "base_quat_xyzw" if family.axes[0] in "xX" else "base_quat_wxyz"
@@ -273,23 +234,33 @@ class _Proposer:
         self.out.notes[f"base_quat_{order}"] = "order of components, with w as the largest"
         return f"base_quat_{order}"
 
-    def _add_threshold(self, family: _Family, entry: dict[str, Any]) -> None:
+    def _add_threshold(self, family: Family, entry: dict[str, Any]) -> None:
         values = np.concatenate([np.ravel(x) for c in family.columns if (x := self.sample[c]) is not None])
-        values = values[np.isfinite(values)] if values.dtype.kind == "f" else values
         if not np.isin(values, (0, 1)).all():
-            low, high = np.percentile(values, (2, 98))
-            entry["above"] = float(f"{low + _SHARE * (high - low):.2g}")
+            entry["above"] = threshold(values)
             self.out.notes["contact_active"] = "threshold, from the range of the readings"
 
-    def _add_order(self, family: _Family, name: str) -> None:
+    def _add_order(self, family: Family, name: str) -> None:
         """An order of names by number, where columns have none."""
-        kind = next((kind for kind in _SUFFIXES if name.startswith(f"{kind}_")), "")
+        kind = next((kind for kind in SUFFIXES if name.startswith(f"{kind}_")), "")
         key = f"{kind}_order"
         if not kind or any(family.names) or key in self.out.columns or (kind == "joint" and self.names_stated):
             return
-        order, how = _usual_order(self.joints if kind == "joint" else self.feet)
+        first = self.sample[family.columns[0]]
+        numbers = len(family.numbers) or (1 if first is None else int(np.prod(first.shape[1:2])))
+        order, how = self._listed_order(kind, numbers) or usual_order(kind, self.robot, numbers)
         self.out.columns[key] = order
         self.out.notes[key] = f"{how}; compare it with the manual of the robot, and with what torchid check says"
+
+    def _listed_order(self, kind: str, count: int) -> tuple[list[str], str] | None:
+        """Names of joints or feet that some array of the file lists."""
+        known = self.joints if kind == "joint" else self.feet
+        for name in self.sample:
+            listed = [] if self._is_numeric(name) or self.sample[name] is None else stated_names(self.sample, name)
+            matched = match_names(listed, known, kind) if len(listed) == count == len(known) else {}
+            if len(matched) == len(known) > 0:
+                return [matched[text] for text in listed], f"as '{name}' of the file lists them"
+        return None
 
     # ------------------------------------------------------------------------------------------------------ units
 
@@ -311,7 +282,7 @@ class _Proposer:
             slope = factor * np.gradient(position, seconds, axis=0)
             self._add_speed_unit(float(np.sqrt(np.nanmean(velocity**2) / max(np.nanmean(slope**2), 1e-12))))
         for name, is_it, unit, why in (
-            ("joint_torque", lambda x: _rms(x) > _HEAVY, "N mm", "as they are too large for N m"),
+            ("joint_torque", lambda x: _rms(x) > _LEVER * self.robot.weight, "N mm", "as they are too large for N m"),
             ("base_position_world", lambda x: np.nanmax(np.abs(x)) > _FAR, "mm", "as it is too far away for m"),
             ("imu_specific_force", lambda x: 0.7 < _length(x) < 1.4, "g", "as its length is about 1"),
             ("imu_angular_velocity", lambda x: _rms(x) > 20.0, "deg/s", "as it is too fast for rad/s"),
@@ -327,22 +298,35 @@ class _Proposer:
 
     def _set_unit(self, name: str, unit: str, why: str) -> None:
         entry = self.out.columns.get(name)
-        if isinstance(entry, dict) and "column" in entry and unit != _si(name):
+        if isinstance(entry, dict) and {"column", "columns"} & set(entry) and unit != _si(name):
             entry["unit"] = unit
             self.out.notes[name] = f"{unit}, {why}"
 
     def _values(self, name: str) -> NDArray[np.float64] | None:
         """Numbers (N, k) of an entry, in the order of its columns."""
         entry = self.out.columns.get(name)
-        if not isinstance(entry, dict) or "column" not in entry:
+        if not isinstance(entry, dict) or not {"column", "columns"} & set(entry):
             return None
+        if "columns" in entry:
+            return self._flat([x for column in entry["columns"].values() if (x := self.sample[column]) is not None])
         text = re.escape(entry["column"])
         text = re.sub(r"\\{(joint|contact)\\}", ".+", text)
         text = re.sub(r"\\{index(:\d+)?\\}", r"\\d+", re.sub(r"\\{(axis|AXIS)\\}", "[wxyzWXYZ]", text))
         found = [x for column, x in self.sample.items() if x is not None and x.size and re.fullmatch(text, column)]
+        return self._flat(found)
+
+    def _flat(self, found: Sequence[NDArray[Any]]) -> NDArray[np.float64] | None:
+        """Numbers (N, k) of columns or arrays; None where they are none."""
         flat = [np.asarray(x, dtype=float).reshape(len(x), -1) for x in found]
         values = np.concatenate(flat, axis=1) if flat and len({len(x) for x in flat}) == 1 else np.zeros((0, 1))
         return values if np.isfinite(values).any() else None
+
+
+def threshold(readings: Any) -> float:
+    """A reading above which a contact is probably active, by the range of all of its sensor, in two digits."""
+    values = np.asarray(readings, dtype=float)
+    low, high = np.percentile(values[np.isfinite(values)], (2, 98)) if np.isfinite(values).any() else (0.0, 0.0)
+    return float(f"{low + _SHARE * (high - low):.2g}")
 
 
 def _si(name: str) -> str:
@@ -357,32 +341,5 @@ def _length(x: NDArray[np.float64]) -> float:
     return float(np.nanmedian(np.linalg.norm(x, axis=1)))
 
 
-def _within(stem: str) -> re.Pattern[str]:
-    return re.compile(rf"(?<![A-Za-z0-9]){re.escape(stem)}(?![A-Za-z0-9])")
-
-
-def _pattern(column: str, stems: Mapping[str, Mapping[str, str]]) -> tuple[str, str, str, str]:
-    """A column with placeholders, and the name, number and axis in their places."""
-    number = axis = ""
-    kinds = {stem: kind for kind, of_kind in stems.items() for stem in of_kind}
-    name = max((stem for stem in kinds if _within(stem).search(column)), key=len, default="")
-    if name:
-        column = _within(name).sub(f"{{{kinds[name]}}}", column, count=1)
-    if not name and (found := _NUMBER.search(column)):
-        column, number = f"{column[: found.start()]}{{index}}{column[found.end() :]}", found[0]
-    if found := _AXIS.search(column):
-        axis = found[0]
-        column = f"{column[: found.start()]}{{{'axis' if axis.islower() else 'AXIS'}}}{column[found.end() :]}"
-    return column, name, number, axis
-
-
 def _anything(pattern: str) -> str:
     return PLACEHOLDER.sub("*", pattern)
-
-
-def _usual_order(names: Sequence[str]) -> tuple[list[str], str]:
-    """Names in the order of motors, and whose that is."""
-    legs = ("FR", "FL", "RR", "RL")
-    if names and all(name.partition("_")[0] in legs for name in names):
-        return sorted(names, key=lambda name: legs.index(name.partition("_")[0])), "as Unitree numbers legs"
-    return list(names), "as in the URDF"

@@ -72,7 +72,7 @@ class _Values:
             array = array.reshape(-1, *shape)
         if array.ndim == 0:
             raise LogError.at_field(f"'{column}'", "a single value", "a row for each sample")
-        if array.shape[1:] != shape:
+        if array.shape[1:] != shape and (array.shape[2:] != shape[1:] or not self.of.has_all_names(array.shape[1:2])):
             names = f", one for each name of its order ({self.of.labels[0]}, ...)" if self.of.labels and shape else ""
             raise LogError.at_field(f"'{column}'", f"shape {_n_by(array.shape[1:])}", f"{_n_by(shape)}{names}")
         return np.asarray(array, dtype=np.float64)

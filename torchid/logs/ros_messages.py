@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from torchid.errors import LogError, UnknownNameError, warn_about_file
 from torchid.guards import MAX_ARRAYS, check_names, require_plain_name
 from torchid.logs.log import FloatArray
+from torchid.logs.ros_low_state import LowState
+from torchid.logs.unitree_messages import register
 
 if TYPE_CHECKING:
     from torchid.logs.ros_files import Channel
@@ -35,7 +37,7 @@ class Decoder(Protocol):
 
 
 def make_deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
-    """The function that deserializes the messages of a channel, by the definitions of ROS, not those in the bag.
+    """The function that deserializes the messages of a channel, by definitions of ROS and Unitree, not the bag's own.
 
     Raises:
         LogError: an unknown serialization.
@@ -56,10 +58,14 @@ def make_deserializer(topic: str, channel: Channel) -> Callable[[bytes], Any]:
 
 @cache
 def _typestore(encoding: str) -> Any:
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     stores = {"ros1": Stores.ROS1_NOETIC, "cdr": Stores.ROS2_HUMBLE}  # the types read here never changed within ROS 2
-    return get_typestore(stores[encoding]) if encoding in stores else None
+    if encoding not in stores:
+        return None
+    store = get_typestore(stores[encoding])
+    register(store, get_types_from_msg)
+    return store
 
 
 class _Constant:
@@ -306,7 +312,8 @@ class TopicMessages:
         if row is None:
             return
         stamp = message.header.stamp if hasattr(message, "header") else None
-        self._stamps.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
+        number = getattr(message, "tick", 0) if stamp is None else stamp.sec * 10**9 + stamp.nanosec
+        self._stamps.append(number)
         self._received.append(received)
         self._values.frombytes(np.asarray(row, dtype=np.float64).tobytes())
         if 8 * len(self._values) > MAX_ARRAYS:
@@ -329,9 +336,11 @@ class TopicMessages:
             raise LogError.at_field(self.topic, "no messages", "at least one")
         stamps: Stamps = np.array(self._stamps, dtype=np.int64)
         rows: FloatArray = np.array(self._values, dtype=np.float64).reshape(len(stamps), -1)
-        stamped = bool(stamps.any())
-        if not stamped:
-            stamps = np.array(self._received, dtype=np.int64)
+        received, stamped = np.array(self._received, dtype=np.int64), bool(stamps.any())
+        if isinstance(self._decoder, LowState):
+            stamps, stamped = self._decoder.stamps(stamps, received)
+        elif not stamped:
+            stamps = received
         if np.any(np.diff(stamps) < 0):
             order = np.argsort(stamps, kind="stable")
             stamps, rows = stamps[order], rows[order]
@@ -341,7 +350,8 @@ class TopicMessages:
             if differ.any():
                 at = stamps[again[np.argmax(differ)]] / 1e9
                 found = f"messages of different content with one stamp, {at:.9f} s"
-                raise LogError.at_field(self.topic, found, "every stamp once")
+                by_tick = ", or logs.topics.low_state.stamps: receipt" * isinstance(self._decoder, LowState)
+                raise LogError.at_field(self.topic, found, "every stamp once" + by_tick)
             warn_about_file(f"{self.topic}: {len(again)} messages come twice; each counts once")
             stamps, rows = np.delete(stamps, again), np.delete(rows, again, axis=0)
         return TopicSeries(self.topic, stamps, self._decoder.fields(rows), stamped)

@@ -16,6 +16,7 @@ from torchid.errors import LogError, UnknownNameError, how_to_install, warn_abou
 from torchid.logs.containers import list_bag_files, reader_errors_explained
 from torchid.logs.log import FloatArray, is_quaternion, normalize_quaternions
 from torchid.logs.quaternion import make_sign_continuous
+from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import (
     ContactFlag,
     Decoder,
@@ -29,7 +30,17 @@ from torchid.logs.ros_messages import (
     Wrench,
     make_deserializer,
 )
-from torchid.logs.ros_topics import ForceTopic, ImuTopic, JointTopic, OdometryTopic, Topics, WrenchTopic, check_topics
+from torchid.logs.ros_topics import (
+    AnyTopic,
+    ForceTopic,
+    ImuTopic,
+    JointTopic,
+    LowStateTopic,
+    OdometryTopic,
+    Topics,
+    WrenchTopic,
+    check_topics,
+)
 from torchid.logs.timeline import LONGEST_STEP, spline_derivatives
 
 if TYPE_CHECKING:
@@ -132,6 +143,7 @@ def _make_common_clock(
 #: Packages that read bags.
 _PACKAGES = ("rosbags", "mcap", "lz4", "zstandard")
 _EVENT = "contact_active"
+_FEET = "foot_force"
 #: Messages between two reports of progress, and topics that a message lists.
 _REPORT_EVERY, _LISTED = 1000, 30
 
@@ -155,8 +167,9 @@ class _Bag:
                 raise UnknownNameError.at_field(field, name, self.channels)
             decoder, given = _decoder(topic), self.channels[name].type
             if given not in decoder.types:
-                raise LogError.at_field(field, f"{name} carries {given}", " or ".join(decoder.types))
-            if isinstance(decoder, NormalForce):
+                instead = ", or logs.topics.low_state" * (given in LowState.types)
+                raise LogError.at_field(field, f"{name} carries {given}", " or ".join(decoder.types) + instead)
+            if isinstance(decoder, (NormalForce, LowState)):
                 decoder.check_options(field, given)
             self.decoders[role], self.rows[role] = decoder, TopicMessages(name, decoder)
 
@@ -182,14 +195,7 @@ def read_bag(
     files = list_bag_files(path)
     if topics is not None:
         check_topics(topics)
-    channels: dict[str, Channel] = {}
-    for file in files:
-        with _open_bag_file(file) as opened:
-            for channel in opened.channels():
-                first = channels.setdefault(channel.topic, channel)
-                if first != channel:
-                    found = f"both {first.type} and {channel.type}"
-                    raise LogError.at_field(channel.topic, found, "one type of message per topic")
+    channels = list_channels(files)
     if topics is None:
         raise LogError.at_field("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
     bag = _Bag(topics, channels)
@@ -201,7 +207,7 @@ def read_bag(
         warn_about_file(f"{', '.join(unstamped)}: {problem}")
     sampled = {role: x for role, x in series.items() if not role.startswith(_EVENT)}
     events = {role: x for role, x in series.items() if role.startswith(_EVENT)}
-    clock = _make_common_clock(sampled[topics.rate_topic], sampled, events)
+    clock = _make_common_clock(sampled[topics.clock], sampled, events)
     return {
         "time": clock.time,
         **_motion(bag, clock, series),
@@ -210,8 +216,25 @@ def read_bag(
     }
 
 
+def list_channels(files: list[Path]) -> dict[str, Channel]:
+    """The topics of a bag.
+
+    Raises:
+        LogError: it is damaged, or a topic has several types.
+    """
+    channels: dict[str, Channel] = {}
+    for file in files:
+        with open_bag_file(file) as opened:
+            for channel in opened.channels():
+                first = channels.setdefault(channel.topic, channel)
+                if first != channel:
+                    found = f"both {first.type} and {channel.type}"
+                    raise LogError.at_field(channel.topic, found, "one type of message per topic")
+    return channels
+
+
 @contextmanager
-def _open_bag_file(path: Path) -> Iterator[BagFile]:
+def open_bag_file(path: Path) -> Iterator[BagFile]:
     """Open a .bag, .mcap or .db3 file.
 
     Raises:
@@ -238,7 +261,9 @@ def _listed(channels: Mapping[str, Channel]) -> str:
     return (", ".join(shown) or "no topics") + (f", and {more} more" if more else "")
 
 
-def _decoder(topic: object) -> Decoder:
+def _decoder(topic: AnyTopic) -> Decoder:
+    if isinstance(topic, LowStateTopic):
+        return LowState(topic)
     if isinstance(topic, JointTopic):
         return JointStates(topic.topic, topic.joints)
     if isinstance(topic, ImuTopic):
@@ -257,7 +282,7 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
         users.setdefault(rows.topic, []).append(rows)
     make = {topic: make_deserializer(topic, bag.channels[topic]) for topic in users}
     for i, file in enumerate(files):
-        with _open_bag_file(file) as opened:
+        with open_bag_file(file) as opened:
             for n, record in enumerate(opened.records(users.keys())):
                 message = make[record.topic](record.data)
                 for rows in users[record.topic]:
@@ -269,11 +294,11 @@ def _read(bag: _Bag, files: list[Path], progress: Callable[[float], None]) -> No
 def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -> dict[str, NDArray[Any]]:
     """Joints, base and IMU."""
     out: dict[str, NDArray[Any]] = {}
-    for role in ("joint_states", "odometry", "imu"):
+    for role in ("joint_states", "low_state", "odometry", "imu"):
         if role in series:
             out |= clock.align(series[role])
         decoder = bag.decoders.get(role)
-        if isinstance(decoder, JointStates):
+        if isinstance(decoder, (JointStates, LowState)):
             out["joint_names"] = np.array(decoder.names, dtype=np.str_)
         elif isinstance(decoder, Odometry) and bag.topics.odometry is not None:
             _check_frame(bag, role, bag.topics.odometry.frame, "the robot's base link")
@@ -283,6 +308,9 @@ def _motion(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries]) -
                 accepted = "logs.topics.imu.frame, the frame of the URDF it sits at"
                 raise LogError.at_field(bag.topics.imu.topic, "no header.frame_id", accepted)
             out["imu_frame"] = np.array(frame)
+    out.pop(_FEET, None)
+    if bag.topics.low_state is not None and bag.topics.low_state.frame is not None:
+        out["imu_frame"] = np.array(bag.topics.low_state.frame)
     return out
 
 
@@ -299,12 +327,19 @@ def _contacts(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries])
         out["contact_wrench_local"] = np.stack(wrenches, axis=1)
         for name, topic in bag.topics.contact_wrenches.items():
             _check_frame(bag, f"contact_wrenches.{name}", topic.frame or name)
-    if bag.topics.contact_force_normal:
+    if bag.topics.contacts_with_force:
         out["contact_force_normal"] = np.full(active.shape, np.nan)
-        for name in bag.topics.contact_force_normal:
-            force = clock.align(series[f"contact_force_normal.{name}"])["force"]
-            out["contact_force_normal"][:, names.index(name)] = force[:, 0]
+        for name in bag.topics.contacts_with_force:
+            measured, field, number = _force(bag, series, name)
+            out["contact_force_normal"][:, names.index(name)] = clock.align(measured)[field][:, number]
     return out
+
+
+def _force(bag: _Bag, series: Mapping[str, TopicSeries], name: str) -> tuple[TopicSeries, str, int]:
+    """Topic, field and column of the force along the ground's normal, or of what a foot sensor reads."""
+    if name in bag.topics.contact_force_normal:
+        return series[f"contact_force_normal.{name}"], "force", 0
+    return series["low_state"], _FEET, bag.topics.feet.index(name)
 
 
 def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], name: str) -> NDArray[np.bool_]:
@@ -314,7 +349,10 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
         if flags is None:
             return np.ones(len(clock.stamps), dtype=np.bool_)
         return clock.hold(flags, flags.fields["active"])[:, 0] != 0.0
-    threshold = bag.topics.contact_force_threshold
+    threshold, low_state = bag.topics.contact_force_threshold, bag.topics.low_state
+    if name in bag.topics.feet and low_state is not None and low_state.above is not None:
+        counts = series["low_state"].fields[_FEET][:, bag.topics.feet.index(name)]
+        return clock.hold(series["low_state"], counts) > low_state.above
     if name in bag.topics.contact_wrenches:
         measured = series[f"contact_wrenches.{name}"]
         with np.errstate(over="ignore"):  # infinite is above any threshold

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from torchid.errors import ConfigError, UnknownNameError
+from torchid.errors import ConfigError, UnknownNameError, excerpt
+from torchid.logs.joint_orders import JOINT_ORDERS, require_joints_of
+from torchid.settings import Number
 
 _STRICT = ConfigDict(extra="forbid")
 _Name = Annotated[str, Field(min_length=1)]
@@ -80,6 +83,48 @@ class ContactTopic:
     always: bool = False
 
 
+@dataclass(config=_STRICT, frozen=True)
+class LowStateTopic:
+    """`LowState` of `unitree_go` or `unitree_hg`: all motors, the IMU, and of the first four foot sensors.
+
+    Attributes:
+        topic: its name.
+        robot: whose motors they are: go2, g1, ...; see `JOINT_ORDERS`.
+        joints: in its place, joints by number of the motor, null for one that is to be left out.
+        frame: of the IMU in the URDF; without it the IMU is not read.
+        feet: contacts by number in `foot_force`, null for one to be left out; by default the robot's.
+        above: [counts] a foot touches while its sensor reads more.
+        forces: whether what the sensors read is the force along the ground's normal, in counts.
+        stamps: `tick` for the robot's clock, `receipt` for that of the recording computer; by default the tick, which
+            has to fit the times of receipt.
+    """
+
+    topic: _Name
+    robot: _Name | None = None
+    joints: Annotated[list[_Name | None], Field(min_length=1)] | None = None
+    frame: _Name | None = None
+    feet: Annotated[list[_Name | None], Field(min_length=1, max_length=4)] | None = None
+    above: Number | None = None
+    forces: bool = False
+    stamps: Literal["tick", "receipt"] | None = None
+
+    @property
+    def order(self) -> tuple[str | None, ...]:
+        """Joints by number of the motor."""
+        return tuple(self.joints or (JOINT_ORDERS[self.robot].joints if self.robot in JOINT_ORDERS else ()))
+
+    @property
+    def reads_feet(self) -> bool:
+        """Whether the foot sensors are read."""
+        return self.forces or self.above is not None
+
+    @property
+    def feet_by_number(self) -> tuple[str | None, ...]:
+        """Contacts by number in `foot_force`; none where these are not read."""
+        of_robot = JOINT_ORDERS[self.robot].feet if self.robot in JOINT_ORDERS else ()
+        return tuple(self.feet or of_robot) if self.reads_feet else ()
+
+
 def _topic(value: object) -> object:
     return {"topic": value} if isinstance(value, str) else value
 
@@ -88,6 +133,7 @@ def _contact(value: object) -> object:
     return {"always": True} if value is True else _topic(value)
 
 
+AnyTopic = JointTopic | LowStateTopic | ImuTopic | OdometryTopic | WrenchTopic | ForceTopic | ContactTopic
 _Wrenches = dict[str, Annotated[WrenchTopic, BeforeValidator(_topic)]]
 _Forces = dict[str, Annotated[ForceTopic, BeforeValidator(_topic)]]
 _Contacts = dict[str, Annotated[ContactTopic, BeforeValidator(_contact)]]
@@ -99,6 +145,7 @@ class Topics:
 
     Attributes:
         joint_states: positions, velocities and efforts.
+        low_state: in its place, the state of a robot of Unitree.
         imu: specific force and angular velocity.
         odometry: pose and twist of the base link.
         contact_wrenches: by contact, the environment's action on the robot at the contact frame, along its axes.
@@ -106,10 +153,11 @@ class Topics:
         contact_active: by contact, its flag; optional for contacts with a wrench or such a force.
         contact_force_threshold: [N], force above which a contact that is not in `contact_active` is active.
         ft_wrenches: by fixed joint, the wrench of the parent side on the child side, in the joint's child frame.
-        rate_topic: topic whose stamps the log takes: `joint_states`, `contact_wrenches.l_sole`, ...
+        rate_topic: topic whose stamps the log takes: `contact_wrenches.l_sole`, ...; by default that of the joints.
     """
 
-    joint_states: Annotated[JointTopic, BeforeValidator(_topic)]
+    joint_states: Annotated[JointTopic, BeforeValidator(_topic)] | None = None
+    low_state: LowStateTopic | None = None
     imu: Annotated[ImuTopic, BeforeValidator(_topic)] | None = None
     odometry: Annotated[OdometryTopic, BeforeValidator(_topic)] | None = None
     contact_wrenches: _Wrenches = dataclasses.field(default_factory=dict)
@@ -117,12 +165,12 @@ class Topics:
     contact_active: _Contacts = dataclasses.field(default_factory=dict)
     contact_force_threshold: _Force | None = None
     ft_wrenches: _Wrenches = dataclasses.field(default_factory=dict)
-    rate_topic: str = "joint_states"
+    rate_topic: str | None = None
 
     @property
-    def by_role(self) -> dict[str, JointTopic | ImuTopic | OdometryTopic | WrenchTopic | ForceTopic | ContactTopic]:
+    def by_role(self) -> dict[str, AnyTopic]:
         """The topics by their role, such as `imu` or `ft_wrenches.l_ankle_ft`."""
-        single = {"joint_states": self.joint_states, "imu": self.imu, "odometry": self.odometry}
+        single = {name: getattr(self, name) for name in ("joint_states", "low_state", "imu", "odometry")}
         several = {
             f"{key}.{name}": topic
             for key in ("contact_wrenches", "contact_force_normal", "contact_active", "ft_wrenches")
@@ -131,26 +179,109 @@ class Topics:
         return {role: topic for role, topic in {**single, **several}.items() if topic is not None}
 
     @property
+    def clock(self) -> str:
+        """Role of the topic whose stamps the log takes."""
+        return self.rate_topic or ("joint_states" if self.low_state is None else "low_state")
+
+    @property
+    def feet(self) -> tuple[str | None, ...]:
+        """Contacts by number in `foot_force` of the low state."""
+        return () if self.low_state is None else self.low_state.feet_by_number
+
+    @property
     def contacts(self) -> tuple[str, ...]:
         """Names of all contacts."""
-        return tuple(dict.fromkeys((*self.contact_wrenches, *self.contact_force_normal, *self.contact_active)))
+        given = (*self.contact_wrenches, *self.contact_force_normal, *self.contact_active, *self.feet)
+        return tuple(dict.fromkeys(name for name in given if name is not None))
+
+    @property
+    def contacts_with_force(self) -> tuple[str, ...]:
+        """Names of the contacts that have a force along the ground's normal."""
+        counted = self.feet if self.low_state is not None and self.low_state.forces else ()
+        return tuple(name for name in (*self.contact_force_normal, *counted) if name is not None)
 
 
 def check_topics(topics: Topics) -> None:
     """Check that a map of topics is complete.
 
     Raises:
-        ConfigError: a contact without a flag, a threshold or `always`.
-        UnknownNameError: the rate topic is not one of the topics.
+        ConfigError: no joints or these twice, a contact without a flag, a threshold or `always`, a low state that
+            does not fit itself.
+        UnknownNameError: a robot that is not known by name; the rate topic is not one of the topics.
     """
+    if (topics.joint_states is None) == (topics.low_state is None):
+        found = "neither joint_states nor low_state" if topics.low_state is None else "joint_states and low_state"
+        accepted = "joint_states: the name of a topic, or low_state: a mapping with topic and robot"
+        raise ConfigError.at_field("logs.topics", found, f"one of the two, {accepted}")
+    if topics.low_state is not None:
+        _check_low_state(topics, topics.low_state)
     for name, contact in topics.contact_active.items():
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
             raise ConfigError.at_field(f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
-    unflagged = [name for name in topics.contacts if name not in topics.contact_active]
+    _check_flags(topics)
+    stamped = [role for role in topics.by_role if not role.startswith("contact_active.")]
+    if topics.clock not in stamped:
+        raise UnknownNameError.at_field("logs.topics.rate_topic", topics.clock, stamped)
+
+
+def _check_flags(topics: Topics) -> None:
+    """Refuse contacts of which nothing says when they touch."""
+    by_count = topics.feet if topics.low_state is not None and topics.low_state.above is not None else ()
+    unflagged = [name for name in topics.contacts if name not in topics.contact_active and name not in by_count]
+    counted = [name for name in unflagged if name in topics.feet]
+    if counted:
+        found = f"missing, though nothing else says when {counted[0]} touches"
+        raise ConfigError.at_field("logs.topics.low_state.above", found, "a reading [counts], or contact_active")
     if unflagged and topics.contact_force_threshold is None:
         found = f"missing, though nothing else says when {unflagged[0]} touches"
         raise ConfigError.at_field("logs.topics.contact_force_threshold", found, "a force [N], or contact_active")
-    stamped = [role for role in topics.by_role if not role.startswith("contact_active.")]
-    if topics.rate_topic not in stamped:
-        raise UnknownNameError.at_field("logs.topics.rate_topic", topics.rate_topic, stamped)
+
+
+def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:
+    """Refuse a low state that does not fit itself or the other topics."""
+    key = "logs.topics.low_state"
+    if (low_state.robot is None) == (low_state.joints is None):
+        found = "neither robot nor joints" if low_state.robot is None else "robot and joints together"
+        accepted = f"one of the two: robot ({', '.join(JOINT_ORDERS)}), or joints by number of the motor"
+        raise ConfigError.at_field(key, found, accepted)
+    if low_state.robot is not None and low_state.robot not in JOINT_ORDERS:
+        raise UnknownNameError.at_field(f"{key}.robot", low_state.robot, JOINT_ORDERS)
+    for name, given in (("joints", low_state.order), ("feet", low_state.feet or ())):
+        names = [one for one in given if one is not None]
+        again = [one for one in names if names.count(one) > 1]
+        if again or (given and not names):
+            found = f"'{excerpt(again[0])}' twice" if again else "no name"
+            raise ConfigError.at_field(f"{key}.{name}", found, "every name once, null for what is left out")
+    if low_state.feet is not None and not low_state.reads_feet:
+        accepted = "above, the reading from which on a foot touches, or forces: true"
+        raise ConfigError.at_field(f"{key}.feet", "given, though nothing reads them", accepted)
+    if low_state.reads_feet and not low_state.feet_by_number:
+        found = "missing, though the foot sensors are read"
+        raise ConfigError.at_field(f"{key}.feet", found, "contacts by number in foot_force, null for what is left out")
+    if topics.imu is not None and low_state.frame is not None:
+        raise ConfigError.at_field("logs.topics.imu", f"set beside {key}.frame", "one IMU, that of the base")
+    twice = [name for name in topics.contact_force_normal if low_state.forces and name in topics.feet]
+    if twice:
+        found = f"set, though {key}.forces is its force too"
+        raise ConfigError.at_field(f"logs.topics.contact_force_normal.{twice[0]}", found, "one of the two")
+
+
+def require_joints(topics: Topics | None, joints: Collection[str]) -> None:
+    """Make sure that the motors of a low state are joints of a robot.
+
+    Args:
+        topics: the map; None for logs without bags.
+        joints: of the URDF.
+
+    Raises:
+        InputError: one is not; the message names the robots that it could be.
+    """
+    if topics is None or topics.low_state is None:
+        return
+    low_state, key = topics.low_state, "logs.topics.low_state"
+    if low_state.robot is not None:
+        require_joints_of(f"{key}.robot", low_state.robot, joints)
+    for name in low_state.order:
+        if name is not None and name not in joints:
+            raise UnknownNameError.at_field(f"{key}.joints", name, joints)

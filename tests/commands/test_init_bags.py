@@ -1,0 +1,200 @@
+"""`torchid init` of bags: topics by type, name, frame and content, the robot of a LowState by the URDF's joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from bags import (
+    FLAG,
+    IMU,
+    JOINT_STATE,
+    NUMBERS,
+    WRENCH,
+    Entry,
+    entries_of,
+    imu,
+    joint_state,
+    wrench,
+    write_bag,
+    write_folder,
+)
+from dialects import with_velocity
+from low_states import FEET, GO2, START, low_states, moving, write_low_states
+from repository import DEMO
+from synthetic import G1, ROBOTS
+
+from torchid.cli import main
+from torchid.commands.init import Initiated, init
+from torchid.config import load_config
+from torchid.fitting.experiment import set_up
+from torchid.logs import Log, read_log
+from torchid.logs.joint_orders import HG, JOINT_ORDERS
+from torchid.robot import load_robot
+
+URDF = DEMO / "quadruped.urdf"
+GO2_URDF = ROBOTS / "go2_description/urdf/go2.urdf"
+COUNTS = np.random.default_rng(2).integers(10, 200, (40, 4))
+pytestmark = pytest.mark.filterwarnings("ignore::torchid.errors.TorchidWarning")  # of frames and of times of receipt
+
+
+def started(urdf: Path, bag: Path) -> tuple[Initiated, dict[str, Any], Log]:
+    """What was said, the topics of the new file, and the log that it reads."""
+    target = bag.with_suffix(".yaml")
+    target.unlink(missing_ok=True)
+    said = init(urdf, bag, target)
+    config = load_config(target)
+    set_up(config)
+    return said, yaml.safe_load(target.read_text())["logs"]["topics"], read_log(bag, config.logs.topics)
+
+
+def test_a_bag_of_every_type_is_read_as_it_was_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = with_velocity(read_log(DEMO / "sway_train.npz").select(slice(0, 120)))
+    path = write_bag(tmp_path / "x.mcap", entries_of(log))
+    said, topics, again = started(URDF, path)
+    assert said.missing == []
+    feet = sorted(log.contact_names)
+    assert topics == {
+        "joint_states": "/joint_states",
+        "imu": {"topic": "/imu", "frame": "trunk"},
+        "odometry": {"topic": "/odom", "twist": "none"},
+        "contact_wrenches": {foot: f"/wrench/{foot}" for foot in feet},
+        "contact_active": {foot: f"/touch/{foot}" for foot in feet},
+    }
+    assert "odometry: of 'base', taken to be the base link" in said.guessed
+    np.testing.assert_array_equal(again.joint_torque, log.joint_torque)
+    order = [again.contact_names.index(name) for name in log.contact_names]
+    np.testing.assert_array_equal(np.asarray(again.contact_active)[:, order], log.contact_active)
+    text = path.with_suffix(".yaml").read_text()
+    assert "  topics:  # what the messages of the bag hold: docs/logs.md\n    joint_states: /joint_states\n" in text
+    assert "    # guessed: of 'base', taken to be the base link\n    odometry: {" in text
+    (tmp_path / "x.yaml").unlink()
+    assert main(["init", str(URDF), str(path), "--output", str(tmp_path / "x.yaml")]) == 0
+    assert (
+        "found         topics of joint_states, imu, odometry, contact_wrenches, contact_act" in capsys.readouterr().out
+    )
+
+
+def test_a_go2s_state_needs_no_edit(tmp_path: Path) -> None:
+    log = moving(GO2)
+    said, topics, again = started(GO2_URDF, write_low_states(tmp_path / "x.db3", log, GO2, feet=COUNTS))
+    low_state = topics["low_state"]
+    assert low_state == {"topic": "/lowstate", "robot": "go2", "frame": "imu", "above": low_state["above"]}
+    assert 10 < low_state["above"] < 80
+    assert set(again.contact_names) == set(FEET)
+    np.testing.assert_array_equal(again.contact_active, low_state["above"] < COUNTS)
+    np.testing.assert_array_equal(again.joint_torque, log.joint_torque)
+    assert said.missing == []
+
+
+@pytest.mark.parametrize(("robot", "feet"), [("g1", 2), ("a1", 4)])
+def test_the_robot_of_a_state_is_that_whose_joints_the_urdf_has(tmp_path: Path, robot: str, feet: int) -> None:
+    order = JOINT_ORDERS[robot]
+    urdf = G1 if robot == "g1" else ROBOTS / "a1_description/urdf/a1.urdf"
+    path = write_low_states(tmp_path / "x.mcap", moving(order.names), order.joints, order.message)
+    said, topics, again = started(urdf, path)
+    frame = "imu_in_pelvis" if robot == "g1" else "imu_link"
+    assert topics == {"low_state": {"topic": "/lowstate", "robot": robot, "frame": frame}}
+    assert again.joint_names == order.names
+    config = load_config(tmp_path / "x.yaml")
+    assert len(config.contacts) == feet
+    assert config.preprocessing.detect_contacts
+    assert said.missing == ["contact_active: which foot touches when; detected from joint torques"]
+
+
+def test_a_state_of_another_robot_is_not_taken(tmp_path: Path) -> None:
+    order = JOINT_ORDERS["g1_23dof"]
+    path = write_low_states(tmp_path / "x.mcap", moving(order.names), order.joints, HG)
+    said = init(GO2_URDF, path, tmp_path / "x.yaml")
+    assert any(text.startswith("joint_position: no topics that look like it") for text in said.missing)
+    assert any("1 topic not needed: /lowstate (unitree_hg/msg/LowState)" in text for text in said.guessed)
+    assert "low_state" not in (tmp_path / "x.yaml").read_text()
+
+
+def test_a_state_at_a_low_rate_is_the_second_choice(tmp_path: Path) -> None:
+    entries = list(low_states(moving(GO2), GO2))
+    entries += [("/lf/lowstate", *entry[1:]) for entry in entries[::10]]
+    _, topics, again = started(GO2_URDF, write_bag(tmp_path / "x.mcap", entries))
+    assert topics["low_state"]["topic"] == "/lowstate"
+    assert len(again) == 40
+
+
+def test_folders_parts_and_bags_of_ros_1_are_looked_at_as_well(tmp_path: Path) -> None:
+    write_folder(tmp_path / "walk", ".mcap", low_states(moving(GO2), GO2))
+    said = init(GO2_URDF, tmp_path / "walk", tmp_path / "a.yaml")
+    assert "train: ['walk[:80%]']" in (tmp_path / "a.yaml").read_text()
+    assert any(text.startswith("40 samples") for text in said.found)
+    log = read_log(DEMO / "sway_train.npz").select(slice(0, 100))
+    path = write_bag(tmp_path / "z.bag", entries_of(log))
+    said = init(URDF, f"{path}[0:0.5]", tmp_path / "b.yaml")
+    assert "train: ['z.bag[0:0.5]']" in (tmp_path / "b.yaml").read_text()
+    assert any(text.startswith("50 samples over 0.49 s") for text in said.found)
+
+
+def legged(names: list[str], more: list[tuple[str, str, Any]], samples: int = 20) -> list[Entry]:
+    """Joint states with efforts and others' messages, all with the same stamps; content is of i and the stamp."""
+    rng, out = np.random.default_rng(1), list[Entry]()
+    for i in range(samples):
+        stamp = START + 5_000_000 * i
+        joints = {part: rng.standard_normal(len(names)) for part in ("position", "effort")}
+        out.append(("/joint_states", stamp, JOINT_STATE, joint_state(stamp, names, **joints)))
+        out += [(topic, stamp, kind, content(i, stamp)) for topic, kind, content in more]
+    return out
+
+
+def test_commands_other_joints_and_imus_of_limbs_are_left_out(tmp_path: Path) -> None:
+    joints = list(load_robot(G1).joint_names)
+    command = ("/joint_command", JOINT_STATE, lambda _, stamp: joint_state(stamp, joints, position=np.zeros(29)))
+    chest = ("/a_chest/imu", IMU, lambda _, stamp: imu(stamp, [9, 9, 9], [0, 0, 0], "imu_in_torso"))
+    pelvis = ("/imu", IMU, lambda i, stamp: imu(stamp, [0, i, 9.8], [0, 0, 1], "imu_in_pelvis"))
+    path = write_bag(tmp_path / "x.mcap", legged([*joints, "left_thumb"], [command, chest, pelvis]))
+    said, topics, again = started(G1, path)
+    assert topics["imu"] == {"topic": "/imu", "frame": "imu_in_pelvis"}
+    assert topics["joint_states"] == {"topic": "/joint_states", "joints": joints}
+    assert again.joint_names == tuple(joints)
+    assert any(
+        "2 topics not needed: /joint_command (sensor_msgs/msg/JointState), /a_chest/imu" in x for x in said.guessed
+    )
+
+
+def test_wrenches_go_to_feet_by_the_limbs_in_names_and_frames(tmp_path: Path) -> None:
+    joints = list(load_robot(G1).joint_names)
+    left = ("/ft/sensor_1", WRENCH, lambda i, stamp: wrench(stamp, [0, 0, 300 * (i % 2), 1, 0, 0], "left_foot_sensor"))
+    right = ("/ft/sensor_0", WRENCH, lambda i, stamp: wrench(stamp, [0, 0, 200.0, 2, 0, 0], "right_foot_sensor"))
+    said, topics, again = started(G1, write_bag(tmp_path / "x.mcap", legged(joints, [left, right])))
+    assert topics["contact_wrenches"] == {
+        "left_ankle_roll_link": "/ft/sensor_1",
+        "right_ankle_roll_link": "/ft/sensor_0",
+    }
+    assert 40 <= topics["contact_force_threshold"] <= 80
+    assert any("frames of messages are others, taken to be those of the contacts" in text for text in said.guessed)
+    wrenches = np.asarray(again.contact_wrench_local)
+    np.testing.assert_array_equal(wrenches[0, :, 3], [1, 2])
+    np.testing.assert_array_equal(np.asarray(again.contact_active)[:2], [[False, True], [True, True]])
+
+
+def test_an_array_of_feet_and_flags_of_some(tmp_path: Path) -> None:
+    joints = list(load_robot(GO2_URDF).joint_names)
+    array = ("/feet", NUMBERS, lambda i, _: {"data": np.array([10.0, 20.0, 30.0, 40.0]) * (i % 3)})
+    _, topics, again = started(GO2_URDF, write_bag(tmp_path / "x.mcap", legged(joints, [array])))
+    assert topics["contact_force_normal"] == {foot: {"topic": "/feet", "index": k} for k, foot in enumerate(FEET)}
+    np.testing.assert_array_equal(np.asarray(again.contact_force_normal)[1], [10, 20, 30, 40])
+    flag = ("/contact/fl", FLAG, lambda i, _: {"data": i > 5})
+    said, topics, again = started(GO2_URDF, write_bag(tmp_path / "y.mcap", legged(joints, [flag])))
+    assert topics["contact_active"] == {"FL_foot": "/contact/fl", "FR_foot": True, "RL_foot": True, "RR_foot": True}
+    assert "contact_active: FR_foot, RL_foot, RR_foot touching throughout, as no topic says otherwise" in said.guessed
+    assert np.asarray(again.contact_active).sum() == 14 + 60
+
+
+def test_a_bag_without_anything_is_answered_by_what_is_missing(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "x.mcap", [("/chatter", 1, "std_msgs/msg/String", {"data": "hello"})])
+    said = init(URDF, path, tmp_path / "x.yaml")
+    assert "time: no topics that look like it, of all 12 joints" in said.missing
+    topics = load_config(tmp_path / "x.yaml").logs.topics
+    assert topics is not None
+    assert topics.by_role.keys() == {"joint_states", *(f"contact_active.{x}" for x in topics.contacts)}
+    assert any("joint_states: nothing, as no topic has the robot's joints" in text for text in said.guessed)
+    assert any("1 topic not needed: /chatter (std_msgs/msg/String)" in text for text in said.guessed)

@@ -1,0 +1,57 @@
+"""Names of recordings against those of a robot: spellings, limbs, and what is not to be confused."""
+
+from __future__ import annotations
+
+import pytest
+
+from torchid.logs.column_proposals import propose_field
+from torchid.logs.name_matching import limbs, match_names, spelled
+
+FEET = ("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")
+
+
+@pytest.mark.parametrize(
+    ("names", "texts", "expected"),
+    [
+        (FEET, ["/contact/lf_foot", "/contact/rh_foot"], ["LF_FOOT", "RH_FOOT"]),
+        (FEET, ["front_left", "hind_right"], ["LF_FOOT", "RH_FOOT"]),
+        (("l_sole", "r_sole"), ["/right/wrench", "/left/wrench"], ["r_sole", "l_sole"]),
+        (("l_sole", "r_sole"), ["left_foot_sensor /ft/1", "right_foot_sensor /ft/0"], ["l_sole", "r_sole"]),
+        (("left_sole_link", "right_sole_link"), ["LeftFootF", "RightFootF"], ["left_sole_link", "right_sole_link"]),
+        (("l_sole", "r_sole"), ["left_heel", "left_toe"], []),
+        (("l_sole", "r_sole"), ["/battery", "/temperature"], []),
+        (("FL_foot", "FR_foot"), ["left", "right"], []),
+    ],
+)  # fmt: skip
+def test_texts_mean_the_name_they_contain_or_that_of_the_same_limb_alone(
+    names: tuple[str, ...], texts: list[str], expected: list[str]
+) -> None:
+    assert match_names(texts, names, "contact") == dict(zip(texts, expected, strict=False))
+
+
+def test_limbs_are_words_and_letters_of_their_own() -> None:
+    assert limbs("LH_FOOT") == limbs("left_hind") == limbs("RearLeftLeg") == {"l", "b"}
+    assert limbs("l_sole") == limbs("LeftFoot") == {"l"}
+    assert limbs("lower_roll_link") == limbs("frame") == set()
+
+
+@pytest.mark.parametrize(
+    ("stem", "column", "found"),
+    [
+        ("left_hip_pitch", "LeftHipPitch.Position", True),
+        ("left_hip_pitch", "q_left-hip-pitch", True),
+        ("LF_HAA", "q_lf_haa", True),
+        ("LHipYaw", "l_hip_yaw_vel", True),
+        ("hip", "q_ship", False),
+        ("joint1", "joint_12", False),
+        ("hip", "hips", False),
+    ],
+)
+def test_a_spelling_is_found_whole(stem: str, column: str, found: bool) -> None:
+    assert bool(spelled(stem).search(column)) == found
+
+
+def test_fields_that_differ_in_what_they_are_of_are_not_alike() -> None:
+    assert propose_field("imu/linear_acceleration") == "imu_specific_force"
+    assert propose_field("imu_angular_velocty") == "imu_angular_velocity"
+    assert propose_field("joint_torqe") == "joint_torque"

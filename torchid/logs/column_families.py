@@ -1,0 +1,143 @@
+"""Columns that differ in the name of a joint or contact, in a number or in an axis alone."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from torchid.logs.column_map import PLACEHOLDER
+from torchid.logs.name_matching import SUFFIXES, KnownRobot, spelled, within
+
+_NUMBER = re.compile(r"\d+")
+_AXIS = re.compile(
+    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-z])([wxyz])$",
+)
+
+
+@dataclass(frozen=True)
+class Family:
+    """Columns of one pattern.
+
+    Attributes:
+        pattern: with placeholders, as in a map.
+        columns: in their order.
+        names: of joints or contacts, as the file has them.
+        numbers: in the names; none where there are none.
+        axes: likewise.
+        by_name: by name of the URDF, its column, where the file spells names in another way; a pattern does not do.
+    """
+
+    pattern: str
+    columns: list[str]
+    names: tuple[str, ...]
+    numbers: tuple[int, ...]
+    axes: tuple[str, ...]
+    by_name: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def words(self) -> str:
+        """All that is neither a name nor a number nor an axis."""
+        return PLACEHOLDER.sub(" ", self.pattern)
+
+    @property
+    def entry(self) -> dict[str, object]:
+        """Where the columns are, as a map says it."""
+        return {"columns": dict(self.by_name)} if self.by_name else {"column": self.pattern}
+
+
+@dataclass(frozen=True)
+class _Stems:
+    """What the file calls joints or contacts, with their names in the URDF.
+
+    Attributes:
+        kind: joint or contact.
+        names: by what is in the file.
+        suffix: that the URDF's names have more.
+        find: the place of a name in a column.
+        exact: whether the file spells names as the URDF does.
+    """
+
+    kind: str
+    names: Mapping[str, str] = field(default_factory=dict)
+    suffix: str = ""
+    find: Callable[[str], re.Pattern[str]] = within
+    exact: bool = True
+
+
+def find_families(columns: Sequence[str], robot: KnownRobot) -> tuple[list[Family], dict[str, str]]:
+    """Columns by pattern, in their order; and what the file's names are in the URDF, by kind, where that is more.
+
+    Args:
+        columns: of a file.
+        robot: whose joints and contacts they may name.
+    """
+    joints = _stems("joint", columns, robot.joints, _Stems("joint"))
+    kinds = (joints, _stems("contact", columns, robot.feet, joints))
+    with_axes = [_pattern(column, kinds) for column in columns]
+    axes = defaultdict[str, set[str]](set)
+    for pattern, _, _, axis in with_axes:
+        axes[pattern].add(axis)
+    found = defaultdict[str, list[tuple[str, str, str, str]]](list)
+    for column, split in zip(columns, with_axes, strict=True):
+        alone = len(axes[split[0]]) == 1  # the y of velocity, the z of the one component that was recorded
+        pattern, name, number, axis = _pattern(column, kinds, False) if alone else split
+        found[pattern].append((column, name, number, axis))
+    out = []
+    for pattern, members in found.items():
+        out += _families(pattern, members, kinds)
+    more = {one.kind: f"{{{one.kind}}}{one.suffix}" for one in kinds if one.names and one.exact and one.suffix}
+    return out, more
+
+
+def _families(pattern: str, members: Sequence[tuple[str, str, str, str]], kinds: Sequence[_Stems]) -> list[Family]:
+    """The family of a pattern; or each column for itself where some are missing."""
+    texts, names, numbers, axes = ([x for x in dict.fromkeys(of)] for of in zip(*members, strict=True))
+    if "{index}" in pattern and (widths := {len(x) for x in numbers}) == {2} and numbers[0].startswith("0"):
+        pattern = pattern.replace("{index}", f"{{index:0{widths.pop()}}}")
+    whole = len(members) == max(len(names), 1) * max(len(numbers), 1) * max(len(axes), 1)
+    kind = next((one for one in kinds if f"{{{one.kind}}}" in pattern), None)
+    other = kind is not None and not kind.exact
+    if not whole or (len(members) == 1 and PLACEHOLDER.search(pattern)) or (other and any(axes)):
+        return [Family(column, [column], ("",), (), ("",)) for column in texts]
+    by_name = {kind.names[name]: column for column, name, *_ in members} if kind is not None and other else {}
+    return [Family(pattern, texts, tuple(names), tuple(int(x) for x in numbers if x), tuple(axes), by_name)]
+
+
+def _stems(kind: str, columns: Sequence[str], names: Sequence[str], others: _Stems) -> _Stems:
+    """What the file calls joints or contacts, where no longer one of others fits; spelled in another way if need be."""
+    best = _Stems(kind)
+    longest = {
+        column: max((len(x) for x in others.names if others.find(x).search(column)), default=0) for column in columns
+    }
+    for exact, find in ((True, within), (False, spelled)):
+        for suffix in SUFFIXES[kind]:
+            if not names or (exact and not all(name.endswith(suffix) and len(name) > len(suffix) for name in names)):
+                continue
+            stems = {name.removesuffix(suffix) or name: name for name in names}
+            seen = {}
+            for stem, name in stems.items():
+                regex = find(stem)
+                if any(n < len(stem) and regex.search(x) for x, n in longest.items()):
+                    seen[stem] = name
+            if len(seen) > len(best.names):
+                best = _Stems(kind, seen, suffix, find, exact)
+        if len(best.names) == len(names):
+            break
+    return best
+
+
+def _pattern(column: str, kinds: Sequence[_Stems], split_axes: bool = True) -> tuple[str, str, str, str]:
+    """A column with placeholders, and the name, number and axis in their places."""
+    number = axis = ""
+    fitting = [(name, one) for one in kinds for name in one.names if one.find(name).search(column)]
+    name, of = max(fitting, key=lambda pair: len(pair[0]), default=("", _Stems("")))
+    if name:
+        column = of.find(name).sub(f"{{{of.kind}}}", column, count=1)
+    if not name and (found := _NUMBER.search(column)):
+        column, number = f"{column[: found.start()]}{{index}}{column[found.end() :]}", found[0]
+    if split_axes and (found := _AXIS.search(column)):
+        axis = found[0]
+        column = f"{column[: found.start()]}{{{'axis' if axis.islower() else 'AXIS'}}}{column[found.end() :]}"
+    return column, name, number, axis

@@ -1,0 +1,92 @@
+"""Match names of recordings to those of a robot: by what both contain, else by the limbs that both mean."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+SUFFIXES = {"joint": ("", "_joint"), "contact": ("", "_foot", "_sole", "_contact", "_link", "_ankle_roll_link")}
+"""What names of a URDF may have more than those of a recording."""
+
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_LIMBS = {
+    "left": "l", "right": "r", "front": "f", "fore": "f", "rear": "b", "hind": "b", "back": "b", "l": "l", "r": "r",
+    "fl": "fl", "lf": "fl", "fr": "fr", "rf": "fr", "rl": "bl", "hl": "bl", "lh": "bl", "bl": "bl", "lb": "bl",
+    "rr": "br", "hr": "br", "rh": "br", "br": "br", "rb": "br",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class KnownRobot:
+    """What the proposal of a map knows of a robot.
+
+    Attributes:
+        joints: of the robot.
+        feet: frames of its contacts.
+        name: what it may be called.
+        weight: [N].
+        base_link: its base.
+        on_base: links of its base.
+        elsewhere: all others.
+    """
+
+    joints: Sequence[str]
+    feet: Sequence[str]
+    name: str
+    weight: float
+    base_link: str
+    on_base: Sequence[str]
+    elsewhere: Sequence[str]
+
+
+def within(stem: str) -> re.Pattern[str]:
+    """A name as a part of another, between letters and numbers that are none of it."""
+    return re.compile(rf"(?<![A-Za-z0-9]){re.escape(stem)}(?![A-Za-z0-9])")
+
+
+def spelled(stem: str) -> re.Pattern[str]:
+    """A name as a part of another, whatever its capitals and separators: left_hip_pitch in `LeftHipPitch.Position`."""
+    words = [re.escape(word) for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", stem)] or [re.escape(stem)]
+    return re.compile(rf"(?<![A-Za-z0-9])(?i:{'[ _./-]?'.join(words)})(?![a-z0-9])")
+
+
+def limbs(text: str) -> frozenset[str]:
+    """Left or right (l, r) and front or back (f, b), as far as a name says it, in words or letters."""
+    return frozenset("".join(_LIMBS.get(word.lower(), "") for word in _WORD.findall(text)))
+
+
+def match_names(texts: Sequence[str], names: Sequence[str], kind: str) -> dict[str, str]:
+    """Names of a robot by texts that mean one each: they contain it, or all name the same limb.
+
+    Args:
+        texts: of a recording.
+        names: of the robot.
+        kind: of the names: joint, contact.
+    """
+    best: dict[str, str] = {}
+    for suffix in SUFFIXES[kind]:
+        stems = {name.removesuffix(suffix).lower(): name for name in names if name.endswith(suffix)}
+        found: dict[str, str] = {}
+        for text in texts:
+            fitting = [stem for stem in stems if stem and within(stem).search(text.lower())]
+            if fitting and stems[longest := max(fitting, key=len)] not in found.values():
+                found[text] = stems[longest]
+        if len(found) > len(best):
+            best = found
+    if len(best) == min(len(texts), len(names)):
+        return best
+    by_limbs = _by_limbs(texts, names)
+    return by_limbs if len(by_limbs) > len(best) else best
+
+
+def _by_limbs(texts: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Texts and names that alone mean the same limb."""
+    of_names, of_texts = {name: limbs(name) for name in names}, {text: limbs(text) for text in texts}
+    out = {}
+    for text, limb in of_texts.items():
+        fitting = [name for name, other in of_names.items() if other and other == limb]
+        again = [other for other, same in of_texts.items() if same == limb]
+        if len(fitting) == 1 and len(again) == 1:
+            out[text] = fitting[0]
+    return out
