@@ -17,6 +17,7 @@ from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,
+    GROUPS_ACCEPTED,
     SCOPES_ACCEPTED,
     STRICT,
     WRENCHES_ACCEPTED,
@@ -118,7 +119,8 @@ _EXPERIMENT = FileKind(
         **{f"{where}.contact_wrenches": WRENCHES_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         **{f"{where}.contact_wrenches.*": COMPONENTS_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         "sensors.offsets": SCOPES_ACCEPTED,
-        "sensors.scales": SCOPES_ACCEPTED,
+        "sensors.scales": f"{SCOPES_ACCEPTED}, or a list of groups",
+        "sensors.scales.*": GROUPS_ACCEPTED,
         "analysis.compare.*": CHOICE_ACCEPTED,
         "estimator.robust": ROBUST_ACCEPTED,
         **MAPS_ACCEPTED,

@@ -21,12 +21,12 @@ from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
+from torchid.fitting.terms import check_scale_groups, check_terms
 from torchid.logs.column_map import require_names
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
-from torchid.problem.extras import CHANNELS, measured_channels
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
@@ -61,7 +61,8 @@ class Scene:
     def terms(self) -> ExtraTerms:
         """Extra parameters of sensors and actuators."""
         sensors = self.config.sensors
-        offsets, scales = ({str(channel): x for channel, x in s.items()} for s in (sensors.offsets, sensors.scales))
+        offsets = {str(channel): scope for channel, scope in sensors.offsets.items()}
+        scales = {str(channel): scope for channel, scope in sensors.scales.items()}
         return ExtraTerms(offsets, scales, **vars(self.config.actuators))
 
     @property
@@ -211,7 +212,9 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
-    return Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
+    scene = Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
+    check_scale_groups(scene.terms, robot, contacts)
+    return scene
 
 
 def set_up(config: ExperimentConfig) -> Experiment:
@@ -225,7 +228,7 @@ def set_up(config: ExperimentConfig) -> Experiment:
     sensors = scene.sensors_of(config.sensors)
     config = replace(config, contacts=scene.config.contacts)
     experiment = Experiment(**vars(scene) | {"config": config}, sensors=sensors)
-    _check_terms(experiment)
+    check_terms(experiment.terms, config.actuators, scene.robot, scene.contacts, sensors)
     return experiment
 
 
@@ -241,21 +244,6 @@ def _ft_field(config: ExperimentConfig | AnalyzeConfig, name: str) -> str:
     choices = {"sensors": config.sensors} | {f"analysis.compare.{key}": x for key, x in config.analysis.compare.items()}
     named = (f"{key}.ft_sensors" for key, choice in choices.items() if name in choice.ft_sensors)
     return next(named, "analysis.candidates.ft_sensors")
-
-
-def _check_terms(experiment: Experiment) -> None:
-    """Refuse extra parameters of channels that nothing measures; all kinds of channels mean those that are measured."""
-    terms = experiment.terms
-    measured = measured_channels(experiment.robot, experiment.contacts, experiment.sensors)
-    for field, scopes in (("offsets", terms.offsets), ("scales", terms.scales)):
-        for channel in scopes:
-            if channel not in measured and len(scopes) < len(CHANNELS):
-                accepted = f"{', '.join(measured)}, or log or all for every kind that is measured"
-                raise ConfigError.at_field(f"sensors.{field}.{channel}", "no such sensor is measured", accepted)
-    for name, value in vars(experiment.config.actuators).items():
-        if value and "joint_torque" not in measured:
-            accepted = "joint torques among the sensors, or no such key"
-            raise ConfigError.at_field(f"actuators.{name}", "set, but no joint torque is measured", accepted)
 
 
 def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:

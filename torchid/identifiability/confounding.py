@@ -137,15 +137,17 @@ def disagreements(
     """
     out = []
     for source in dict.fromkeys(part.source for part in parts if part.unloaded):
-        estimates = {(x.extra.what, x.extra.contact): x for x in in_contact if x.log in ("", source)}
+        estimates = {(x.extra.what, at): x for x in in_contact if x.log in ("", source) for at in x.extra.contacts}
         R = merge_factors(
             (part.factor for part in parts if part.unloaded and part.source == source), builder
         ).triangle()
         for number, extra in enumerate(builder.extras, start=builder.columns.count):
-            column, offset = R[:, number].numpy(), estimates.get((extra.what, extra.contact))
-            if extra.what == "offset" and extra.contact is not None and offset is not None and column.any():
+            column, at = R[:, number].numpy(), extra.contact
+            if extra.what != "offset" or at is None or not column.any():
+                continue
+            if (offset := estimates.get(("offset", at))) is not None:
                 weight = float(column @ column)
-                read, scale = float(column @ R[:, -1].numpy()) / weight, estimates.get(("scale", extra.contact))
+                read, scale = float(column @ R[:, -1].numpy()) / weight, estimates.get(("scale", at))
                 expected, variance = offset.value, offset.standard_error**2 + noise**2 / weight
                 if scale is not None:
                     expected, variance = expected / (1.0 + scale.value), variance + (read * scale.standard_error) ** 2
