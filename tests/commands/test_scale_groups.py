@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from currents import HIP_SCALE, HIPS, KNEES, quadruped_files
+from currents import HIP_SCALE, HIPS, KNEES, NOISE, quadruped_files
 
 from torchid.cli import main
 
 EXACT = 1e-7
-NOISE = "{joint_torque: 0.1, base_force: 1.0, base_moment: 1.0}"
-GROUPED = {"set": "joints", "noise": {"joint_torque": 0.1}, "scales": {"joint_torque": [HIPS]}}
+GROUPED = {"set": "joints", "noise": NOISE, "scales": {"joint_torque": [HIPS]}}
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +28,7 @@ def document(run: Path, name: str) -> dict[str, Any]:
 
 def compressed(file: Path, folder: Path) -> list[str]:
     """Factors of the logs that train."""
-    assert main(["compress", str(file), "--output", str(folder / "factors"), f"sensors.noise={NOISE}"]) == 0
+    assert main(["compress", str(file), "--output", str(folder / "factors")]) == 0
     return sorted(map(str, (folder / "factors").rglob("*.factor")))
 
 
@@ -58,7 +57,7 @@ def test_factors_the_cache_and_large_logs_have_it_as_well(file: Path, tmp_path: 
     assert main(["identify", str(file), f"output={tmp_path / 'blocks'}", "preprocessing.memory_gb=0.0001"]) == 0
     files = compressed(file, tmp_path)
     assert len(files) == 2
-    more = f"logs.train={json.dumps(files)}", f"sensors.noise={NOISE}"
+    more = (f"logs.train={json.dumps(files)}",)
     assert main(["identify", str(file), f"output={tmp_path / 'factored'}", *more]) == 0
     for name in ("again", "blocks", "factored"):
         (scale,) = document(tmp_path / name, "parameters")["extras"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,19 @@ FEET = [f"{end}_{side}_foot" for end in ("front", "rear") for side in ("left", "
 HIPS, KNEES = ["*_hip", "*_thigh"], ["*_knee"]
 HIP_SCALE, KNEE_SCALE = 0.9, 1.15
 """Force per reading."""
-STATES = [[True] * 4, [True, False, False, True], [False, True, True, True]]
+NOISE = {"joint_torque": 0.1, "base_force": 1.0, "base_moment": 0.1}
+"""Stated, as residuals of exact logs say nothing of it."""
+STATES = [[True] * 4, [True, False, False, True], [False, True, True, True], [True, True, True, False]]
+"""Each foot swings in some: what is at a foot that always stands moves nothing that torques alone could tell."""
 
 
 def quadruped_files(
-    folder: Path, scales: Mapping[str, float], samples: int = 400, **settings: Any
+    folder: Path,
+    scales: Mapping[str, float],
+    samples: int = 240,
+    states: Sequence[Sequence[bool]] = STATES,
+    noise: float = 0.0,
+    **settings: Any,
 ) -> tuple[Path, float]:
     """An experiment file beside exact logs of a robot that is off its URDF, read with scales by pattern; its mass."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -36,7 +44,7 @@ def quadruped_files(
     for pattern, x in scales.items():
         scale[[fits(name, pattern) for name in robot.joint_names]] = x
     for name in ("a", "b", "new"):
-        log = make_log(oracle, [(foot, 3) for foot in FEET], STATES, samples, rng, f"{name}.npz")
+        log = make_log(oracle, [(foot, 3) for foot in FEET], states, samples, rng, f"{name}.npz")
         write_log(
             replace(log, joint_torque=value(log.joint_torque) / scale, contact_wrench_local=None),
             folder / f"{name}.npz",
@@ -45,7 +53,7 @@ def quadruped_files(
         "robot": {"urdf": str(DEMO / "quadruped.urdf")},
         "contacts": [{"frame": foot, "type": "point", "radius": 0.0} for foot in FEET],
         "logs": {"train": ["a.npz", "b.npz"], "test": ["new.npz"]},
-        "sensors": {"set": "joints", "noise": {"joint_torque": 0.1}},
+        "sensors": {"set": "joints", "noise": NOISE},
         "output": str(folder / "run"),
     } | settings  # fmt: skip
     (folder / "quadruped.yaml").write_text(yaml.safe_dump(experiment))

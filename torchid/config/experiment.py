@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass
 
 from torchid.config.analysis import AnalysisConfig
-from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, validate_keys
+from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, validate_keys
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
@@ -123,6 +123,7 @@ _EXPERIMENT = FileKind(
         "sensors.scales.*": GROUPS_ACCEPTED,
         "analysis.compare.*": CHOICE_ACCEPTED,
         "estimator.robust": ROBUST_ACCEPTED,
+        **dict.fromkeys(("estimator.total_mass", "estimator.masses.*"), MASS_ACCEPTED),
         **MAPS_ACCEPTED,
     },
 )

@@ -19,6 +19,7 @@ from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.contacts import read_along_normals, resolve_contacts, suited_to_preprocessing
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
+from torchid.fitting.known_masses import known_masses
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
 from torchid.fitting.terms import check_scale_groups, check_terms
@@ -125,6 +126,7 @@ class Scene:
             estimator=batch_estimator(settings, conditions),
             friction=settings.friction,
             frozen=self.frozen(),
+            masses=known_masses(settings, self.robot),
         )
 
     def calibrations(self, fit: Fit, builder: RowBuilder) -> Comparison[Calibration]:
@@ -289,7 +291,7 @@ def conditions_from(settings: EstimatorConfig, robot: Robot) -> Conditions:
     lower, upper = _bounds(settings, robot)
     return Conditions(
         margin=settings.margin,
-        total_mass=settings.total_mass,
+        total_mass=None if settings.total_mass is None or settings.total_mass.std else settings.total_mass.value,
         enclosures=_enclosures(settings, robot),
         mirrors=_mirrors(settings, robot),
         lower=lower,
@@ -337,10 +339,14 @@ def _mirrors(settings: EstimatorConfig, robot: Robot) -> tuple[Mirror, ...]:
 
 def _bounds(settings: EstimatorConfig, robot: Robot) -> tuple[Array | None, Array | None]:
     """Lower and upper bounds, (L, 12), None if the file has none."""
-    if not settings.bounds:
+    exact = {name: mass.value for name, mass in settings.masses.items() if not mass.std and name in robot.body_names}
+    if not (settings.bounds or exact):
         return None, None
     lower, upper = np.full(robot.nominal.shape, -np.inf), np.full(robot.nominal.shape, np.inf)
-    for name, intervals in settings.bounds.items():
+    for name, mass in exact.items():
+        lower[robot.body_names.index(name), parameters.MASS] = mass
+        upper[robot.body_names.index(name), parameters.MASS] = mass
+    for name, intervals in (settings.bounds or {}).items():
         if name not in robot.body_names:
             raise UnknownNameError.at_field("estimator.bounds", name, robot.body_names)
         body = robot.body_names.index(name)
