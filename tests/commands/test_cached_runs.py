@@ -112,6 +112,7 @@ CHANGED = {
     "cutoff_hz": 7.0,
     "sample_rate_hz": 111.0,
     "contact_margin_s": 0.02,
+    "max_slip": 0.5,
     "detect_contacts": True,
     "base_motion": "contacts",
     "exclude_condemned": True,

@@ -23,7 +23,7 @@ ALL: dict[str, Any] = {
         {"frame": "r_sole", "type": "line", "line_axis": "x", "radius": 0.3, "normal": [0.0, 0.1, 1.0]},
     ],
     "logs": {"train": ["a.npz", "/logs/b.h5"], "test": ["../c.csv"]},
-    "preprocessing": {"cutoff_hz": 20, "sample_rate_hz": 200.0, "contact_margin_s": 0.05},
+    "preprocessing": {"cutoff_hz": 20, "sample_rate_hz": 200.0, "contact_margin_s": 0.05, "max_slip": "auto"},
     "sensors": {
         "joint_torques": ["hip", "knee"],
         "contact_wrenches": {"l_sole": ["fx", "mz"], "r_sole": []},
