@@ -130,7 +130,8 @@ def _velocities(builder: RowBuilder, samples: Samples, base: Tensor | None) -> F
     tree, out = builder.tree, np.empty((len(samples), len(builder.contacts), 3))
     for start in range(0, len(samples), _TOGETHER):
         part = samples[start : start + _TOGETHER]
-        kinematics, v = builder.kinematics(part), part.joint_velocity
+        kinematics = builder.kinematics(part)
+        v = torch.nn.functional.pad(part.joint_velocity, (0, tree.n_dofs - tree.n))  # sensors in limbs do not move
         if tree.base_rows:
             linear = torch.zeros_like(v[:, :1].expand(-1, 3)) if base is None else base[start : start + _TOGETHER]
             angular = part.base.angular_velocity
