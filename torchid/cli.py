@@ -312,6 +312,9 @@ def _analyze(options: argparse.Namespace) -> None:
         _print_scenario(scenario)
     if analysis.accuracies:
         print_tables(accuracy_table(analysis.accuracies))
+        for name, found in analysis.accuracies.items():
+            for message in found.confounded:
+                print(fill(f"confounded    {name}: {message}", 100, subsequent_indent=" " * 14))
     print(f"written to    {analysis.output}")
 
 

@@ -280,8 +280,8 @@ def test_an_axis_of_less_than_a_decade_has_plain_numbers() -> None:
 def test_a_key_of_another_estimator_is_refused_without_logs_too(
     experiment: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = asked(experiment, estimator={"name": "least_squares", "total_mass": 12.0})
-    assert "estimator.total_mass" in refusal(["analyze", str(file)], experiment, capsys)
+    file = asked(experiment, estimator={"name": "least_squares", "com_inside": "box"})
+    assert "estimator.com_inside" in refusal(["analyze", str(file)], experiment, capsys)
 
 
 def test_a_bolted_robot_cannot_lose_its_base_and_is_told_so(

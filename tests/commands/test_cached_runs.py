@@ -112,6 +112,7 @@ CHANGED = {
     "cutoff_hz": 7.0,
     "sample_rate_hz": 111.0,
     "contact_margin_s": 0.02,
+    "max_slip": 0.5,
     "detect_contacts": True,
     "base_motion": "contacts",
     "exclude_condemned": True,
@@ -212,6 +213,10 @@ def test_noise_sensors_extras_and_folds_change_the_name_of_factors(demo: Path, t
     others = [f"sensors.noise.{name}={json.dumps(x)}" for name, x in values.items()]
     others += [f"actuators.{name}={json.dumps(x)}" for name, x in terms.items()]
     others += ["sensors.set=full", "sensors.offsets={joint_torque: log}", "sensors.scales={joint_torque: all}"]
+    others += [
+        'sensors.scales={joint_torque: [["*_hip", "*_knee"]]}',
+        'sensors.scales={joint_torque: ["*_hip", "*_knee"]}',
+    ]
     found = {key(other) for other in others}
     assert same not in found
     assert len(found) == len(others)

@@ -182,6 +182,32 @@ FILES: dict[str, tuple[Edit, tuple[str, ...]]] = {
         edit_config(sensors={"set": "contacts", "scales": {"joint_torque": "all"}}),
         ("sensors.scales.joint_torque: no such sensor is measured; accepted: contact_force, or",),
     ),
+    "a joint in two groups of one scale": (
+        edit_config(sensors={"set": "joints", "scales": {"joint_torque": ["*_hip", ["*_knee", "front_*_hip"]]}}),
+        ("sensors.scales.joint_torque: 'front_left_hip' in two groups, [*_hip] and [*_knee, front_*_hip]; accepted:",),
+    ),
+    "a group of a scale that no joint is in": (
+        edit_config(sensors={"set": "joints", "scales": {"joint_torque": ["*_hp"]}}),
+        ("sensors.scales.joint_torque: unknown name '*_hp'; accepted: ",),
+    ),
+    "a group of a scale without a measured joint": (
+        edit_config(
+            sensors={"joint_torques": ["front_left_hip", "front_left_knee"], "scales": {"joint_torque": ["*_thigh"]}}
+        ),
+        ("joint_torque: '*_thigh', whose joint_torque is not measured; accepted: front_left_hip, front_left_knee",),
+    ),
+    "groups of a scale without lists": (
+        edit_config(sensors={"set": "joints", "scales": {"joint_torque": {"hips": "*_hip"}}}),
+        ("sensors.scales.joint_torque: found {'hips': '*_hip'}; accepted: log, all, or a list of groups of joints",),
+    ),
+    "an empty group of a scale": (
+        edit_config(sensors={"set": "joints", "scales": {"joint_torque": [[]]}}),
+        ("sensors.scales.joint_torque: found [[]]; accepted: log, all, or a list of groups",),
+    ),
+    "groups of sensors that are not there": (
+        edit_config(sensors={"set": "joints", "scales": {"contact_force": ["*_foot"]}}),
+        ("sensors.scales.contact_force: no such sensor is measured; accepted: joint_torque, or",),
+    ),
     "actuators without joint torques": (
         edit_config(sensors="contacts", actuators={"sign_width": 0.1}),
         ("actuators.sign_width: set, but no joint torque is measured",),

@@ -23,7 +23,7 @@ ALL: dict[str, Any] = {
         {"frame": "r_sole", "type": "line", "line_axis": "x", "radius": 0.3, "normal": [0.0, 0.1, 1.0]},
     ],
     "logs": {"train": ["a.npz", "/logs/b.h5"], "test": ["../c.csv"]},
-    "preprocessing": {"cutoff_hz": 20, "sample_rate_hz": 200.0, "contact_margin_s": 0.05},
+    "preprocessing": {"cutoff_hz": 20, "sample_rate_hz": 200.0, "contact_margin_s": 0.05, "max_slip": "auto"},
     "sensors": {
         "joint_torques": ["hip", "knee"],
         "contact_wrenches": {"l_sole": ["fx", "mz"], "r_sole": []},
@@ -35,7 +35,7 @@ ALL: dict[str, Any] = {
             **{"angular_velocity": 0.01, "specific_force": 0.05},
         },
         "offsets": {"joint_torque": "all", "contact_force": "log"},
-        "scales": {"ft_force": "log"},
+        "scales": {"ft_force": "log", "joint_torque": [["hip", "*_hip"], ["knee"]]},
         "on_base_lost": "warn",
     },
     "actuators": {"armature": True, "torque_offset": False, "asymmetric_coulomb": True, "sign_width": 0.01},
@@ -174,6 +174,7 @@ def test_a_mapping_given_empty_clears_that_of_the_file_and_any_other_adds_to_it(
     assert sensors.offsets == {}
     assert {str(channel): extent for channel, extent in sensors.scales.items()} == {
         "ft_force": "log",
+        "joint_torque": [["hip", "*_hip"], ["knee"]],
         "contact_force": "all",
     }
     assert sensors.contact_wrenches == {"l_sole": ["fx", "mz"], "r_sole": []}

@@ -23,7 +23,7 @@ from torchid.report.tables import extra_table
 
 def found(what: str, joint: str, log: str, unit: str = "N m") -> ExtraEstimate:
     """An unknown of one log, or of all if it has no name."""
-    return ExtraEstimate(Extra(what, joint, "", unit, 1.0, bool(log), 0), log, 1.5, 1.4, 0.1, 1.0, ())
+    return ExtraEstimate(Extra(what, joint, "", unit, 1.0, bool(log), (0,)), log, 1.5, 1.4, 0.1, 1.0, ())
 
 
 def of_logs(count: int, joints: int = 1) -> list[ExtraEstimate]:
@@ -78,7 +78,7 @@ def test_a_value_has_as_many_decimals_as_its_error_and_that_two_digits(
 def test_a_warning_of_what_cannot_be_told_apart_lists_sensors_and_parameters_by_their_commas() -> None:
     mixed = ("trunk m", "trunk Izz", "thigh mcy", "scale of hip0")
     joints = [replace(found("scale", f"hip{j}", ""), inflation=1e9, confounded_with=mixed) for j in range(8)]
-    foot = Extra("offset", "sole", "fz", "N", 1.0, False, contact=(0, 2))
+    foot = Extra("offset", "sole", "fz", "N", 1.0, False, contacts=((0, 2),))
     off = ExtraEstimate(foot, "", 1.5, 1.4, 0.1, 1e9, mixed)
     with pytest.warns(ConfoundedWarning) as caught, about_file("a.yaml"):
         warn_of_confounded([*joints, off])

@@ -10,7 +10,14 @@ import numpy as np
 from torchid import parameters
 from torchid.commands.check import stretches_to_check
 from torchid.commands.reading import with_flags
-from torchid.errors import ImplausibleFitError, InputError, NumericalWarning, SensorError, warn_about_file
+from torchid.errors import (
+    ImplausibleFitError,
+    InputError,
+    NumericalWarning,
+    SensorError,
+    join_names,
+    warn_about_file,
+)
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.fitting.misfit import beyond_models
@@ -46,8 +53,8 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
 
     Raises:
         SensorError: no parameter is in reach of the sensors.
-        ImplausibleFitError: parameters that no robot has, or forces that no parameters explain in a log that the
-            checks condemn.
+        ImplausibleFitError: parameters that no robot has, forces that no parameters explain in a log that the checks
+            condemn, or scales that neither the data nor a known mass determines.
 
     Warns:
         NumericalWarning: forces that no parameters explain, for whatever reason.
@@ -55,10 +62,12 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     estimate = fit.estimate
     if not estimate.rank:
         raise SensorError.at_field("sensors", "no parameter is in reach of them", "other sensors, contacts or logs")
+    if fit.assembly.homogeneous:
+        _require_scales(fit)
     block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error
     mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance, block_error)
-    reason = implausibility(fit.assembly.problem, estimate.phi, mass, scene.robot)
-    unexplained = beyond_models(estimate, fit.assembly.problem)
+    reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass, scene.robot)
+    unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces)
     if reason is None and unexplained is None:
         return mass
     log, finding = next(_findings(scene), (None, None))
@@ -75,6 +84,21 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     advice = "check units, frames, quaternion order and contact_active, or state the noise that there is"
     warn_about_file(f"{unexplained}{named}; {advice}", NumericalWarning)
     return mass
+
+
+def _require_scales(fit: Fit) -> None:
+    """Refuse scales of all measured forces where no forces at all, with mass where it acts on none, fit best.
+
+    Raises:
+        ImplausibleFitError: names them.
+    """
+    scales = {x.extra.label: 1.0 + x.value for x in fit.extras if x.extra.what == "scale"}
+    beyond = [f"{label} {x:.2g}" for label, x in scales.items() if is_implausible_factor(x)]
+    if beyond:
+        found = f"of all measured forces, which no mass determines here: {join_names(beyond)}"
+        reason = "mass at a contact that always stands acts on no joint"
+        accepted = f"a sensor without a scale, or logs in which each contact lifts: {reason}"
+        raise ImplausibleFitError.at_field("sensors.scales", found, accepted)
 
 
 def require_not_worse(worse: list[WorseThanNominal], scene: Scene) -> None:

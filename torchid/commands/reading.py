@@ -12,17 +12,19 @@ import torch
 from torchid import ranks
 from torchid.commands.large_log import BLOCK_GB, LargeLog
 from torchid.config.logs import require_apart
-from torchid.errors import LogError
+from torchid.errors import LogError, warn
 from torchid.fitting.experiment import Scene
 from torchid.log_checks import Checked, drop_condemned
 from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
+from torchid.logs.log import FloatArray
 from torchid.logs.preprocess import away_from_changes, preprocess
 from torchid.logs.time_range import LogPart, share_samples, split_range
 from torchid.problem import Samples, bind_log
 from torchid.problem.contact_detection import with_detected_contacts
+from torchid.problem.contact_slip import measure_slip
 from torchid.problem.standing import preprocess_standing
 from torchid.sensing import SensorSet
 
@@ -97,16 +99,54 @@ class LogReader:
         else:
             log = preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates)
         samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
+        slip = self._slipping(log, samples, recorded)
         if not fits_contact_offsets(self.scene):
             samples = replace(samples, unloaded=None)
         if checked is not None:
             count = len(samples)
             samples = drop_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
             self.excluded[str(path)] = count - len(samples)
-        if settings.margin_s is None:
+        kept = None if slip is None else np.isin(samples.time.numpy(), slip, invert=True)
+        if settings.margin_s is not None:
+            away = away_from_changes(recorded, samples.time.numpy(), settings.margin_s)
+            kept = away if kept is None else kept if away is None else kept & away
+        if kept is None or kept.all():
             return samples
-        kept = away_from_changes(recorded, samples.time.numpy(), settings.margin_s)
-        return samples if kept is None else samples[torch.from_numpy(np.flatnonzero(kept))]
+        if not kept.any():
+            found = "no sample away from changes of contact in which no contact slips"
+            raise LogError(
+                path, "contact_active", found, "a larger preprocessing.max_slip, or a smaller contact_margin_s"
+            )
+        return samples[torch.from_numpy(np.flatnonzero(kept))]
+
+    def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
+        """Stamps of samples in which a contact slips; None where all are kept.
+
+        Warns:
+            TorchidWarning: there are some, or nothing says whether there are.
+        """
+        settings, scene = self.scene.config.preprocessing, self.scene
+        if settings.max_slip is None or not scene.contacts:
+            return None
+        limit = None if settings.max_slip == "auto" else float(settings.max_slip)
+        slip = measure_slip(
+            log,
+            samples,
+            recorded,
+            scene.robot,
+            scene.contacts,
+            limit,
+            settings.cutoff_hz,
+            settings.base_motion is not None,
+        )
+        slipping = slip.slips.any(axis=1)
+        if not slip.checked:
+            needed = "needs the base's linear velocity or two contacts that stand"
+            warn(f"{log.source}: slip is not checked: it {needed}, away from changes of contact")
+        elif slipping.any():
+            count = f"{int(slipping.sum())} of {len(samples)} samples dropped, in which contacts slip"
+            warn(f"{log.source}: {count}: {slip}; null as preprocessing.max_slip keeps them")
+        return np.asarray(samples.time.numpy()[slipping])
 
     def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
         """A log that does not, with those before it [GB]."""
@@ -117,7 +157,8 @@ class LogReader:
             if settings.exclude_condemned:
                 key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
             else:
-                key = "base_motion" if settings.base_motion is not None else "detect_contacts"
+                keys = ("base_motion", "detect_contacts", "max_slip")
+                key = next(name for name in keys if getattr(settings, name) is not None)
             raise LogError(path, f"preprocessing.{key}", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
@@ -129,7 +170,7 @@ class LogReader:
     def _needs_whole_logs(self) -> bool:
         """Whether samples are left out for what is known of a whole log alone."""
         settings = self.scene.config.preprocessing
-        return settings.exclude_condemned or bool(settings.derived)
+        return settings.exclude_condemned or bool(settings.derived) or settings.max_slip is not None
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""

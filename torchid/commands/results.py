@@ -15,7 +15,7 @@ from torchid.commands.training import Training, body_eigenvalues
 from torchid.config import ExperimentConfig, dump_config
 from torchid.errors import during
 from torchid.estimators import ConstrainedEstimate, Estimate, SgdEstimate, Violation
-from torchid.fitting.calibration import Calibration, Comparison
+from torchid.fitting.calibration import Calibration, Comparison, list_confounded
 from torchid.fitting.cross_validation import CrossValidation, RidgeChoice
 from torchid.fitting.experiment import Experiment
 from torchid.fitting.factor_files import FactorFile
@@ -222,6 +222,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "total_mass": run.mass.value if run.mass.determined else None,
         "total_mass_standard_error": run.mass.standard_error if np.isfinite(run.mass.standard_error) else None,
         "total_mass_told_from_offsets": run.mass.separable,
+        "confounded": [asdict(one) | {"message": str(one)} for one in list_confounded(run.extras)],
         "total_mass_nominal": float(robot.nominal[:, 0].sum()),
         "smallest_eigenvalue": body_eigenvalues(robot, estimate.phi),
         "noise": {"groups": [asdict(one) for one in run.noise.groups], "suggested": run.noise.suggested},

@@ -11,7 +11,7 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.plausibility import require_plausible
 from torchid.errors import ImplausibleFitError, LogError, warn
-from torchid.fitting.calibration import Calibration
+from torchid.fitting.calibration import Calibration, list_confounded
 from torchid.fitting.experiment import Scene, batch_estimator
 from torchid.identifiability.information import error_directions, expected_errors
 from torchid.parameters import Array
@@ -124,4 +124,5 @@ def _accuracy(
     phi = calibration.parameters(evaluation)
     measured = evaluation.metrics(calibration.calibrate(test), phi[None])[0] if test else None
     possible = measured_components(scene.contacts, sensors)
-    return SetAccuracy(int(sensors.torque.sum() + possible.sum()), estimate.rank, expected, measured)
+    channels, confounded = int(sensors.torque.sum() + possible.sum()), tuple(map(str, list_confounded(fit.extras)))
+    return SetAccuracy(channels, estimate.rank, expected, measured, confounded)

@@ -51,6 +51,24 @@ class TrainingConfig(TrainingSettings):
     checkpoint_seconds: NotNegative = 5.0
 
 
+@dataclass(config=STRICT, frozen=True)
+class MassConfig:
+    """A known mass and its standard deviation [kg], 0 for an exact one."""
+
+    value: Positive
+    std: NotNegative = 0.0
+
+
+def _mass(value: object) -> object:
+    """A mass as a mapping, where it may be a number alone."""
+    return value if value is None or isinstance(value, (dict, MassConfig)) else {"value": value}
+
+
+MASS_ACCEPTED = "a number greater than 0, or a mapping with value and std [kg]"
+"""Accepted for a known mass, in messages."""
+
+Mass = Annotated[MassConfig, BeforeValidator(_mass)]
+
 Loss = Literal["huber", "tukey"]
 
 
@@ -103,7 +121,7 @@ class _FitConfig:
 
     `ridge`: auto, the largest that predicts left-out blocks of the training logs as well as the best; `friction: false`
     leaves friction at the URDF's values, `frozen` bodies keep all of theirs; `robust` weighs outliers down in a batch
-    fit.
+    fit. `total_mass` and `masses` of bodies by name are known, as from a scale.
     """
 
     name: Literal["least_squares", "consistent", "sgd"] = "least_squares"
@@ -112,18 +130,19 @@ class _FitConfig:
     friction: bool = True
     frozen: list[str] = dataclasses.field(default_factory=list)
     robust: Robust | None = None
+    total_mass: Annotated[MassConfig | None, BeforeValidator(_mass)] = None
+    masses: dict[str, Mass] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(config=STRICT, frozen=True)
 class _ConditionsConfig:
     """What makes `Conditions`, together with a robot.
 
-    `total_mass` [kg] if known; `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry`
+    `com_inside` keeps centres of mass in what encloses the bodies' `com_shapes`, `symmetry`
     makes left and right mirror images, `bounds` are [lower, upper] by body and parameter, null for none.
     """
 
     margin: BelowOne = Conditions.margin
-    total_mass: Positive | None = Conditions.total_mass
     com_inside: EnclosureKind | None = None
     com_shapes: Literal["visual", "collision"] = "visual"
     symmetry: SymmetryConfig | None = None
@@ -195,9 +214,12 @@ def validate_keys(estimator: EstimatorConfig) -> None:
         raise ConfigError.at_field("estimator.penalties", found, "consistency: penalties, or no such key")
 
 
+_OF_BATCH_FITS = {"robust", "total_mass", "masses"}
+
+
 def _estimators_with(key: str) -> list[str]:
     """Names of the estimators that a key of the block is for."""
-    if key in _fields(_FitConfig) and key != "robust":
+    if key in _fields(_FitConfig) and key not in _OF_BATCH_FITS:
         return list(ESTIMATORS)
     return [name for name, estimator in ESTIMATORS.items() if key in _keys_of(estimator)]
 
@@ -207,8 +229,7 @@ def _keys_of(estimator: type) -> set[str]:
     keys = set(_fields(estimator))
     if "conditions" in keys:
         keys |= set(_fields(_ConditionsConfig))
-    keys.add("training" if issubclass(estimator, TrainingSettings) else "robust")
-    return keys
+    return keys | ({"training"} if issubclass(estimator, TrainingSettings) else _OF_BATCH_FITS)
 
 
 def _fields(of: type) -> list[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass
 
 from torchid.config.analysis import AnalysisConfig
-from torchid.config.estimator import ROBUST_ACCEPTED, EstimatorConfig, validate_keys
+from torchid.config.estimator import MASS_ACCEPTED, ROBUST_ACCEPTED, EstimatorConfig, validate_keys
 from torchid.config.logs import SETS, LogsConfig, entries_spelled_out, resolve_logs
 from torchid.config.maps import MAPS_ACCEPTED
 from torchid.config.preprocessing import PreprocessingConfig
@@ -17,6 +17,7 @@ from torchid.config.reading import FileKind, Settings, dump, load
 from torchid.config.sensors import (
     CHOICE_ACCEPTED,
     COMPONENTS_ACCEPTED,
+    GROUPS_ACCEPTED,
     SCOPES_ACCEPTED,
     STRICT,
     WRENCHES_ACCEPTED,
@@ -118,9 +119,11 @@ _EXPERIMENT = FileKind(
         **{f"{where}.contact_wrenches": WRENCHES_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         **{f"{where}.contact_wrenches.*": COMPONENTS_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         "sensors.offsets": SCOPES_ACCEPTED,
-        "sensors.scales": SCOPES_ACCEPTED,
+        "sensors.scales": f"{SCOPES_ACCEPTED}, or a list of groups",
+        "sensors.scales.*": GROUPS_ACCEPTED,
         "analysis.compare.*": CHOICE_ACCEPTED,
         "estimator.robust": ROBUST_ACCEPTED,
+        **dict.fromkeys(("estimator.total_mass", "estimator.masses.*"), MASS_ACCEPTED),
         **MAPS_ACCEPTED,
     },
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT
@@ -17,6 +17,17 @@ def _switch(value: object) -> object:
     return ({} if value else None) if isinstance(value, bool) else value
 
 
+def _speed(value: object) -> float | str | None:
+    """A positive number, auto, or none."""
+    try:
+        return None if value is None else "auto" if value == "auto" else _POSITIVE.validate_python(value)
+    except ValueError as error:
+        raise ValueError("auto, null, or a number greater than 0 [m/s]") from error
+
+
+_POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
+
+
 @dataclass(config=STRICT, frozen=True)
 class PreprocessingConfig:
     """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
@@ -25,6 +36,8 @@ class PreprocessingConfig:
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
     recorded ones.
     `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
+    `max_slip`: speed [m/s] above which a contact that should stand slips, so that the sample is dropped; auto, from the
+    noise of each contact's velocity; None keeps all.
     `exclude_condemned`: leave out the samples that `torchid check` condemns.
     `memory_gb`: a log whose arrays take more [GB] is read block by block, and its samples are kept on the disk.
     `cache_gb`: room [GB] for samples and factors that later runs of `identify` find beside the output; 0 for none.
@@ -35,6 +48,7 @@ class PreprocessingConfig:
     contact_margin_s: NotNegative | None = None
     detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
     base_motion: Literal["contacts"] | None = None
+    max_slip: Annotated[float | Literal["auto"] | None, PlainValidator(_speed)] = None
     exclude_condemned: bool = False
     memory_gb: Positive = 2.0
     cache_gb: NotNegative = 2.0

@@ -152,11 +152,32 @@ def _every_channel(value: object) -> object:
     return dict.fromkeys(CHANNELS, value) if value in get_args(Scope) else value
 
 
+def _scope_or_groups(value: object) -> str | list[list[str]]:
+    """A scope, or groups of patterns, of which one alone needs no list."""
+    if isinstance(value, str) and value in get_args(Scope):
+        return value
+    groups = [[group] if isinstance(group, str) else group for group in value] if isinstance(value, list) else []
+    named = all(isinstance(group, list) and group and all(map(_is_name, group)) for group in groups)
+    if not (groups and named):
+        raise ValueError(GROUPS_ACCEPTED)
+    return groups
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and bool(value)
+
+
 Channel = Literal["joint_torque", "contact_force", "contact_moment", "ft_force", "ft_moment"]
 Scope = Literal["log", "all"]
 Scopes = Annotated[dict[Channel, Scope], BeforeValidator(_every_channel)]
+Scales = Annotated[
+    dict[Channel, Annotated[Scope | list[list[str]], PlainValidator(_scope_or_groups)]], BeforeValidator(_every_channel)
+]
 SCOPES_ACCEPTED = f"log, all, or a mapping from kinds of channels ({', '.join(CHANNELS)}) to log or all"
 """Accepted for `Scopes`, in messages."""
+
+GROUPS_ACCEPTED = "log, all, or a list of groups of joints or frames: [[l_hip, r_hip], '*_knee']"
+"""Accepted for the scales of a kind of channels, in messages."""
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -164,12 +185,12 @@ class SensorsConfig(ChoiceConfig):
     """The sensors of a run, their noise and calibration, and whether to stop where they lose the base.
 
     `offsets` and `scales` say which channels have an unknown one, constant over a `log` or over `all`; a scope alone is
-    short for every kind of channel.
+    short for every kind of channel. `scales` may have groups of joints or frames, by names or patterns, that share one.
     """
 
     noise: NoiseConfig = dataclasses.field(default_factory=NoiseConfig)
     offsets: Scopes = dataclasses.field(default_factory=dict)
-    scales: Scopes = dataclasses.field(default_factory=dict)
+    scales: Scales = dataclasses.field(default_factory=dict)
     on_base_lost: Literal["error", "warn"] = "error"
 
 

@@ -166,15 +166,60 @@ def warn_of_confounded(extras: Sequence[ExtraEstimate]) -> None:
     Warns:
         ConfoundedWarning: one for each log that has some.
     """
+    for one in list_confounded(extras):
+        with about_file(one.log or current_file()):
+            warn_about_file(str(one), ConfoundedWarning)
+
+
+@dataclass(frozen=True)
+class Confounded:
+    """Extra parameters that the data do not separate from others.
+
+    Attributes:
+        log: that they are of, "" for all.
+        extras: their labels.
+        confounded_with: the others: "total mass" if stating this would do, else parameters of bodies.
+        advice: what would separate them.
+    """
+
+    log: str
+    extras: tuple[str, ...]
+    confounded_with: tuple[str, ...]
+    advice: str
+
+    def __str__(self) -> str:
+        """All in one line."""
+        others = "the total mass" if self.confounded_with == (_TOTAL_MASS,) else _grouped(self.confounded_with)
+        return f"{_grouped(self.extras)}: confounded with {others or 'each other'}; do not trust either; {self.advice}"
+
+
+_TOTAL_MASS = "total mass"
+
+
+def list_confounded(extras: Sequence[ExtraEstimate]) -> list[Confounded]:
+    """Extra parameters of a fit that are confounded, by log, those with the total mass apart from others."""
+    out = []
     for log in dict.fromkeys(x.log for x in extras):
-        confounded = [x for x in extras if x.log == log and not x.separable]
-        if confounded:
-            named = _grouped(x.extra.label for x in confounded)
-            others = _grouped(name for x in confounded for name in x.confounded_with if " of " not in name)
-            message = f"{named}: confounded with {others or 'each other'}; do not trust either"
-            advice = "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
-            with about_file(log or current_file()):
-                warn_about_file(f"{message}; {advice}", ConfoundedWarning)
+        for by_mass in (True, False):
+            own = [x for x in extras if x.log == log and not x.separable and x.mass_separates is by_mass]
+            if not own:
+                continue
+            others = dict.fromkeys(name for x in own for name in x.confounded_with if " of " not in name)
+            found = (_TOTAL_MASS,) if by_mass else tuple(others)
+            out.append(Confounded(log, tuple(x.extra.label for x in own), found, _advice(own, by_mass)))
+    return out
+
+
+def _advice(extras: Sequence[ExtraEstimate], by_mass: bool) -> str:
+    """What would separate extra parameters from what they are confounded with."""
+    kinds = {x.extra.what for x in extras}
+    if by_mass:
+        return "state estimator.total_mass" + (", or leave a sensor out of scales" if kinds == {"scale"} else "")
+    if kinds == {"scale"}:
+        return (
+            "add motion, state a known mass (estimator.total_mass, estimator.masses), or leave a sensor out of scales"
+        )
+    return "add motion that unloads the sensor, state what is known, or zero the sensor before the log"
 
 
 def warn_of_disagreement(fit: Fit, fitter: LogFitter) -> None:

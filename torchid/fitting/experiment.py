@@ -19,15 +19,16 @@ from torchid.fitting.calibration import Calibration, Comparison, calibrations
 from torchid.fitting.contacts import read_along_normals, resolve_contacts, suited_to_preprocessing
 from torchid.fitting.cross_validation import RIDGES, RidgeChoice, choose_ridge
 from torchid.fitting.fit import Fit, LogFitter, frozen_parameters
+from torchid.fitting.known_masses import known_masses
 from torchid.fitting.noise import NoiseSummary, estimate_noise, recorded_sensors
 from torchid.fitting.robust import RobustLoss
+from torchid.fitting.terms import check_scale_groups, check_terms
 from torchid.logs.column_map import require_names
 from torchid.logs.ros_topics import require_joints
 from torchid.parameters import PARAMETERS, Array
 from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
-from torchid.problem.extras import CHANNELS, measured_channels
 from torchid.problem.sampled_rows import LogElsewhere
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
@@ -62,7 +63,8 @@ class Scene:
     def terms(self) -> ExtraTerms:
         """Extra parameters of sensors and actuators."""
         sensors = self.config.sensors
-        offsets, scales = ({str(channel): x for channel, x in s.items()} for s in (sensors.offsets, sensors.scales))
+        offsets = {str(channel): scope for channel, scope in sensors.offsets.items()}
+        scales = {str(channel): scope for channel, scope in sensors.scales.items()}
         return ExtraTerms(offsets, scales, **vars(self.config.actuators))
 
     @property
@@ -125,6 +127,7 @@ class Scene:
             estimator=batch_estimator(settings, conditions),
             friction=settings.friction,
             frozen=self.frozen(),
+            masses=known_masses(settings, self.robot),
         )
 
     def calibrations(self, fit: Fit, builder: RowBuilder) -> Comparison[Calibration]:
@@ -214,7 +217,9 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     contacts, rolling = resolve_contacts(config.contacts, robot)
     contacts = suited_to_preprocessing(read_along_normals(contacts, config.sensors), config)
     stated = [replace(c, radius=contact.radius) for c, contact in zip(config.contacts, contacts, strict=True)]
-    return Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
+    scene = Scene(config=replace(config, contacts=stated), robot=robot, contacts=contacts, rolling=rolling)
+    check_scale_groups(scene.terms, robot, contacts)
+    return scene
 
 
 def set_up(config: ExperimentConfig) -> Experiment:
@@ -228,7 +233,7 @@ def set_up(config: ExperimentConfig) -> Experiment:
     sensors = scene.sensors_of(config.sensors)
     config = replace(config, contacts=scene.config.contacts)
     experiment = Experiment(**vars(scene) | {"config": config}, sensors=sensors)
-    _check_terms(experiment)
+    check_terms(experiment.terms, config.actuators, scene.robot, scene.contacts, sensors)
     return experiment
 
 
@@ -244,21 +249,6 @@ def _ft_field(config: ExperimentConfig | AnalyzeConfig, name: str) -> str:
     choices = {"sensors": config.sensors} | {f"analysis.compare.{key}": x for key, x in config.analysis.compare.items()}
     named = (f"{key}.ft_sensors" for key, choice in choices.items() if name in choice.ft_sensors)
     return next(named, "analysis.candidates.ft_sensors")
-
-
-def _check_terms(experiment: Experiment) -> None:
-    """Refuse extra parameters of channels that nothing measures; all kinds of channels mean those that are measured."""
-    terms = experiment.terms
-    measured = measured_channels(experiment.robot, experiment.contacts, experiment.sensors)
-    for field, scopes in (("offsets", terms.offsets), ("scales", terms.scales)):
-        for channel in scopes:
-            if channel not in measured and len(scopes) < len(CHANNELS):
-                accepted = f"{', '.join(measured)}, or log or all for every kind that is measured"
-                raise ConfigError.at_field(f"sensors.{field}.{channel}", "no such sensor is measured", accepted)
-    for name, value in vars(experiment.config.actuators).items():
-        if value and "joint_torque" not in measured:
-            accepted = "joint torques among the sensors, or no such key"
-            raise ConfigError.at_field(f"actuators.{name}", "set, but no joint torque is measured", accepted)
 
 
 def batch_estimator(settings: EstimatorConfig, conditions: Conditions) -> LeastSquares | Consistent:
@@ -304,7 +294,7 @@ def conditions_from(settings: EstimatorConfig, robot: Robot) -> Conditions:
     lower, upper = _bounds(settings, robot)
     return Conditions(
         margin=settings.margin,
-        total_mass=settings.total_mass,
+        total_mass=None if settings.total_mass is None or settings.total_mass.std else settings.total_mass.value,
         enclosures=_enclosures(settings, robot),
         mirrors=_mirrors(settings, robot),
         lower=lower,
@@ -352,10 +342,14 @@ def _mirrors(settings: EstimatorConfig, robot: Robot) -> tuple[Mirror, ...]:
 
 def _bounds(settings: EstimatorConfig, robot: Robot) -> tuple[Array | None, Array | None]:
     """Lower and upper bounds, (L, 12), None if the file has none."""
-    if not settings.bounds:
+    exact = {name: mass.value for name, mass in settings.masses.items() if not mass.std and name in robot.body_names}
+    if not (settings.bounds or exact):
         return None, None
     lower, upper = np.full(robot.nominal.shape, -np.inf), np.full(robot.nominal.shape, np.inf)
-    for name, intervals in settings.bounds.items():
+    for name, mass in exact.items():
+        lower[robot.body_names.index(name), parameters.MASS] = mass
+        upper[robot.body_names.index(name), parameters.MASS] = mass
+    for name, intervals in (settings.bounds or {}).items():
         if name not in robot.body_names:
             raise UnknownNameError.at_field("estimator.bounds", name, robot.body_names)
         body = robot.body_names.index(name)

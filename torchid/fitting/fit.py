@@ -12,13 +12,15 @@ from torch import Tensor
 
 from torchid.errors import TorchidWarning, UnknownNameError
 from torchid.estimators import Estimate, LeastSquares
+from torchid.fitting.known_masses import TOTAL, KnownMass, with_known_masses
 from torchid.identifiability.block_scatter import BlockScatter, block_scatter
-from torchid.identifiability.confounding import ExtraEstimate, estimate_extras
+from torchid.identifiability.confounding import ExtraEstimate, estimate_extras, mass_weights
 from torchid.parameters import PER_BODY
 from torchid.problem import LinearProblem, RowBuilder, assemble
 from torchid.problem.compression import Part, merge_blocks_of_folds, merge_states
 from torchid.problem.elimination import Assembly
 from torchid.robot import Robot
+from torchid.rounding import RANK_TOLERANCE
 
 Solve = Callable[[LinearProblem], Estimate]
 """An estimator's `solve`."""
@@ -84,6 +86,7 @@ class LogFitter:
         estimator: finds the parameters, unless a method is given another `solve`.
         friction: whether friction is fitted.
         frozen: (12 L,) bool, parameters that keep their nominal values, from `frozen_parameters`; None for none.
+        masses: that are known.
     """
 
     robot: Robot
@@ -91,6 +94,7 @@ class LogFitter:
     estimator: BatchEstimator
     friction: bool = True
     frozen: np.ndarray | None = None
+    masses: tuple[KnownMass, ...] = ()
 
     @property
     def least_squares(self) -> LeastSquares:
@@ -111,12 +115,29 @@ class LogFitter:
         return fit if scatter is None else with_block_errors(fit, scatter)
 
     def assemble(self, parts: Sequence[Part]) -> Assembly:
-        """The problem of compressed logs as they are, with extra parameters eliminated and frozen ones not free."""
+        """The problem of compressed logs as they are, with extra parameters eliminated and frozen ones not free.
+
+        Masses that are known are further rows of it. Where scales make up all of the forces and no mass is known, the
+        nominal total mass stands in for one: the best fit were no forces at all.
+        """
         assembly = assemble(parts, self.builder, self.robot, self.friction)
-        if self.frozen is None:
-            return assembly
-        problem, known = (replace(x, free=x.free & ~self.frozen) for x in (assembly.problem, assembly.if_known))
-        return replace(assembly, problem=problem, if_known=known)
+        problem, known, data = assembly.problem, assembly.if_known, None
+        if self.frozen is not None:
+            problem, known = (replace(x, free=x.free & ~self.frozen) for x in (problem, known))
+        masses, homogeneous, scaled_by = (
+            self.masses,
+            bool(self.builder.extras) and _is_homogeneous(problem, assembly.forces),
+            None,
+        )
+        if homogeneous and not masses:
+            weights = mass_weights(len(self.robot.bodies))
+            scaled_by = float(weights @ problem.nominal)
+            masses = (KnownMass(TOTAL, weights, scaled_by),)
+        if masses:
+            data, noise = problem, np.sqrt(problem.oversampling) * self.least_squares.solve(problem).residual_std
+            problem, known = (with_known_masses(x, masses, noise, homogeneous) for x in (problem, known))
+        known_of = {"stated": len(masses), "data": data, "scaled_by": scaled_by, "homogeneous": homogeneous}
+        return replace(assembly, problem=problem, if_known=known, **known_of)  # type: ignore[arg-type]
 
     def build_problem(self, parts: Sequence[Part]) -> LogProblem:
         """The problem of compressed logs, readings of contact sensors in the air weighed by their own noise.
@@ -151,6 +172,13 @@ class LogFitter:
             warnings.simplefilter("ignore", TorchidWarning)  # the fit of all of them says the same
             rests = ([block for block in blocks if block.fold != fold] for fold in folds)
             return [self.solve_problem(LogProblem(rest, self.assemble(rest))) for rest in rests]
+
+
+def _is_homogeneous(problem: LinearProblem, forces: float) -> bool:
+    """Whether nothing is left of the measured forces, of this squared norm, once unknown scales are eliminated."""
+    fixed = ~problem.free
+    left = problem.b - problem.A[:, fixed] @ problem.nominal[fixed]
+    return float(left @ left) + problem.residual <= RANK_TOLERANCE**2 * forces
 
 
 def with_block_errors(fit: Fit, scatter: BlockScatter, factor: float = 1.0) -> Fit:

@@ -89,17 +89,19 @@ def misfit(estimate: Estimate, noise: NoiseSummary, scatter: BlockScatter | None
     )
 
 
-def beyond_models(estimate: Estimate, problem: LinearProblem) -> str | None:
+def beyond_models(estimate: Estimate, problem: LinearProblem, forces: float = 0.0) -> str | None:
     """Why forces are not those of any robot with noise, in words; None if they may be. Far more than a `Misfit`.
 
     Args:
         estimate: of a fit, which may be far from the best.
         problem: that was solved.
+        forces: squared norm of the weighted forces, if offsets and scales that were eliminated have taken some of it.
     """
     left = np.sqrt(estimate.cost / max(estimate.rows, 1))
     if left > _UNEXPLAINED:
         return f"forces differ from any rigid-body model by {left:.3g} times the stated sensor noise"
-    share = np.sqrt(estimate.cost / max(problem.cost(np.zeros_like(estimate.phi)), np.finfo(float).tiny))
+    forces = max(problem.cost(np.zeros_like(estimate.phi)), forces, np.finfo(float).tiny)
+    share = np.sqrt(estimate.cost / forces)
     if share > _SHARE:
         return f"no rigid-body model explains {100.0 * share:.3g} % of the weighted forces"
     return None

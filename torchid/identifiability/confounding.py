@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ It is a variance inflation of 100, ten times what is commonly taken for serious 
 Welsch, "Regression Diagnostics", 1980.
 """
 
+_BY_MASS = 0.9  # share of a variance that a known total mass would take off, from which on it is named
 _NAMED = 4  # parameters, at most, in a message
 _CONTRADICTS = 5.0  # standard errors between readings in the air and in contact; noise is seldom white
 _NOTICEABLE = 3.0  # standard deviations of the sensor's noise: less is invisible in a single reading
@@ -44,6 +45,7 @@ class ExtraEstimate:
         confounded_with: names of other parameters, those with most influence first; empty if it is separable.
         block_error: standard error by the scatter between blocks of the logs, see `BlockScatter`; 0 where there are too
             few.
+        mass_separates: whether it is confounded with the total mass, so that stating this would separate it.
     """
 
     extra: Extra
@@ -54,6 +56,7 @@ class ExtraEstimate:
     inflation: float
     confounded_with: tuple[str, ...]
     block_error: float = 0.0
+    mass_separates: bool = False
 
     @property
     def standard_error(self) -> float:
@@ -81,7 +84,7 @@ def estimate_extras(
     if not assembly.eliminations:
         return []
     covariance, names = (
-        ParameterCovariance.of(assembly.problem, rank_tolerance),
+        ParameterCovariance.of(assembly.problem, rank_tolerance, assembly.stated),
         _names(assembly.problem.free, body_names),
     )
     noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
@@ -90,7 +93,9 @@ def estimate_extras(
     out = []
     for elimination, pair in zip(assembly.eliminations, values, strict=True):
         out += _estimates(elimination, pair, noise, covariance, names, shared if elimination.log else None)
-    return out
+    if assembly.scaled_by is None:
+        return out
+    return [replace(x, noise_error=np.inf, inflation=np.inf, mass_separates=True) for x in out]
 
 
 @dataclass(frozen=True)
@@ -137,15 +142,17 @@ def disagreements(
     """
     out = []
     for source in dict.fromkeys(part.source for part in parts if part.unloaded):
-        estimates = {(x.extra.what, x.extra.contact): x for x in in_contact if x.log in ("", source)}
+        estimates = {(x.extra.what, at): x for x in in_contact if x.log in ("", source) for at in x.extra.contacts}
         R = merge_factors(
             (part.factor for part in parts if part.unloaded and part.source == source), builder
         ).triangle()
         for number, extra in enumerate(builder.extras, start=builder.columns.count):
-            column, offset = R[:, number].numpy(), estimates.get((extra.what, extra.contact))
-            if extra.what == "offset" and extra.contact is not None and offset is not None and column.any():
+            column, at = R[:, number].numpy(), extra.contact
+            if extra.what != "offset" or at is None or not column.any():
+                continue
+            if (offset := estimates.get(("offset", at))) is not None:
                 weight = float(column @ column)
-                read, scale = float(column @ R[:, -1].numpy()) / weight, estimates.get(("scale", extra.contact))
+                read, scale = float(column @ R[:, -1].numpy()) / weight, estimates.get(("scale", at))
                 expected, variance = offset.value, offset.standard_error**2 + noise**2 / weight
                 if scale is not None:
                     expected, variance = expected / (1.0 + scale.value), variance + (read * scale.standard_error) ** 2
@@ -197,8 +204,14 @@ def total_mass(
         combination_standard_error(problem, estimate, weights, rank_tolerance)
         for problem in (assembly.problem, assembly.if_known)
     )
-    separable = not np.isfinite(if_known) or error <= INFLATION_LIMIT * if_known
+    noise = float(np.sqrt(assembly.problem.oversampling) * estimate.residual_std)
+    covariance = ParameterCovariance.of(assembly.problem, rank_tolerance, assembly.stated)
+    along = covariance.scale_sensitivity(weights[None])[0]
+    by_data = noise * covariance.without_stated(error / noise, along) if assembly.stated and noise else error
+    separable = not np.isfinite(if_known) or by_data <= INFLATION_LIMIT * if_known
     value, nominal = (float(weights @ phi) for phi in (estimate.phi, assembly.problem.nominal))
+    if assembly.scaled_by is not None:
+        return TotalMass(np.inf, False, value, nominal)
     return TotalMass(max(error, block_error), separable, value, nominal)
 
 
@@ -234,6 +247,7 @@ class ParameterCovariance:
         values: (P',), singular values that belong to the columns of both.
         scale: (P',), of the free parameters.
         free: (P,) bool.
+        by_stated: (P', stated), change of the parameters by unit errors of what is known of them.
     """
 
     root: Array
@@ -241,18 +255,22 @@ class ParameterCovariance:
     values: Array
     scale: Array
     free: np.ndarray
+    by_stated: Array
 
     @classmethod
-    def of(cls, problem: LinearProblem, rank_tolerance: float) -> ParameterCovariance:
-        """Of the rows of a problem; `rank_tolerance` as in `LeastSquares`."""
+    def of(cls, problem: LinearProblem, rank_tolerance: float, stated: int = 0) -> ParameterCovariance:
+        """Of the rows of a problem, the last `stated` of which are no data; `rank_tolerance` as in `LeastSquares`."""
         scale = problem.scale[problem.free]
         _, values, Vt = np.linalg.svd(problem.A[:, problem.free] * scale, full_matrices=True)
         least = max(rank_tolerance, np.finfo(float).eps * max(problem.A.shape)) * values.max(initial=0.0)
         rank = int((values > least).sum())
         values = np.pad(values, (0, len(Vt) - len(values)))
         values[rank:] = 0.0
+        root = Vt[:rank].T / values[:rank]
+        known = problem.A[len(problem.A) - stated :, problem.free] * scale
         return cls(
-            root=Vt[:rank].T / values[:rank],
+            by_stated=root @ (root.T @ known.T),
+            root=root,
             null_space=Vt[rank:].T,
             values=values,
             scale=scale,
@@ -264,12 +282,30 @@ class ParameterCovariance:
 
         The prior bounds each deviation to about its scale: else the least certain parameter would dominate.
         """
+        shares = sensitivity * self._bounded(sensitivity, noise)
+        return np.asarray(shares / max(np.abs(shares).max(initial=0.0), np.finfo(float).tiny))
+
+    def shared_variance(self, sensitivity: Array, other: Array, noise: float) -> float:
+        """Share of the variance along sensitivities (P',) that goes if a combination of parameters, (P',), is known.
+
+        It is their squared correlation, with variances as in `variance_shares`.
+        """
+        own, of_other = self._bounded(sensitivity, noise), self._bounded(other, noise)
+        product = float(sensitivity @ own) * float(other @ of_other)
+        return float(other @ own) ** 2 / max(product, np.finfo(float).tiny)
+
+    def _bounded(self, sensitivity: Array, noise: float) -> Array:
+        """Covariance of the parameters, each bounded by its scale, with a combination (P',) of them, (P',)."""
         noise = max(noise, UNOBSERVABLE_SHARE**2)  # of exact data, whose variance is all due to the least certain
         rank = self.root.shape[1]
         directions = np.hstack([self.root * self.values[:rank], self.null_space])
-        along = directions.T @ sensitivity / (1.0 + (self.values / noise) ** 2)
-        shares = sensitivity * (directions @ along)
-        return np.asarray(shares / max(np.abs(shares).max(initial=0.0), np.finfo(float).tiny))
+        return np.asarray(directions @ (directions.T @ sensitivity / (1.0 + (self.values / noise) ** 2)))
+
+    def without_stated(self, deviation: float, sensitivity: Array) -> float:
+        """A standard deviation along sensitivities (P') less the part of what is known of the parameters."""
+        if not self.by_stated.size:
+            return deviation
+        return float(np.sqrt(max(deviation**2 - float(np.square(sensitivity @ self.by_stated).sum()), 0.0)))
 
     def scale_sensitivity(self, sensitivity: Array) -> Array:
         """Sensitivities to the scaled free parameters, (M, P'), of those to all parameters, (M, 12 L)."""
@@ -297,6 +333,7 @@ def _estimates(
         own.append(through @ shared.inverse)
         unobservable.append(through @ shared.unobservable)
     G = covariance.scale_sensitivity(sensitivity)
+    mass = covariance.scale_sensitivity(mass_weights(P // parameters.PER_BODY)[None])[0]
     size = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
     undetermined_by_bodies = np.linalg.norm(G @ covariance.null_space, axis=1) > UNOBSERVABLE_SHARE * size
     through_parameters = ((G @ covariance.root) ** 2).sum(1)
@@ -311,7 +348,8 @@ def _estimates(
     for k, extra in enumerate(elimination.extras):
         if not np.isfinite(elimination.std_if_known[k]):
             continue
-        inflation = float(deviation[k] / elimination.std_if_known[k])
+        inflation = covariance.without_stated(float(deviation[k]), G[k]) / float(elimination.std_if_known[k])
+        by_mass = inflation > INFLATION_LIMIT and covariance.shared_variance(G[k], mass, noise) > _BY_MASS
         confounded: tuple[str, ...] = ()
         if inflation > INFLATION_LIMIT:
             by_bodies = undetermined_by_bodies[k] or 2.0 * through_parameters[k] > variance[k]
@@ -330,6 +368,7 @@ def _estimates(
                 noise_error=error,
                 inflation=inflation,
                 confounded_with=confounded,
+                mass_separates=by_mass,
             )
         )
     return out

@@ -31,6 +31,7 @@ from torchid.log_checks.findings import (
 from torchid.log_checks.forces import check_forces_against_urdf
 from torchid.log_checks.frozen import check_repeats, check_scalar_wrenches
 from torchid.log_checks.motion import check_angle_unit, check_angular_velocity, check_derivatives
+from torchid.log_checks.slip import check_slip
 from torchid.log_checks.spikes import check_jumps
 from torchid.log_checks.stamps import check_magnitudes, check_missing_values, check_time_stamps
 from torchid.log_checks.weight import check_accelerometer, check_weight
@@ -137,6 +138,7 @@ def check(
         results += check_accelerometer(repaired, robot)
     if _blocking_finding(results) is None:
         results += check_standing_feet(repaired, robot, contacts, derived)
+        results += check_slip(repaired, robot, contacts, cutoff_hz, derived)
     compared = repaired
     if "base_" in derived and robot is not None and _blocking_finding(results) is None:
         try:

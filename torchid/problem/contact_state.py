@@ -177,7 +177,7 @@ class ContactStateLayouts:
         extras = [
             (self.columns.count + number, extra)
             for number, extra in enumerate(self.extras)
-            if extra.dof in coupled or (extra.contact is not None and state[extra.contact[0]])
+            if not set(extra.dofs).isdisjoint(coupled) or any(state[contact] for contact, _ in extra.contacts)
         ]
         noise, base_rows = self.sensors.noise, self.columns.tree.base_rows
         self._cache[key] = ContactStateLayout(
@@ -201,18 +201,18 @@ class ContactStateLayouts:
     def _uncoupled(self, joint: int) -> RowBlock:
         columns, row = self.columns, self.columns.joint_rows[joint]
         moved = [(node, 0, ratio, (columns.friction(node), columns.friction(node) + 1)) for node, ratio in row.moved]
-        extras = tuple(columns.count + number for number, extra in enumerate(self.extras) if extra.dof == joint)
+        extras = tuple(columns.count + number for number, extra in enumerate(self.extras) if joint in extra.dofs)
         return row_block(columns.tree, columns.layout, slice(0, 1), moved, extras=extras)
 
     def _met(
         self, extra: Extra, coupled: tuple[int, ...], bodies: Sequence[ContactBody]
     ) -> tuple[tuple[int, ...], bool]:
         """Coupled joints whose rows an extra parameter is in, and whether it is in those of the base."""
-        if extra.contact is None:
-            return (coupled.index(extra.dof),) if extra.dof in coupled else (), False
-        node = self.frames[extra.contact[0]][0]
-        joints = next(body.joints for body in bodies if body.body == node)
-        return joints, bool(self.columns.tree.base_rows)
+        if extra.dofs:
+            return tuple(coupled.index(dof) for dof in extra.dofs if dof in coupled), False
+        nodes = {self.frames[contact][0] for contact, _ in extra.contacts}
+        joints = {joint for body in bodies if body.body in nodes for joint in body.joints}
+        return tuple(sorted(joints)), bool(self.columns.tree.base_rows)
 
     def frame_rotation(self, contact: int) -> Tensor:
         """Axes of a contact frame in its node's joint frame, (3, 3), cached."""

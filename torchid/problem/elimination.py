@@ -53,13 +53,21 @@ class Assembly:
     """The problem in the bodies' parameters, and the eliminations: log by log, then of the unknowns of all logs.
 
     `if_known`: the same problem if all eliminated unknowns were known to be 0. `noise`: what noise of the motion had
-    added to it.
+    added to it. `forces`: squared norm of all measured forces, weighted. `stated`: how many of the last rows of
+    both problems are no data but what is known of the parameters; `data`: the problem without them. `homogeneous`:
+    whether unknown scales make up all of the measured forces, so that nothing says how large these are; `scaled_by` is
+    then the total mass [kg] that stands in for a known one, None if one is known.
     """
 
     problem: LinearProblem
     eliminations: tuple[Elimination, ...]
     if_known: LinearProblem
     noise: NoiseShares = field(default_factory=NoiseShares)
+    forces: float = 0.0
+    stated: int = 0
+    data: LinearProblem | None = None
+    scaled_by: float | None = None
+    homogeneous: bool = False
 
     def extras_at(self, phi: Array) -> list[Array]:
         """Values of the eliminated unknowns, for each elimination, that fit the rows best at parameters (12 L,)."""
@@ -84,9 +92,10 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     """
     everything = merge_factors((part.factor for part in parts), builder)
     of_all_logs, noise = corrected_triangle(everything)
+    forces = float(np.square(of_all_logs[:, -1]).sum())
     if not builder.extras:
         problem = problem_from_triangle(of_all_logs, everything.rows, everything.oversampling, builder, robot, friction)
-        return Assembly(problem, (), problem, noise)
+        return Assembly(problem, (), problem, noise, forces)
     count = builder.columns.count
     per_log, of_all = ([n for n, extra in enumerate(builder.extras) if extra.per_log is own] for own in (True, False))
     eliminations, rows = [], of_all_logs
@@ -112,7 +121,7 @@ def assemble(parts: Sequence[Part], builder: RowBuilder, robot: Robot, friction:
     problem = problem_from_triangle(rows, rows_left, everything.oversampling, builder, robot, friction)
     known = np.asarray(np.linalg.qr(np.delete(of_all_logs, np.s_[count:-1], axis=1), mode="r"))
     if_known = problem_from_triangle(known, everything.rows, everything.oversampling, builder, robot, friction)
-    return Assembly(problem, tuple(eliminations), if_known, noise)
+    return Assembly(problem, tuple(eliminations), if_known, noise, forces)
 
 
 def _eliminate(

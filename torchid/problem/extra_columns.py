@@ -13,17 +13,15 @@ from torchid.problem.samples import Samples
 from torchid.regressor.tree import KinematicTree
 
 
-def dof_extra_column(extra: Extra, samples: Samples, tree: KinematicTree) -> Tensor:
-    """Column of a degree of freedom's extra parameter in its row, (B,)."""
-    if extra.dof is None:
-        raise ValueError(f"extra: found {extra.label}; accepted: one of a degree of freedom")
+def dof_extra_column(extra: Extra, dof: int, samples: Samples, tree: KinematicTree) -> Tensor:
+    """Column of an extra parameter in the row of one of its degrees of freedom, (B,)."""
     if extra.what == "scale":
         reading = samples.torque
-        return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, extra.dof]
+        return samples.time.new_full((len(samples),), torch.nan) if reading is None else -reading[:, dof]
     if extra.what == "armature":
-        return samples.joint_acceleration[:, extra.dof]
+        return samples.joint_acceleration[:, dof]
     if extra.what == "asymmetric_coulomb":
-        return tree.coulomb_sign(samples.joint_velocity[:, extra.dof]).abs()
+        return tree.coulomb_sign(samples.joint_velocity[:, dof]).abs()
     return torch.ones_like(samples.time)
 
 
@@ -59,15 +57,16 @@ def extra_columns(
     projected = (measured @ W).permute(1, 2, 0)  # rows per unit of each measured component
     components = [component for body in layout.contact_bodies for component in body.components]
     for extra in extras:
-        if extra.dof is not None:
-            row = W[:, tree.base_rows + layout.coupled_joints.index(extra.dof)]
-            yield row.T * dof_extra_column(extra, samples, tree)
-            continue
-        contact, axis = extra.contact or (0, 0)
-        column, reading = W.new_zeros(W.shape[2], len(samples)), contact_extra_column(extra, samples, contact, axis)
-        vector = range(3) if axis < 3 else range(3, 6)
-        for k in vector if contact in rotations else [axis]:
-            if (contact, k) in components:
-                along = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
-                column = column + projected[components.index((contact, k))] * along
+        column = W.new_zeros(W.shape[2], len(samples))
+        for dof in extra.dofs:
+            if dof in layout.coupled_joints:
+                row = W[:, tree.base_rows + layout.coupled_joints.index(dof)]
+                column = column + row.T * dof_extra_column(extra, dof, samples, tree)
+        for contact, axis in extra.contacts:
+            reading = contact_extra_column(extra, samples, contact, axis)
+            vector = range(3) if axis < 3 else range(3, 6)
+            for k in vector if contact in rotations else [axis]:
+                if (contact, k) in components:
+                    along = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
+                    column = column + projected[components.index((contact, k))] * along
         yield column

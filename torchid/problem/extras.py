@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
+from torchid.logs.column_map import fits
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -16,8 +18,12 @@ CHANNELS = ("joint_torque", "contact_force", "contact_moment", "ft_force", "ft_m
 ACTUATORS = ("armature", "torque_offset", "asymmetric_coulomb")
 """Extra parameters of joints rather than sensors."""
 
+ScaleGroups = Sequence[Sequence[str]]
+"""Groups of sensors that share a scale of all logs: patterns of the names of joints or frames, as `fits` has them."""
+
 _UNITS = dict(zip(CHANNELS, ("N m", "N", "N m", "N", "N m"), strict=True))
 _SIZES = dict(zip(CHANNELS, (5.0, 50.0, 5.0, 50.0, 5.0), strict=True))
+_SCALE_SIZE = 0.1
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,8 @@ class ExtraTerms:
     """Which extra parameters are fitted; none by default.
 
     A reading y of a sensor with an offset o and a scale s means the force s y - o. `offsets` and `scales` say for
-    some of `CHANNELS` whether they are constant over a "log" or over "all" logs.
+    some of `CHANNELS` whether they are constant over a "log" or over "all" logs. `scales` may have groups of sensors
+    instead: all in a group have one scale, constant over all logs, and those in none have a scale of 1.
 
     Of every joint whose torque is measured: `armature` (reflected rotor inertia, times the joint's acceleration),
     `torque_offset`, and `asymmetric_coulomb`, half the difference of Coulomb friction forwards and backwards.
@@ -33,7 +40,7 @@ class ExtraTerms:
     """
 
     offsets: Mapping[str, str] = field(default_factory=dict)
-    scales: Mapping[str, str] = field(default_factory=dict)
+    scales: Mapping[str, str | ScaleGroups] = field(default_factory=dict)
     armature: bool = False
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
@@ -46,12 +53,13 @@ class Extra:
 
     Attributes:
         what: "offset", "scale" (less 1), "armature", "torque_offset" or "asymmetric_coulomb".
-        name: of the joint or the sensor's frame; `component`: of its wrench, "" of a joint torque.
+        name: of the joint or the sensor's frame, or the patterns of a group; `component`: of its wrench, "" of a joint
+            torque, "force" or "moment" for a group of sensors.
         unit: of the unknown.
         size: of a plausible value, in this unit.
         per_log: whether every log has its own.
-        dof: index in the robot's `dof_names`, or
-        contact: index among the contacts and component along the axes that the log has the wrench in.
+        dofs: indices in the robot's `dof_names`, more than one of a group, or
+        contacts: index among the contacts, and component along the axes that the log has the wrench in.
     """
 
     what: str
@@ -60,13 +68,23 @@ class Extra:
     unit: str
     size: float
     per_log: bool
-    dof: int | None = None
-    contact: tuple[int, int] | None = None
+    dofs: tuple[int, ...] = ()
+    contacts: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def dof(self) -> int | None:
+        """The first of `dofs`, the only one of all but groups."""
+        return self.dofs[0] if self.dofs else None
+
+    @property
+    def contact(self) -> tuple[int, int] | None:
+        """The first of `contacts`, the only one of all but groups."""
+        return self.contacts[0] if self.contacts else None
 
     @property
     def label(self) -> str:
-        """A unique name: "offset of l_sole fz", "offset of limb sensor l_ankle fz"."""
-        limb = "limb sensor " if self.component and self.dof is not None else ""  # a link may have its joint's name
+        """A unique name: "offset of l_sole fz", "offset of limb sensor l_ankle fz", "scale of *_hip,*_knee"."""
+        limb = "limb sensor " if self.component and self.dofs else ""  # a link may have its joint's name
         channel = f"{limb}{self.name} {self.component}".strip()
         return f"{self.what.replace('_', ' ').replace('coulomb', 'Coulomb friction')} of {channel}"
 
@@ -78,37 +96,62 @@ def list_extras(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet, t
     one component of the vector is measured.
     """
     extras: list[Extra] = []
+    channels = list(_channels(robot, contacts, sensors))
     for what, scopes in (("offset", terms.offsets), ("scale", terms.scales)):
-        for channel, name, component, dof, contact in _channels(robot, contacts, sensors):
-            if channel in scopes:
-                unit, size = (_UNITS[channel], _SIZES[channel]) if what == "offset" else ("1", 0.1)
-                extras.append(Extra(what, name, component, unit, size, scopes[channel] == "log", dof, contact))
+        for channel, name, component, dofs, of_contacts in channels:
+            scope = scopes.get(channel)
+            if isinstance(scope, str):
+                unit, size = (_UNITS[channel], _SIZES[channel]) if what == "offset" else ("1", _SCALE_SIZE)
+                extras.append(Extra(what, name, component, unit, size, scope == "log", dofs, of_contacts))
+    for kind, groups in terms.scales.items():
+        if not isinstance(groups, str):
+            extras += _group_scales(kind, groups, [channel for channel in channels if channel.kind == kind])
     measured = np.flatnonzero(sensors.torque[: robot.n]).tolist()
     for what, unit, size in zip(ACTUATORS, ("kg m^2", "N m", "N m"), (0.1, 5.0, 1.0), strict=True):
         if getattr(terms, what):
-            extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, dof) for dof in measured]
+            extras += [Extra(what, robot.joint_names[dof], "", unit, size, False, (dof,)) for dof in measured]
     return tuple(extras)
 
 
-def measured_channels(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> tuple[str, ...]:
-    """Those of `CHANNELS` that a sensor set measures."""
-    kinds = {kind for kind, *_ in _channels(robot, contacts, sensors)}
-    return tuple(kind for kind in CHANNELS if kind in kinds)
+def _group_scales(kind: str, groups: ScaleGroups, channels: Sequence[Channel]) -> Iterator[Extra]:
+    """A scale for each group of channels of one kind that has a measured member."""
+    for patterns in groups:
+        members = [channel for channel in channels if any(fits(channel.name, pattern) for pattern in patterns)]
+        dofs = tuple(dof for channel in members for dof in channel.dofs)
+        contacts = tuple(at for channel in members for at in channel.contacts)
+        component = "" if kind == "joint_torque" else kind.rpartition("_")[-1]
+        if members:
+            yield Extra("scale", ",".join(patterns), component, "1", _SCALE_SIZE, False, dofs, contacts)
 
 
-def _channels(
-    robot: Robot, contacts: Sequence[Contact], sensors: SensorSet
-) -> Iterator[tuple[str, str, str, int | None, tuple[int, int] | None]]:
-    """Kind, name, component and index of every measured channel."""
+def measured_channels(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> dict[str, tuple[str, ...]]:
+    """Those of `CHANNELS` that a sensor set measures, with the names of the joints or frames of each."""
+    channels = list(_channels(robot, contacts, sensors))
+    names = {kind: tuple(dict.fromkeys(x.name for x in channels if x.kind == kind)) for kind in CHANNELS}
+    return {kind: named for kind, named in names.items() if named}
+
+
+class Channel(NamedTuple):
+    """A measured channel: one of `CHANNELS`, name of joint or frame, component, and its index as in `Extra`."""
+
+    kind: str
+    name: str
+    component: str
+    dofs: tuple[int, ...]
+    contacts: tuple[tuple[int, int], ...]
+
+
+def _channels(robot: Robot, contacts: Sequence[Contact], sensors: SensorSet) -> Iterator[Channel]:
+    """Every measured channel."""
     for dof in np.flatnonzero(sensors.torque).tolist():
         name, _, component = (
             robot.dof_names[dof].rpartition(".") if dof >= robot.n else (robot.joint_names[dof], "", "")
         )
         kind = "joint_torque" if dof < robot.n else "ft_force" if component.startswith("f") else "ft_moment"
-        yield kind, name, component, dof, None
+        yield Channel(kind, name, component, (dof,), ())
     for index, k in np.argwhere(recorded_components(contacts, sensors, in_world=True)).tolist():
         kind = "contact_force" if k < 3 else "contact_moment"
-        yield kind, contacts[index].frame, contacts[index].component_name(k), None, (index, k)
+        yield Channel(kind, contacts[index].frame, contacts[index].component_name(k), (), ((index, k),))
 
 
 def measured_components(contacts: Sequence[Contact], sensors: SensorSet) -> np.ndarray:

@@ -60,16 +60,15 @@ def _readings(samples: Samples, calibration: Sequence[tuple[Extra, float]], tree
     """Calibrated copies of the readings with extra parameters, by field."""
     copies: dict[str, Tensor] = {}
     for extra, value in calibration:
-        name = "torque" if extra.contact is None else "wrench"
+        name = "torque" if extra.dofs else "wrench"
         recorded: Tensor | None = getattr(samples, name)
         if recorded is None:
             continue
         if name not in copies:
             copies[name] = recorded.clone()
-        if extra.contact is None:
-            copies[name][:, extra.dof] -= value * dof_extra_column(extra, samples, tree)
-        else:
-            contact, axis = extra.contact
+        for dof in extra.dofs:
+            copies[name][:, dof] -= value * dof_extra_column(extra, dof, samples, tree)
+        for contact, axis in extra.contacts:
             copies[name][:, contact, axis] -= value * contact_extra_column(extra, samples, contact, axis)
     return copies
 
@@ -165,9 +164,9 @@ def measured_and_predicted_forces(
     measured = torque + contact_forces(builder, samples, state, kinematics).T
     predicted = predict_forces(builder, kinematics, phi).mT
     for number, extra in enumerate(builder.extras, start=builder.columns.count):
-        if extra.dof is not None and extra.what in ACTUATORS:
-            column = dof_extra_column(extra, samples, builder.tree)
-            predicted[..., base_rows + extra.dof] += phi[:, number, None] * column
+        for dof in extra.dofs if extra.what in ACTUATORS else ():
+            column = dof_extra_column(extra, dof, samples, builder.tree)
+            predicted[..., base_rows + dof] += phi[:, number, None] * column
     return GeneralizedForces(measured, torque, predicted)
 
 

@@ -277,7 +277,7 @@ class RowBuilder(nn.Module):
             self._project(None, W, dynamics, rows, workspace)
             for number, column in enumerate(block.extras, start=len(block.inertial) + len(block.friction)):
                 extra = self.extras[column - self.columns.count]
-                torch.mul(dof_extra_column(extra, samples, self.tree), weight, out=rows.values[number, 0])
+                torch.mul(dof_extra_column(extra, joint, samples, self.tree), weight, out=rows.values[number, 0])
             yield joint, rows
 
     def _coupled_rows(
@@ -316,7 +316,7 @@ class RowBuilder(nn.Module):
     def _extra_columns(self, part: _Part, layout: ContactStateLayout, block: RowBlock, W: Tensor) -> Tensor:
         """Columns of a block's extra parameters, (extras, r, B)."""
         extras = [self.extras[column - self.columns.count] for column in block.extras]
-        touching = {extra.contact[0] for extra in extras if extra.contact is not None}
+        touching = {contact for extra in extras for contact, _ in extra.contacts}
         turned = touching.difference(self._layouts.along_normal) if part.samples.wrench_in_world else ()
         rotations = {k: self._rotation(k, part.dynamics) for k in turned}
         basis = W.permute(2, 0, 1)

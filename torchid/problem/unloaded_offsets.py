@@ -57,7 +57,7 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
     """Equations of the unknown offsets, from the readings in the air among some samples of a log."""
     if samples.unloaded is None:
         return
-    scales = {x.contact: number for number, x in enumerate(builder.extras) if x.what == "scale" and x.contact}
+    scales = {at: number for number, x in enumerate(builder.extras) if x.what == "scale" for at in x.contacts}
     noise = builder.sensors.noise.wrench_std.tolist()
     for number, extra in enumerate(builder.extras):
         if extra.what != "offset" or extra.contact is None:

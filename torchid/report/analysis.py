@@ -237,18 +237,23 @@ def _table(title: str, *headings: str) -> Table:
 
 @dataclass(frozen=True)
 class SetAccuracy:
-    """Errors of a fit with one sensor set: expected, and measured on the test logs, if any."""
+    """Errors of a fit with one sensor set: expected, and measured on the test logs, if any.
+
+    `confounded`: what it is that the set does not separate, in words.
+    """
 
     channels: int
     rank: int
     expected: ExpectedErrors
     measured: Metrics | None
+    confounded: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, object]:
         """Rms by group of rows."""
         return {
             "channels": self.channels,
             "rank": self.rank,
+            "confounded": list(self.confounded),
             "expected_model_error": self.expected.model,
             "expected_sensor_noise": self.expected.sensors,
             "expected": self.expected.total,

@@ -1,0 +1,193 @@
+"""A mass that a scale has told fixes what torques alone leave open: by how much all their constants are off."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from currents import HIP_SCALE, HIPS, KNEE_SCALE, KNEES, NOISE, quadruped_files
+from refusals import refusal
+from repository import SHARED
+from synthetic import ROBOTS
+
+from torchid.cli import main
+from torchid.commands.identify import identify
+from torchid.config import load_config
+from torchid.errors import ConfoundedWarning
+from torchid.estimators import LeastSquares
+from torchid.fitting.known_masses import KnownMass, with_known_masses
+from torchid.identifiability.confounding import mass_weights
+from torchid.parameters import PER_BODY
+from torchid.problem import LinearProblem
+
+SCALES = dict.fromkeys(HIPS, HIP_SCALE) | dict.fromkeys(KNEES, KNEE_SCALE)
+SENSORS = {"set": "joints", "noise": NOISE, "scales": {"joint_torque": [HIPS, KNEES]}}
+LABELS = ("scale of *_hip,*_thigh", "scale of *_knee")
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
+    """An experiment file of a robot of which each type of motor has an unknown constant, and its mass [kg]."""
+    return quadruped_files(tmp_path_factory.mktemp("currents"), SCALES, sensors=SENSORS)
+
+
+def document(run: Path, name: str) -> dict[str, Any]:
+    return dict(json.loads((run / f"{name}.json").read_text()))
+
+
+def scales_of(run: Path) -> dict[str, dict[str, Any]]:
+    return {entry["label"]: entry for entry in document(run, "parameters")["extras"]}
+
+
+@pytest.mark.parametrize(
+    ("std", "more", "tolerance"),
+    [
+        (0.0, (), 1e-7),
+        (0.0, ("estimator.ridge=1e-3",), 3e-3),  # 1.4e-3: the ridge holds all other parameters near the URDF
+        (0.05, (), 1e-7),
+        (0.05, ("estimator.name=consistent", "estimator.ridge=1e-6"), 2e-4),
+    ],
+)
+def test_a_known_total_mass_gives_the_scales_of_all_motors(
+    world: tuple[Path, float], tmp_path: Path, std: float, more: tuple[str, ...], tolerance: float
+) -> None:
+    file, mass = world
+    known = f"estimator.total_mass={{value: {mass!r}, std: {std}}}"
+    assert main(["identify", str(file), known, f"output={tmp_path / 'run'}", *more]) == 0
+    found = scales_of(tmp_path / "run")
+    values = [found[label]["value"] for label in LABELS]
+    assert values == pytest.approx([HIP_SCALE - 1.0, KNEE_SCALE - 1.0], abs=tolerance)
+    assert all(found[label]["standard_error"] is not None for label in LABELS)
+    assert all(found[label]["told_apart"] for label in LABELS)
+    metrics = document(tmp_path / "run", "metrics")
+    assert metrics["confounded"] == []
+    assert metrics["total_mass"] == pytest.approx(mass, rel=1e-7 if not std else 1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf")
+def test_without_it_they_are_confounded_and_of_the_size_that_the_urdf_s_mass_makes_them(
+    world: tuple[Path, float], tmp_path: Path
+) -> None:
+    file, mass = world
+    with pytest.warns(ConfoundedWarning) as caught:
+        identify(load_config(file, [f"output={tmp_path / 'run'}"]))
+    (message,) = (str(x.message) for x in caught if issubclass(x.category, ConfoundedWarning))
+    said = "scale of *_hip,*_thigh, *_knee: confounded with the total mass; do not trust either; state estimator."
+    assert said in message
+    (confounded,) = document(tmp_path / "run", "metrics")["confounded"]
+    assert (confounded["extras"], confounded["confounded_with"]) == (list(LABELS), ["total mass"])
+    assert said in confounded["message"]
+    assert not any(entry["told_apart"] for entry in scales_of(tmp_path / "run").values())
+    assert all(entry["standard_error"] is None for entry in scales_of(tmp_path / "run").values())
+    assert document(tmp_path / "run", "metrics")["total_mass"] is None
+    values = [1.0 + scales_of(tmp_path / "run")[label]["value"] for label in LABELS]
+    urdf = document(tmp_path / "run", "metrics")["total_mass_nominal"]
+    assert values == pytest.approx([HIP_SCALE * urdf / mass, KNEE_SCALE * urdf / mass], rel=1e-7)
+
+
+def test_the_mass_of_one_body_does_as_well(world: tuple[Path, float], tmp_path: Path) -> None:
+    """Of those that the rows determine alone: the trunk's is a sum with others', a shank's too; of all it is known."""
+    file, mass = world
+    metrics = {}
+    for name, more in (("total", ()), ("with trunk", ("estimator.masses={trunk: {value: 9.0, std: 3.0}}",))):
+        known = f"estimator.total_mass={mass!r}"
+        assert main(["identify", str(file), known, *more, f"output={tmp_path / name}"]) == 0
+        metrics[name] = document(tmp_path / name, "metrics")
+        found = scales_of(tmp_path / name)
+        assert [found[label]["value"] for label in LABELS] == pytest.approx([-0.1, 0.15], abs=1e-6)
+    assert metrics["with trunk"]["rank"] == metrics["total"]["rank"] + 1
+
+
+def test_a_heavier_robot_has_torques_of_larger_scale_in_proportion(world: tuple[Path, float], tmp_path: Path) -> None:
+    file, mass = world
+    assert main(["identify", str(file), f"estimator.total_mass={1.1 * mass!r}", f"output={tmp_path / 'run'}"]) == 0
+    found = scales_of(tmp_path / "run")
+    values = [1.0 + found[label]["value"] for label in LABELS]
+    assert values == pytest.approx([1.1 * HIP_SCALE, 1.1 * KNEE_SCALE], rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("estimator.total_mass=heavy", "estimator.total_mass.value: found 'heavy'; accepted: a number"),
+        ("estimator.total_mass=-1", "estimator.total_mass"),
+        ("estimator.total_mass={value: 12, std: -1}", "estimator.total_mass.std"),
+        ("estimator.masses={trnk: 3}", "estimator.masses: unknown name 'trnk'; accepted: trunk"),
+        ("estimator={masses: {trunk: 3}, frozen: [trunk]}", "estimator.masses.trunk: a mass of a body that is frozen"),
+        ("estimator={masses: {trunk: 3}, total_mass: 2}", "estimator.total_mass: 2 kg, of which trunk alone are 3 kg"),
+        (
+            "estimator={name: consistent, masses: {trunk: 3}, bounds: {trunk: {m: [1, 4]}}}",
+            "estimator.masses.trunk: a mass, beside estimator.bounds.trunk.m; accepted: one of the two",
+        ),
+        ("estimator={name: sgd, total_mass: 12}", "estimator.total_mass: set, which sgd has not"),
+    ],
+)
+def test_a_mass_that_cannot_be_is_refused_in_one_line(
+    world: tuple[Path, float], tmp_path: Path, capsys: pytest.CaptureFixture[str], more: str, message: str
+) -> None:
+    file, _ = world
+    scales = () if "sgd" not in more else ("sensors={scales: {}}",)
+    command = ["identify", str(file), more, f"output={tmp_path / 'run'}", *scales]
+    assert message in refusal(command, file.parent, capsys)
+
+
+@pytest.mark.filterwarnings("ignore:identified.urdf")
+def test_a_total_mass_does_not_settle_scales_while_all_feet_stand(tmp_path: Path) -> None:
+    """A mass at a foot that stands acts on no joint: as much of the robot's as there may be."""
+    file, mass = quadruped_files(tmp_path, SCALES, states=[[True] * 4], noise=0.5, sensors=SENSORS)
+    with pytest.warns(ConfoundedWarning, match="confounded with m of"):
+        identify(load_config(file, [f"estimator.total_mass={mass!r}"]))
+    found = scales_of(tmp_path / "run")
+    assert not any(found[label]["told_apart"] or found[label]["standard_error"] for label in LABELS)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
+def test_a_recorded_robot_that_stands_on_all_feet_is_refused_with_the_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No torques, and all mass at the feet, fit torques best that the model does not explain."""
+    feet = [f"{end}{side}_foot" for end in "FR" for side in "LR"]
+    experiment = {
+        "robot": {"urdf": str(ROBOTS / "go2_description/urdf/go2.urdf")},
+        "contacts": [{"frame": foot, "type": "point", "radius": 0.022} for foot in feet],
+        "logs": {
+            "train": [f"{SHARED / 'go2_standing' / 'log.npz'}[5:50]"],
+            "columns": {"joint_torque": "torque_estimate", "contact_active": {"always": feet}},
+        },
+        "preprocessing": {"cutoff_hz": 4, "base_motion": "contacts"},
+        "sensors": {"set": "joints", "scales": {"joint_torque": [["*_hip_joint", "*_thigh_joint"], "*_calf_joint"]}},
+        "estimator": {"ridge": 0.001, "total_mass": {"value": 15.2, "std": 0.05}},
+        "output": str(tmp_path / "run"),
+    }
+    (tmp_path / "go2.yaml").write_text(yaml.safe_dump(experiment))
+    message = refusal(["identify", str(tmp_path / "go2.yaml")], tmp_path, capsys)
+    assert "sensors.scales: of all measured forces, which no mass determines here: scale of *_hip_joint" in message
+    assert "accepted: a sensor without a scale, or logs in which each contact lifts" in message
+
+
+def test_exact_masses_hold_whatever_the_data_say_and_uncertain_ones_are_weighed() -> None:
+    """Against the optimum with a Lagrange multiplier, and against rows of their own."""
+    rng, count = np.random.default_rng(0), 3 * PER_BODY
+    A, b = rng.normal(size=(2 * count, count)), rng.normal(size=2 * count)
+    nominal, scale = rng.uniform(0.5, 1.0, count), rng.uniform(0.5, 2.0, count)
+    free = np.ones(count, dtype=bool)
+    free[PER_BODY : 2 * PER_BODY] = False
+    problem = LinearProblem(A, b, 0.0, 2 * count, nominal, scale, free)
+    total, one = mass_weights(3), mass_weights(3) * (np.arange(count) == 0)
+    exact = KnownMass("a", total, 7.0), KnownMass("b", one, 2.5)
+    found = LeastSquares().solve(with_known_masses(problem, exact)).phi
+    E = np.array([total, one])[:, free]
+    known = np.array([7.0, 2.5]) - np.array([total, one])[:, ~free] @ nominal[~free]
+    left = b - A[:, ~free] @ nominal[~free]
+    H = np.block([[A[:, free].T @ A[:, free], E.T], [E, np.zeros((2, 2))]])
+    expected = np.linalg.solve(H, np.append(A[:, free].T @ left, known))[: free.sum()]
+    np.testing.assert_allclose(found[free], expected, rtol=1e-9)
+    assert np.array_equal(found[~free], nominal[~free])
+    uncertain = with_known_masses(problem, [KnownMass("a", total, 7.0, 0.2)], 1.5)
+    rows = np.vstack([A, 1.5 / 0.2 * total])
+    expected = np.linalg.lstsq(rows[:, free], np.append(left, 7.5 * (7.0 - total[~free] @ nominal[~free])))[0]
+    np.testing.assert_allclose(LeastSquares().solve(uncertain).phi[free], expected, rtol=1e-9)

@@ -1,0 +1,81 @@
+"""Extra parameters of an experiment file, checked against a robot and what is measured of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+from torchid.errors import ConfigError, UnknownNameError
+from torchid.logs.column_map import fits
+from torchid.problem import ExtraTerms
+from torchid.problem.extras import CHANNELS, ScaleGroups, measured_channels
+from torchid.robot import Robot
+from torchid.sensing import Contact, SensorSet
+
+
+def check_scale_groups(terms: ExtraTerms, robot: Robot, contacts: Sequence[Contact]) -> None:
+    """Refuse groups of `sensors.scales` that name what the robot does not have, or one sensor twice.
+
+    Raises:
+        UnknownNameError: a pattern that no joint or frame fits.
+        ConfigError: a joint or frame in two groups.
+    """
+    frames = tuple(contact.frame for contact in contacts)
+    names = dict.fromkeys(CHANNELS, frames) | {"joint_torque": robot.joint_names}
+    names |= dict.fromkeys(("ft_force", "ft_moment"), robot.ft_names)
+    for kind, groups in _groups(terms).items():
+        field, group_of = f"sensors.scales.{kind}", dict[str, Sequence[str]]()
+        for group in groups:
+            for pattern in group:
+                if not _fitting(names[kind], pattern):
+                    raise UnknownNameError.at_field(field, pattern, names[kind])
+            for name in (x for x in names[kind] if any(fits(x, pattern) for pattern in group)):
+                if name in group_of:
+                    both = f"[{', '.join(group_of[name])}] and [{', '.join(group)}]"
+                    raise ConfigError.at_field(field, f"'{name}' in two groups, {both}", "one group, or none, for each")
+                group_of[name] = group
+
+
+def check_terms(
+    terms: ExtraTerms, actuators: object, robot: Robot, contacts: Sequence[Contact], sensors: SensorSet
+) -> None:
+    """Refuse extra parameters of channels that nothing measures; all kinds of channels mean those that are measured.
+
+    Args:
+        terms: that are fitted.
+        actuators: the block of that name.
+        robot: the robot.
+        contacts: of it.
+        sensors: what is measured.
+
+    Raises:
+        ConfigError: a kind of channels, or actuators' terms, without a sensor.
+        UnknownNameError: a group's pattern that fits no sensor that is measured.
+    """
+    measured = measured_channels(robot, contacts, sensors)
+    for key, scopes in _scopes(terms).items():
+        for channel, scope in scopes.items():
+            if channel not in measured and (len(scopes) < len(CHANNELS) or not isinstance(scope, str)):
+                accepted = f"{', '.join(measured)}, or log or all for every kind that is measured"
+                raise ConfigError.at_field(f"sensors.{key}.{channel}", "no such sensor is measured", accepted)
+    for kind, groups in _groups(terms).items():
+        for pattern in (pattern for group in groups for pattern in group):
+            if not _fitting(measured[kind], pattern):
+                what = f"whose {kind} is not measured"
+                raise UnknownNameError.at_field(f"sensors.scales.{kind}", pattern, measured[kind], what)
+    for name, value in vars(actuators).items():
+        if value and "joint_torque" not in measured:
+            accepted = "joint torques among the sensors, or no such key"
+            raise ConfigError.at_field(f"actuators.{name}", "set, but no joint torque is measured", accepted)
+
+
+def _scopes(terms: ExtraTerms) -> dict[str, Any]:
+    return {"offsets": terms.offsets, "scales": terms.scales}
+
+
+def _groups(terms: ExtraTerms) -> dict[str, ScaleGroups]:
+    return {kind: groups for kind, groups in terms.scales.items() if not isinstance(groups, str)}
+
+
+def _fitting(names: Collection[str], pattern: str) -> bool:
+    return any(fits(name, pattern) for name in names)

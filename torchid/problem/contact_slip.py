@@ -1,0 +1,173 @@
+"""Slip: contacts that move on the ground while their flags say that they stand."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchid.logs import Log
+from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.preprocess import near_contact_changes
+from torchid.problem.rows import RowBuilder
+from torchid.problem.samples import Samples
+from torchid.regressor.kinematics import rotation_matrix
+from torchid.regressor.regressor import generalized_forces
+from torchid.robot import Robot
+from torchid.sensing import Contact, named_sensors
+
+LEAST_LIMIT = 0.02
+"""Limit [m/s] that is chosen at least: soft ground creeps by millimetres, and a filter leaves some of an impact."""
+
+_NOISES = 6.0  # standard deviations of a stance's velocity, by axis, that are noise
+_MEDIAN_SPEED = 1.538  # of a velocity whose three components have unit variance (Maxwell distribution)
+_STENCIL = 3.0  # steps that a derivative looks to each side
+_TOGETHER = 2048  # samples whose velocities are worked out at once
+
+
+@dataclass(frozen=True)
+class Slip:
+    """Speed of the contacts on the ground.
+
+    Attributes:
+        speed: (N, C) [m/s], of the material point that touches; NaN where it is not known or the contact does not
+            stand, or was about to change.
+        limits: (C,) [m/s], above which a contact slips.
+        relative: whether speeds are against the other contacts that stand, as the base's velocity was not recorded.
+        frames: of the contacts.
+    """
+
+    speed: FloatArray
+    limits: FloatArray
+    relative: bool
+    frames: tuple[str, ...]
+
+    @property
+    def slips(self) -> BoolArray:
+        """Which contacts slip, (N, C)."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.speed > self.limits)
+
+    @property
+    def checked(self) -> bool:
+        """Whether any speed is known."""
+        return bool(np.isfinite(self.speed).any())
+
+    def __str__(self) -> str:
+        """How many samples of which contacts slip, "" for none."""
+        counts, fastest = self.slips.sum(axis=0), np.nanmax(np.where(self.slips, self.speed, 0.0), axis=0, initial=0.0)
+        named = [
+            f"{frame} in {count} samples (up to {most:.2g} m/s, more than {limit:.2g})"
+            for frame, count, most, limit in zip(self.frames, counts, fastest, self.limits, strict=True)
+            if count
+        ]
+        return ", ".join(named)
+
+
+def measure_slip(
+    log: Log,
+    samples: Samples,
+    recorded: Log,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    limit: float | None = None,
+    cutoff_hz: float | None = None,
+    base_is_derived: bool = False,
+) -> Slip:
+    """Speeds of the contacts that stand on the ground, of a log and its samples.
+
+    The velocity of a contact that rolls is that of the material point at the ground. Where the log has the velocity of
+    its base it is that in the world; else it is that against the median of all contacts that stand (the base's linear
+    velocity is in each alike), known from two contacts on; of two that move apart both count.
+
+    Args:
+        log: preprocessed.
+        samples: bound from it, one for one.
+        recorded: the log with its flags as recorded; contacts count as standing away from their changes alone.
+        robot: the robot.
+        contacts: of the samples.
+        limit: [m/s] above which a contact slips; None for six standard deviations of each contact's velocity while it
+            stands, by its median, and at least `LEAST_LIMIT`.
+        cutoff_hz: of the filter, which spreads what happens at a change over its inverse; None for no filter.
+        base_is_derived: whether the base's motion follows from the contacts themselves.
+    """
+    builder = RowBuilder(robot, _plain(contacts), named_sensors("full", robot.n, len(contacts), ft=len(robot.ft_names)))
+    known = None if base_is_derived else _base_velocity(log, samples)
+    velocity = _velocities(builder, samples, known)
+    standing = _standing(samples, recorded, contacts, cutoff_hz)
+    velocity[~standing] = np.nan
+    relative = known is None and not robot.fixed_base
+    if relative:
+        velocity = _against_others(velocity)
+    speed = np.linalg.norm(velocity, axis=2)
+    limits = np.full(len(contacts), np.inf if limit is None else limit)
+    if limit is None:
+        for contact in np.flatnonzero(np.isfinite(speed).any(axis=0)):
+            noise = float(np.nanmedian(speed[:, contact])) / _MEDIAN_SPEED
+            limits[contact] = max(_NOISES * noise, LEAST_LIMIT)
+    return Slip(speed, limits, relative, tuple(contact.frame for contact in contacts))
+
+
+def _plain(contacts: Sequence[Contact]) -> list[Contact]:
+    """The contacts with the axes of their frames, however they are read."""
+    return [dataclasses.replace(contact, along_normal=False) for contact in contacts]
+
+
+def _base_velocity(log: Log, samples: Samples) -> Tensor | None:
+    """Velocity of the base's origin along its axes, (N, 3) [m/s]; None where it was not recorded."""
+    velocity, quat = log.base_linear_velocity_world, samples.base.quat_xyzw
+    if velocity is None or quat is None:
+        return None
+    return (rotation_matrix(quat).mT @ torch.as_tensor(velocity).to(quat)[..., None])[..., 0]
+
+
+def _velocities(builder: RowBuilder, samples: Samples, base: Tensor | None) -> FloatArray:
+    """Velocities of the contacts' points along the base's axes, (N, C, 3) [m/s], the base's origin at rest for None."""
+    tree, out = builder.tree, np.empty((len(samples), len(builder.contacts), 3))
+    for start in range(0, len(samples), _TOGETHER):
+        part = samples[start : start + _TOGETHER]
+        kinematics = builder.kinematics(part)
+        v = torch.nn.functional.pad(part.joint_velocity, (0, tree.n_dofs - tree.n))  # sensors in limbs do not move
+        if tree.base_rows:
+            linear = torch.zeros_like(v[:, :1].expand(-1, 3)) if base is None else base[start : start + _TOGETHER]
+            angular = part.base.angular_velocity
+            v = torch.cat([linear, torch.zeros_like(linear) if angular is None else angular, v], dim=1)
+        for contact, (body, _) in enumerate(builder.frames):
+            units = builder.unit_wrenches(kinematics, contact, [0, 1, 2])
+            joints = builder.columns.joints_above(body)
+            rows = [*range(tree.base_rows), *(tree.base_rows + joint for joint in joints)]
+            forces = generalized_forces(tree, kinematics.screw_axes, body, units, joints)  # (3, rows, B)
+            along_frame = (forces * v.T[rows]).sum(1)
+            velocity = (units[:3] * along_frame).sum(1)  # of a unit force the first three are the frame's axis
+            out[start : start + len(part), contact] = velocity.T.cpu().numpy()
+    return out
+
+
+def _standing(samples: Samples, recorded: Log, contacts: Sequence[Contact], cutoff_hz: float | None) -> BoolArray:
+    """Which contacts stand and are away from their own changes, (N, C)."""
+    time, standing = samples.time.cpu().numpy(), samples.active.cpu().numpy().copy()
+    margin = _STENCIL * float(np.median(np.diff(recorded.time))) + (0.0 if cutoff_hz is None else 1.0 / cutoff_hz)
+    if recorded.contact_active is None:
+        return np.asarray(standing)
+    for index, contact in enumerate(contacts):
+        if contact.frame in recorded.contact_names:
+            own = recorded.contact_active[:, [recorded.contact_names.index(contact.frame)]]
+            alone = dataclasses.replace(recorded, contact_active=np.repeat(own, len(recorded.contact_names), axis=1))
+            standing[:, index] &= ~near_contact_changes(alone, time, margin)
+    return np.asarray(standing)
+
+
+def _against_others(velocity: FloatArray) -> FloatArray:
+    """Velocities (N, C, 3), NaN where a contact does not stand, against those that stand; NaN of one alone."""
+    count = np.isfinite(velocity[:, :, 0]).sum(axis=1)
+    out = np.full_like(velocity, np.nan)
+    two, more = count == 2, count > 2
+    if more.any():
+        out[more] = velocity[more] - np.nanmedian(velocity[more], axis=1, keepdims=True)
+    if two.any():
+        out[two] = 2.0 * (velocity[two] - np.nanmean(velocity[two], axis=1, keepdims=True))
+    return out
