@@ -243,10 +243,8 @@ def _print_fit(run: Identification) -> None:
         print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
     print(f"total mass    {_mass_text(run.mass)} (URDF: {run.mass.nominal:.3f} kg)")
     if run.robust is not None:
-        robust = run.robust
-        print(
-            f"robust        {robust.loss}, {100 * robust.mean_weight:.3g} % of the weight kept, {robust.passes} passes"
-        )
+        kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
+        print(f"robust        {run.robust.loss}, {kept}, {run.robust.passes} passes")
     if robot.massless:
         print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
 
@@ -303,7 +301,7 @@ def _analyze(options: argparse.Namespace) -> None:
     with _importing():
         from torchid.commands.analyze import analyze
         from torchid.config import load_analysis
-        from torchid.report.analysis import accuracy_table
+        from torchid.report.analysis import accuracy_table, confounded_lines
         from torchid.report.tables import print_tables
 
     analysis = analyze(load_analysis(options.file, options.overrides))
@@ -312,9 +310,8 @@ def _analyze(options: argparse.Namespace) -> None:
         _print_scenario(scenario)
     if analysis.accuracies:
         print_tables(accuracy_table(analysis.accuracies))
-        for name, found in analysis.accuracies.items():
-            for message in found.confounded:
-                print(fill(f"confounded    {name}: {message}", 100, subsequent_indent=" " * 14))
+        for line in confounded_lines(analysis.accuracies):
+            print(line)
     print(f"written to    {analysis.output}")
 
 
@@ -345,9 +342,8 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
             print(fill(line, 100, subsequent_indent="  "))
     if plan.removals:
         print_tables(removal_table(plan))
-    print(
-        f"structure     {base.rank} combinations of {int(base.free.sum())} parameters; base_parameters.txt names them"
-    )
+    structure = f"{base.rank} combinations of {int(base.free.sum())} parameters"
+    print(f"structure     {structure}; base_parameters.txt names them")
     print()
 
 

@@ -18,6 +18,9 @@ from torchid.sensing import Contact
 MOST_SLIPPING_SHARE = 0.3
 """Of a contact's samples: where more of them slip it is no slip, but wrong flags, radii or another motion."""
 
+CLEAR_SLIP = 2.0
+"""Times its limit that a contact that is named moves at its fastest: noise of cameras and encoders has long tails."""
+
 _SLIP_CHECK = "slip of contacts"
 _ADVICE = "preprocessing.max_slip: auto leaves these samples out; look for dust, a soft floor or flags that are late"
 
@@ -32,7 +35,7 @@ def check_slip(
         return
     cutoff_hz = cutoff_hz or default_cutoff_hz(log)
     slips, checked = np.zeros((len(log), len(contacts)), dtype=bool), False
-    standing = np.zeros(len(contacts))
+    standing, fastest = np.zeros(len(contacts)), np.zeros(len(contacts))
     for start in range(0, len(log), MAX_DIFFERENTIATED_SAMPLES):
         part = log.select(slice(start, start + MAX_DIFFERENTIATED_SAMPLES))
         try:
@@ -47,9 +50,10 @@ def check_slip(
         for index in range(len(contacts)):
             slips[nearest[slip.slips[:, index]], index] = True
         standing += np.isfinite(slip.speed).sum(axis=0)
+        fastest = np.maximum(fastest, np.nanmax(slip.speed / slip.limits, axis=0, initial=0.0))
     if not checked:
         yield Skipped(_SLIP_CHECK, "neither the base's linear velocity nor two contacts that stand at once")
-    for contact, own, stands in zip(contacts, slips.T, standing.tolist(), strict=True):
-        if 0 < own.sum() <= MOST_SLIPPING_SHARE * stands:
+    for contact, own, stands, peak in zip(contacts, slips.T, standing.tolist(), fastest.tolist(), strict=True):
+        if peak >= CLEAR_SLIP and own.sum() <= MOST_SLIPPING_SHARE * stands:
             text = f"{contact.frame} moves on the ground in {int(own.sum())} samples"
             yield Finding("slip", SUSPICIOUS, "contact_active", text, _ADVICE, (contact.frame,), tuple(find_spans(own)))

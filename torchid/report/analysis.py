@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from textwrap import wrap
+from textwrap import fill, wrap
 from typing import Any
 
 import matplotlib
@@ -282,6 +282,12 @@ def accuracy_table(sets: Mapping[str, SetAccuracy]) -> Table:
             first = ["", "", ""]
         table.add_section()
     return table
+
+
+def confounded_lines(sets: Mapping[str, SetAccuracy]) -> list[str]:
+    """What each set does not separate, one paragraph a message."""
+    messages = [f"confounded    {name}: {message}" for name, found in sets.items() for message in found.confounded]
+    return [fill(message, 100, subsequent_indent=" " * 14) for message in messages]
 
 
 def _number(x: float | None) -> str:
