@@ -229,14 +229,15 @@ def nested_parquet(path: Path, log: Log) -> Path:
         "state": {"joints": joints, "base": base},
         "feet": feet,
     }
-    pq.write_table(pa.table({name: _struct(inner) for name, inner in tree.items()}), path)
+    pq.write_table(pa.table({name: struct(inner) for name, inner in tree.items()}), path)
     return path
 
 
-def _struct(tree: Any) -> Any:
-    if not isinstance(tree, dict):
+def struct(tree: Any) -> Any:
+    """Nested mappings as a nested column."""
+    if not isinstance(tree, Mapping):
         return pa.array(tree)
-    return pa.StructArray.from_arrays([_struct(inner) for inner in tree.values()], list(tree))
+    return pa.StructArray.from_arrays([struct(inner) for inner in tree.values()], list(tree))
 
 
 GROUPS_MAP = """

@@ -13,7 +13,7 @@ import pinocchio as pin
 import pyarrow as pa
 import pyarrow.parquet as pq
 from bags import FLAG, IMU, JOINT_STATE, ODOMETRY, Entry, imu, joint_state, odometry, write_bag
-from dialects import save_csv
+from dialects import save_csv, struct
 from low_states import FEET, GO2
 from motions import value
 from numpy.typing import NDArray
@@ -311,14 +311,8 @@ def nested_parquet(path: Path, motion: Motion) -> Path:
         turn = dict(zip("xyzw", _parts(log.base_quat_xyzw), strict=True))
         tree["base"] = {"position": parts, "orientation": turn}
         tree["grf"] = {name: motion.counts[:, k] for k, name in enumerate(log.contact_names)}
-    pq.write_table(pa.table({name: _struct(inner) for name, inner in tree.items()}), path)
+    pq.write_table(pa.table({name: struct(inner) for name, inner in tree.items()}), path)
     return path
-
-
-def _struct(tree: Any) -> Any:
-    if not isinstance(tree, Mapping):
-        return pa.array(tree)
-    return pa.StructArray.from_arrays([_struct(inner) for inner in tree.values()], list(tree))
 
 
 def _parts(values: Array | None, scale: float = 1.0) -> list[Array]:

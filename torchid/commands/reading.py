@@ -113,10 +113,11 @@ class LogReader:
         if kept is None or kept.all():
             return samples
         if not kept.any():
-            found = "no sample away from changes of contact in which no contact slips"
-            raise LogError(
-                path, "contact_active", found, "a larger preprocessing.max_slip, or a smaller contact_margin_s"
-            )
+            found, accepted = "no sample away from changes of contact", "a smaller preprocessing.contact_margin_s"
+            if slip is not None:
+                found = f"{found} in which no contact slips"
+                accepted = "a larger preprocessing.max_slip, or a smaller contact_margin_s"
+            raise LogError(path, "contact_active", found, accepted)
         return samples[torch.from_numpy(np.flatnonzero(kept))]
 
     def _slipping(self, log: Log, samples: Samples, recorded: Log) -> FloatArray | None:
