@@ -65,11 +65,11 @@ def cheapest_set(
     deadline = time.monotonic() + seconds
     solved = [_cheapest_part(part, kept, deadline) for part in demand_groups(demands, usable)]
     chosen = kept.union(*(result.chosen for result in solved))
-    beside = total_cost(kept.difference(*(result.chosen for result in solved)))
+    beside, cost = total_cost(kept.difference(*(result.chosen for result in solved))), total_cost(chosen)
     return CheapestSet(
         tuple(c for c in candidates if c in chosen),
-        total_cost(chosen),
-        beside + sum(result.lower_bound for result in solved),
+        cost,
+        min(cost, beside + sum(result.lower_bound for result in solved)),  # as sums in another order round otherwise
         all(result.proven for result in solved),
     )
 
