@@ -63,7 +63,7 @@ def assert_agrees(legged: Legged, seconds: float, seed: int, least: float) -> No
     true, exact = walked(legged, seconds, seed)
     active = value(exact.log.contact_active)
     assert 0.05 < 1.0 - active.mean() < 0.5, "feet must be in the air for a while"
-    found = detect_contacts(noisy(legged, seconds, seed), true.robot, legged.contacts(), DEFAULT)
+    found = detect_contacts(noisy(legged, seconds, seed), true.robot, legged.contacts(), DEFAULT).active
     margin = round(DEFAULT.margin_s / float(np.median(np.diff(exact.log.time))))
     each, together = agreement(found, active, margin)
     assert each >= least
@@ -72,7 +72,7 @@ def assert_agrees(legged: Legged, seconds: float, seed: int, least: float) -> No
 
 @pytest.mark.parametrize("legged", WALKERS)
 def test_flags_of_a_noisy_recording_are_those_of_the_simulator(legged: Legged) -> None:
-    assert_agrees(legged, SECONDS, 0, 0.94 if legged is G1 else AGREEING)  # one foot carries 2 % of G1 for a second
+    assert_agrees(legged, SECONDS, 0, AGREEING)
 
 
 @pytest.mark.slow
@@ -82,11 +82,43 @@ def test_flags_of_a_long_noisy_recording_are_those_of_the_simulator(legged: Legg
     assert_agrees(legged, 20.0, seed, AGREEING)  # 0.977 to 0.988 measured
 
 
+def test_a_foot_that_keeps_still_stands_however_little_it_carries() -> None:
+    """One foot carries 2 % of G1 for a second."""
+    true, exact = walked(G1)
+    active = value(exact.log.contact_active)
+
+    def missed(log: Log, light: float) -> float:
+        found = detect_contacts(log, true.robot, G1.contacts(), replace(DEFAULT, light=light)).active
+        return float((active & ~found).sum() / active.sum())
+
+    by_load = 1.0
+    assert missed(exact.log, DEFAULT.light) < 0.2 * missed(exact.log, by_load)
+    assert missed(noisy(G1), DEFAULT.light) < 0.5 * missed(noisy(G1), by_load)  # whose speeds are against other feet
+    without = replace(noisy(G1), **NO_BASE)
+    assert missed(without, DEFAULT.light) == missed(without, by_load), "no speed without the base's angular velocity"
+
+
+def test_samples_whose_flags_may_be_wrong_are_not_certain() -> None:
+    """Both ends are known to a filter's period, and stances too short to count are in doubt."""
+    true, exact = walked(QUADRUPED)
+    found = detect_contacts(noisy(QUADRUPED), true.robot, QUADRUPED.contacts(), DEFAULT)
+    time = exact.log.time - exact.log.time[0]
+    ends = (time < 2.0 / DEFAULT.cutoff_hz - 0.01) | (time > time[-1] - 2.0 / DEFAULT.cutoff_hz + 0.01)
+    assert not found.certain[ends].any()
+    assert found.certain[~ends].mean() > 0.9
+    forces = normal_forces(noisy(QUADRUPED), true.robot, QUADRUPED.contacts(), DEFAULT.cutoff_hz)
+    samples = np.searchsorted(exact.log.time, forces.time - 1e-9)
+    weight = 9.81 * float(true.robot.nominal[:, 0].sum())
+    doubtful = ((forces.force > DEFAULT.touch * weight) & ~found.active[samples]).any(axis=1)
+    assert doubtful.any(), "impacts and swings load a foot for a moment"
+    assert not found.certain[samples][doubtful].any()
+
+
 @pytest.mark.parametrize("recorded", [NO_IMU, NO_BASE], ids=["orientation alone", "nothing of the base"])
 @pytest.mark.parametrize("legged", [WALKERS[0], WALKERS[2]])
 def test_point_feet_are_told_without_an_imu(legged: Legged, recorded: dict[str, None]) -> None:
     true, exact = walked(legged)
-    found = detect_contacts(replace(noisy(legged), **recorded), true.robot, legged.contacts(), DEFAULT)
+    found = detect_contacts(replace(noisy(legged), **recorded), true.robot, legged.contacts(), DEFAULT).active
     each, _ = agreement(found, value(exact.log.contact_active), 10)
     assert each >= AGREEING
 
@@ -113,13 +145,13 @@ def test_the_order_of_joints_does_not_matter_and_contacts_keep_theirs() -> None:
         joint_torque=value(log.joint_torque)[:, joints],
     )
     contacts = QUADRUPED.contacts()
-    found = detect_contacts(log, true.robot, contacts, DEFAULT)
-    np.testing.assert_array_equal(detect_contacts(shuffled, true.robot, contacts, DEFAULT), found)
-    flagged = with_detected_contacts(log, true.robot, contacts[::-1])
+    found = detect_contacts(log, true.robot, contacts, DEFAULT).active
+    np.testing.assert_array_equal(detect_contacts(shuffled, true.robot, contacts, DEFAULT).active, found)
+    flagged = with_detected_contacts(log, true.robot, contacts[::-1])[0]
     assert flagged.contact_names == log.contact_names, "wrenches keep their columns"
     assert (value(flagged.contact_active) == found).mean() > 0.999
     bare = replace(log, contact_names=(), contact_active=None, contact_wrench_world=None)
-    assert with_detected_contacts(bare, true.robot, contacts[::-1]).contact_names == tuple(
+    assert with_detected_contacts(bare, true.robot, contacts[::-1])[0].contact_names == tuple(
         contact.frame for contact in contacts[::-1]
     )
 
@@ -129,8 +161,8 @@ def test_sensors_in_limbs_change_nothing() -> None:
     contacts, log = QUADRUPED.contacts(), noisy(QUADRUPED)
     split = load(QUADRUPED.urdf, None, False, ("front_left_sole",))
     assert split.n_dofs == true.robot.n + 6
-    found = detect_contacts(log, split, contacts, DEFAULT)
-    assert (found == detect_contacts(log, true.robot, contacts, DEFAULT)).mean() > 0.999
+    found = detect_contacts(log, split, contacts, DEFAULT).active
+    assert (found == detect_contacts(log, true.robot, contacts, DEFAULT).active).mean() > 0.999
 
 
 def test_gaps_in_a_reading_leave_the_flags_around_them() -> None:
@@ -138,9 +170,9 @@ def test_gaps_in_a_reading_leave_the_flags_around_them() -> None:
     log = noisy(QUADRUPED)
     torque, position = value(log.joint_torque).copy(), log.joint_position.copy()
     torque[700:704, 2], position[900, 5] = np.nan, np.nan
-    found = detect_contacts(log, true.robot, QUADRUPED.contacts(), DEFAULT)
+    found = detect_contacts(log, true.robot, QUADRUPED.contacts(), DEFAULT).active
     holed = replace(log, joint_torque=torque, joint_position=position)
-    assert (detect_contacts(holed, true.robot, QUADRUPED.contacts(), DEFAULT) == found).mean() > 0.99
+    assert (detect_contacts(holed, true.robot, QUADRUPED.contacts(), DEFAULT).active == found).mean() > 0.99
 
 
 # ----------------------------------------------------------------------------------------------- known loads, no motion
@@ -178,10 +210,10 @@ def test_feet_of_a_robot_that_something_else_carries_do_not_stand(carried: float
     robot = robot_of(stance("quadruped").machine)
     weight = 9.81 * float(robot.nominal[:, 0].sum())
     log, contacts = still(np.full(4, carried * weight))
-    assert not detect_contacts(log, robot, contacts, DEFAULT).any()
+    assert not detect_contacts(log, robot, contacts, DEFAULT).active.any()
     log, contacts = still(np.array([0.25, 0.25, 0.25, 0.0]) * weight)
     np.testing.assert_array_equal(
-        detect_contacts(log, robot, contacts, DEFAULT), np.tile([True, True, True, False], (len(log), 1))
+        detect_contacts(log, robot, contacts, DEFAULT).active, np.tile([True, True, True, False], (len(log), 1))
     )
 
 
@@ -204,7 +236,7 @@ def test_flags_that_were_made_are_not_condemned_by_the_checks() -> None:
     late = replace(log, contact_active=np.roll(value(log.contact_active), 20, axis=0))
     condemned = [x.field for x in check(late, true.robot, contacts).findings if x.severity == "condemned"]
     assert "contact_active" in condemned
-    for made in (late, with_detected_contacts(late, true.robot, contacts)):
+    for made in (late, with_detected_contacts(late, true.robot, contacts)[0]):
         findings = check(made, true.robot, contacts, derived=("contact_active",)).findings
         assert not [x for x in findings if x.field in ("contact_active", "contact_names")]
 
@@ -220,7 +252,7 @@ def test_a_leg_without_torques_is_refused() -> None:
         LogError,
     )
     assert "3 joints or more above each contact" in message
-    assert detect_contacts(log, true.robot, (), DEFAULT).shape == (len(log), 0)
+    assert detect_contacts(log, true.robot, (), DEFAULT).active.shape == (len(log), 0)
 
 
 def test_a_log_without_torques_or_joints_is_refused_in_one_line() -> None:

@@ -84,7 +84,7 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
             settings = config.preprocessing
-            log = with_flags(read_log_to_check(file, config.logs, settings), scene)
+            log, _ = with_flags(read_log_to_check(file, config.logs, settings), scene)
             found = check(log, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
             checked.append(replace(found, rolling=scene.rolling))
     return checked

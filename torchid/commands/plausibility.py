@@ -209,7 +209,7 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     for path in files.train:
         with suppress(InputError):  # larger than memory: it is not checked
             for log, name in stretches_to_check(path, files, settings):
-                flagged = with_flags(log, scene)
+                flagged, _ = with_flags(log, scene)
                 checked = check(flagged, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
                 severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
                 findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]

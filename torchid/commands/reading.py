@@ -19,8 +19,8 @@ from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
-from torchid.logs.log import FloatArray
-from torchid.logs.preprocess import away_from_changes, preprocess
+from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
 from torchid.logs.time_range import LogPart, share_samples, split_range
 from torchid.problem import Samples, bind_log
 from torchid.problem.contact_detection import with_detected_contacts
@@ -90,7 +90,7 @@ class LogReader:
             return self._large_log(path, required, None).samples(fits_contact_offsets(self.scene))
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
         read = read_log(path, topics, allow_gaps=settings.exclude_condemned, columns=columns)
-        recorded = with_flags(read, self.scene)
+        recorded, certain = with_flags(read, self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         rates = settings.cutoff_hz, settings.sample_rate_hz
@@ -110,6 +110,9 @@ class LogReader:
         if settings.margin_s is not None:
             away = away_from_changes(recorded, samples.time.numpy(), settings.margin_s)
             kept = away if kept is None else kept if away is None else kept & away
+        if not certain.all():
+            away = away_from_stamps(samples.time.numpy(), recorded.time[~certain], settings.margin_s or 0.0)
+            kept = away if kept is None else kept & away
         if kept is None or kept.all():
             return samples
         if not kept.any():
@@ -200,10 +203,12 @@ class LogReader:
         return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz, settings.derived)
 
 
-def with_flags(log: Log, scene: Scene) -> Log:
-    """A log as it was read, with contact flags from joint torques if the settings want these."""
+def with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
+    """A log as it was read, and where its contact flags are certain: from joint torques if the settings want these."""
     settings = scene.config.preprocessing.detect_contacts
-    return log if settings is None else with_detected_contacts(log, scene.robot, scene.contacts, settings)
+    if settings is None:
+        return log, np.ones(len(log), dtype=bool)
+    return with_detected_contacts(log, scene.robot, scene.contacts, settings)
 
 
 def check_parts(logs: Mapping[str, Sequence[Samples]]) -> None:

@@ -324,13 +324,18 @@ def find_unloaded(time: FloatArray, active: BoolArray, margin: float = UNLOADED_
     """
     out = np.ones(active.shape, dtype=bool)
     for contact in range(active.shape[1]):
-        touching = time[active[:, contact]]
-        if len(touching):
-            after = np.searchsorted(touching, time)
-            since = np.abs(time - touching[np.maximum(after - 1, 0)])
-            until = np.abs(touching[np.minimum(after, len(touching) - 1)] - time)
-            out[:, contact] = np.minimum(since, until) > margin
+        out[:, contact] = away_from_stamps(time, time[active[:, contact]], margin)
     return out
+
+
+def away_from_stamps(time: FloatArray, stamps: FloatArray, margin: float) -> BoolArray:
+    """Which times (K,) [s] are further than a margin [s] from each of some stamps (M,) [s] in order, (K,)."""
+    if not len(stamps):
+        return np.ones(len(time), dtype=bool)
+    after = np.searchsorted(stamps, time)
+    since = np.abs(time - stamps[np.maximum(after - 1, 0)])
+    until = np.abs(stamps[np.minimum(after, len(stamps) - 1)] - time)
+    return np.asarray(np.minimum(since, until) > margin)
 
 
 def unloaded_readings(log: Log, where: BoolArray | None = None) -> FloatArray | None:

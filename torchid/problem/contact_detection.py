@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from torchid.problem.predict import force_series
 from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples, joint_order
 from torchid.problem.standing import stand_on_feet
+from torchid.problem.still_contacts import keep_still
 from torchid.regressor import FrameJacobian
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import Robot
@@ -47,13 +48,15 @@ class DetectionConfig:
     """How contacts are detected.
 
     A contact stands from where its normal force exceeds `touch` until it is below `lift`, shares of the robot's
-    weight by the URDF. Torques are low-pass filtered before (`cutoff_hz`, zero phase); stances and swings shorter than
-    `shortest_s` [s] are none. Samples within `margin_s` [s] of a change are dropped, as are those within
-    `preprocessing.contact_margin_s`.
+    weight by the URDF. Where the base's motion was measured, it stands also while it carries more than `light` and
+    keeps still, for twice `shortest_s` at least. Torques are low-pass filtered before (`cutoff_hz`, zero phase);
+    stances and swings shorter than `shortest_s` [s] are none. Samples within `margin_s` [s] of a change are dropped, as
+    are those within `preprocessing.contact_margin_s`.
     """
 
     touch: Positive = 0.02
     lift: NotNegative = 0.015
+    light: NotNegative = 0.005
     cutoff_hz: Positive = 20.0
     shortest_s: NotNegative = 0.04
     margin_s: NotNegative = 0.02
@@ -61,27 +64,40 @@ class DetectionConfig:
 
 def with_detected_contacts(
     log: Log, robot: Robot, contacts: Sequence[Contact], settings: DetectionConfig | None = None
-) -> Log:
-    """The log with flags of all contacts by `detect_contacts`, in the place of what it has.
+) -> tuple[Log, BoolArray]:
+    """The log with flags of all contacts by `detect_contacts` in the place of what it has, and where they are certain.
 
     Raises:
         LogError: as `detect_contacts`; wrenches without the name of a contact.
     """
-    active = detect_contacts(log, robot, contacts, settings or DetectionConfig())
+    active, certain = detect_contacts(log, robot, contacts, settings or DetectionConfig())
     frames = tuple(contact.frame for contact in contacts)
     if log.contact_wrench is None and log.contact_force_normal is None and log.contact_normal_world is None:
-        return dataclasses.replace(log, contact_names=frames, contact_active=active)
+        return dataclasses.replace(log, contact_names=frames, contact_active=active), certain
     if missing := [frame for frame in frames if frame not in log.contact_names]:
         raise LogError(
             log.source, "contact_names", f"contact '{missing[0]}' missing", "every contact of the experiment"
         )
     flags = np.zeros((len(log), len(log.contact_names)), dtype=bool)
     flags[:, [log.contact_names.index(frame) for frame in frames]] = active
-    return dataclasses.replace(log, contact_active=flags)
+    return dataclasses.replace(log, contact_active=flags), certain
 
 
-def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], settings: DetectionConfig) -> BoolArray:
-    """Which contacts stand, (N, C).
+class Detection(NamedTuple):
+    """Which contacts stand.
+
+    Attributes:
+        active: (N, C).
+        certain: samples (N,) that a fit may trust: neither those at both ends of a log, which the filter spoils, nor
+            stances that were too short to count.
+    """
+
+    active: BoolArray
+    certain: BoolArray
+
+
+def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], settings: DetectionConfig) -> Detection:
+    """Which contacts stand when.
 
     Args:
         log: as recorded, with the torques of all joints above the contacts.
@@ -94,14 +110,20 @@ def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], setting
         InputError: a cutoff that does not suit the log.
     """
     if not contacts:
-        return np.zeros((len(log), 0), dtype=bool)
+        return Detection(np.zeros((len(log), 0), dtype=bool), np.ones(len(log), dtype=bool))
     weight = GRAVITY * float(robot.nominal[:, 0].sum())
-    found = normal_forces(log, robot, contacts, settings.cutoff_hz)
-    shortest = round(settings.shortest_s / float(np.median(np.diff(found.time)))) if len(found.time) > 1 else 0
-    share = found.force.T / weight
-    flags = [_without_short(_hysteresis(one, settings.touch, settings.lift), shortest) for one in share]
-    nearest = np.searchsorted(0.5 * (found.time[1:] + found.time[:-1]), log.time)
-    return np.stack(flags, axis=1)[nearest]
+    known, samples, rotation = _prepared(log, robot, contacts, settings.cutoff_hz)
+    share = _normal_forces(samples, rotation, robot, contacts) / weight
+    shortest = round(settings.shortest_s / float(np.median(np.diff(known.time)))) if len(known) > 1 else 0
+    loaded = np.stack([_hysteresis(one, settings.touch, settings.lift) for one in share.T], axis=1)
+    if known.imu_frame or known.base_quat_xyzw is not None:
+        light = share > settings.light
+        loaded |= keep_still(known, samples, robot, contacts, loaded, light, 2 * shortest)
+    flags = np.stack([_without_short(one, shortest) for one in loaded.T], axis=1)
+    nearest = np.searchsorted(0.5 * (known.time[1:] + known.time[:-1]), log.time)
+    inside = (log.time >= known.time[0]) & (log.time <= known.time[-1])
+    doubtful = np.asarray((loaded & ~flags).any(axis=1))
+    return Detection(flags[nearest], inside & ~doubtful[nearest])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,6 +150,12 @@ def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz
     Raises:
         InputError: no torques, fewer than three of joints above a contact, joints that are missing, or as `preprocess`.
     """
+    known, samples, rotation = _prepared(log, robot, contacts, cutoff_hz)
+    return NormalForces(known.time, _normal_forces(samples, rotation, robot, contacts))
+
+
+def _prepared(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float) -> tuple[Log, Samples, FloatArray]:
+    """The preprocessed log, its samples, in which all contacts stand, and rotations (K, 3, 3) of the base."""
     if log.joint_torque is None:
         raise LogError(log.source, "joint_torque", "missing", "the field, from which preprocessing.detect_contacts is")
     known = _preprocessed(log, cutoff_hz)
@@ -143,12 +171,18 @@ def normal_forces(log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz
         log.source, torch.from_numpy(known.time), position, velocity, acceleration, base,
         torch.cat([torque, in_limbs], dim=1), None, False, torch.ones(len(known), len(contacts), dtype=torch.bool),
     )  # fmt: skip
-    balance = _Balance.of(robot, contacts, torque.numpy())
-    chosen = [slice(start, start + _TOGETHER) for start in range(0, len(known), _TOGETHER)]
-    every = slice(None, None, -(-len(known) // _FITTED))
+    return known, samples, rotation
+
+
+def _normal_forces(samples: Samples, rotation: FloatArray, robot: Robot, contacts: Sequence[Contact]) -> FloatArray:
+    """Forces (K, C) [N] along the ground's normal."""
+    measured = np.zeros((0, 0)) if samples.torque is None else samples.torque[:, : robot.n].numpy()
+    balance = _Balance.of(robot, contacts, measured)
+    chosen = [slice(start, start + _TOGETHER) for start in range(0, len(samples), _TOGETHER)]
+    every = slice(None, None, -(-len(samples) // _FITTED))
     actuators = _fit_actuators([balance.equations(samples[every], rotation[every])])
     parts = [balance.normal_forces(balance.equations(samples[x], rotation[x]), actuators) for x in chosen]
-    return NormalForces(known.time, np.concatenate(parts))
+    return np.concatenate(parts)
 
 
 def _require_torques(log: Log, robot: Robot, contacts: Sequence[Contact], measured: BoolArray) -> None:

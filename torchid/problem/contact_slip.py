@@ -95,9 +95,8 @@ def measure_slip(
         cutoff_hz: of the filter, which spreads what happens at a change over its inverse; None for no filter.
         base_is_derived: whether the base's motion follows from the contacts themselves.
     """
-    builder = RowBuilder(robot, _plain(contacts), named_sensors("full", robot.n, len(contacts), ft=len(robot.ft_names)))
-    known = None if base_is_derived else _base_velocity(log, samples)
-    velocity = _velocities(builder, samples, known)
+    known = None if base_is_derived else base_velocity(log, samples)
+    velocity = contact_velocities(samples, robot, contacts, known)
     standing = _standing(samples, recorded, contacts, cutoff_hz)
     velocity[~standing] = np.nan
     relative = known is None and not robot.fixed_base
@@ -112,12 +111,7 @@ def measure_slip(
     return Slip(speed, limits, relative, tuple(contact.frame for contact in contacts))
 
 
-def _plain(contacts: Sequence[Contact]) -> list[Contact]:
-    """The contacts with the axes of their frames, however they are read."""
-    return [dataclasses.replace(contact, along_normal=False) for contact in contacts]
-
-
-def _base_velocity(log: Log, samples: Samples) -> Tensor | None:
+def base_velocity(log: Log, samples: Samples) -> Tensor | None:
     """Velocity of the base's origin along its axes, (N, 3) [m/s]; None where it was not recorded."""
     velocity, quat = log.base_linear_velocity_world, samples.base.quat_xyzw
     if velocity is None or quat is None:
@@ -125,8 +119,17 @@ def _base_velocity(log: Log, samples: Samples) -> Tensor | None:
     return (rotation_matrix(quat).mT @ torch.as_tensor(velocity).to(quat)[..., None])[..., 0]
 
 
-def _velocities(builder: RowBuilder, samples: Samples, base: Tensor | None) -> FloatArray:
-    """Velocities of the contacts' points along the base's axes, (N, C, 3) [m/s], the base's origin at rest for None."""
+def contact_velocities(samples: Samples, robot: Robot, contacts: Sequence[Contact], base: Tensor | None) -> FloatArray:
+    """Velocities of the contacts' material points along the base's axes, (N, C, 3) [m/s].
+
+    Args:
+        samples: N of them.
+        robot: the robot.
+        contacts: of the samples.
+        base: velocity of the base's origin along its axes, (N, 3) [m/s]; None for one at rest.
+    """
+    plain = [dataclasses.replace(contact, along_normal=False) for contact in contacts]  # by the axes of their frames
+    builder = RowBuilder(robot, plain, named_sensors("full", robot.n, len(contacts), ft=len(robot.ft_names)))
     tree, out = builder.tree, np.empty((len(samples), len(builder.contacts), 3))
     for start in range(0, len(samples), _TOGETHER):
         part = samples[start : start + _TOGETHER]

@@ -1,0 +1,72 @@
+"""Contacts that keep still: a foot that carries next to nothing may stand all the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchid.logs import Log
+from torchid.logs.log import BoolArray, FloatArray
+from torchid.problem.contact_slip import base_velocity, contact_velocities
+from torchid.problem.samples import Samples
+from torchid.robot import Robot
+from torchid.sensing import Contact
+
+LEAST_LIMIT = 0.01
+"""Speed [m/s] below which a contact always counts as still: what soft ground and filters leave of a stance."""
+
+_MEDIANS = 2.0  # of the speed of contacts that surely stand, which is noise
+
+
+def keep_still(
+    log: Log,
+    samples: Samples,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    standing: BoolArray,
+    possible: BoolArray,
+    shortest: int,
+) -> BoolArray:
+    """Which contacts that may stand move no faster than those that surely do, for some samples at least, (N, C).
+
+    Speeds are those in the world where the log has the velocity of its base, else those against the median of the
+    other contacts that surely stand.
+
+    Args:
+        log: preprocessed.
+        samples: bound from it, one for one, with the angular velocity of the base.
+        robot: the robot.
+        contacts: of the samples.
+        standing: those that surely stand, (N, C).
+        possible: those that may stand, (N, C).
+        shortest: samples in a row.
+    """
+    known = base_velocity(log, samples)
+    velocity = contact_velocities(samples, robot, contacts, known)
+    speed = np.linalg.norm(velocity if known is not None else _against_standing(velocity, standing), axis=2)
+    noise = speed[standing & np.isfinite(speed)]
+    limit = max(LEAST_LIMIT, _MEDIANS * float(np.median(noise))) if len(noise) else LEAST_LIMIT
+    with np.errstate(invalid="ignore"):
+        still = (speed < limit) & possible
+    return np.stack([_lasting(one, shortest) for one in still.T], axis=1)
+
+
+def _lasting(flags: BoolArray, shortest: int) -> BoolArray:
+    """The flags (N,) without runs of fewer true ones."""
+    ends = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
+    out = np.zeros_like(flags)
+    for start, stop in zip(ends[::2], ends[1::2], strict=True):
+        out[start:stop] = stop - start >= shortest
+    return out
+
+
+def _against_standing(velocity: FloatArray, standing: BoolArray) -> FloatArray:
+    """Velocities (N, C, 3) against the median of the other contacts that stand; NaN where none does."""
+    out = np.full_like(velocity, np.nan)
+    for contact in range(velocity.shape[1]):
+        others = np.where(standing[:, :, None], velocity, np.nan)
+        others[:, contact] = np.nan
+        some = np.isfinite(others[:, :, 0]).any(axis=1)
+        out[some, contact] = velocity[some, contact] - np.nanmedian(others[some], axis=1)
+    return out
