@@ -124,7 +124,7 @@ def test_a_refusal_names_the_key_and_the_longest_gap(tmp_path: Path) -> None:
         log: Log = read_log(path, bridge_gaps_s=0.09)
     assert np.abs(log.joint_position[:, 0] - signal(1.0)).max() < 1e-3
     at_end = written(tmp_path / "b.npz", signal(1.0) * gap(slice(0, 3)))
-    assert "this one is at an end of the log" in log_refusal(at_end)
+    assert "none here has values on both sides" in log_refusal(at_end)
 
 
 @pytest.mark.parametrize("value", [np.inf, 1e300, -np.inf])

@@ -217,7 +217,13 @@ def test_files_that_make_up_no_log_are_refused_in_one_line(log: Log, tmp_path: P
     np.savez(tmp_path / "short.npz", time=log.time[:5], joint_names=log.joint_names, joint_torque=log.joint_torque)
     np.savez(tmp_path / "foreign.npz", time=log.time, tau_7=log.time)
     write_bag(tmp_path / "walk.mcap", entries_of(recorded()))
+    late = {"time": log.time + 0.003, "joint_names": log.joint_names}
+    broken = np.where(np.arange(400)[:, None] == 7, np.nan, log.joint_position)
+    np.savez(tmp_path / "broken.npz", **late, joint_velocity=broken)
+    np.savez(tmp_path / "infinite.npz", **late, joint_torque=np.where(np.isnan(broken), np.inf, broken))
     refusals = {
+        "motion.npz + broken.npz": "broken.npz: joint_velocity: nan at sample 7, component 0; accepted: finite numbers",
+        "motion.npz + infinite.npz": "infinite.npz: joint_torque: inf at sample 7",
         "motion.npz + absent.npz": "absent.npz: file: no such file",
         "motion.npz + timeless.npz": "timeless.npz: time: missing; accepted: stamps in each",
         "motion.npz + short.npz": "short.npz: joint_torque: shape",
@@ -252,3 +258,30 @@ def test_gaps_of_a_file_that_is_interpolated_are_named_and_bridged(log: Log, tmp
     np.savez(tmp_path / "torques.npz", time=np.where(other < 2.0, other, other + 0.05), joint_torque=np.sin(torque))
     with pytest.raises(LogError, match=r"torques.npz: time: a gap of 0.051 s from 1.999 s on.*cut the file there"):
         read_log(name)
+
+
+def test_entries_of_a_map_that_have_no_columns_go_with_the_fields_that_they_belong_to(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    time, q, dq, desired = np.arange(50) / 100.0, *rng.standard_normal((3, 50, 2))
+    gravity = rng.standard_normal((50, 3))
+    names = np.array([b"a", b"b"])
+    np.savez(tmp_path / "joints.npz", time=time, joint_names=names, q=q, dq=dq, wanted=desired)
+    np.savez(tmp_path / "imu.npz", t=time, acc=gravity, imu_angular_velocity=-gravity)
+    text = """
+    time: t
+    joint_position: q
+    joint_velocity: dq
+    joint_torque: {pd: {kp: 20, kd: 2, position: wanted}}
+    contact_active: {always: [foot]}
+    imu_frame: trunk
+    imu_specific_force: {column: acc, unit: g}
+    """
+    for order in ("joints.npz + imu.npz", "imu.npz + joints.npz"):
+        found = read_log(tmp_path / order, columns=parsed_map(text))
+        assert (found.imu_frame, found.joint_names, found.contact_names) == ("trunk", ("a", "b"), ("foot",))
+        assert found.contact_active is not None
+        assert found.joint_torque is not None
+        assert found.imu_specific_force is not None
+        assert found.contact_active.all()
+        assert np.abs(found.joint_torque - 20.0 * (desired - q) + 2.0 * dq).max() < 1e-13
+        assert np.abs(found.imu_specific_force - 9.80665 * gravity).max() < 1e-13

@@ -41,7 +41,7 @@ class Series:
         Warns:
             TorchidWarning: a field is NaN in some samples.
         """
-        same = self._same_stamps(time)
+        same = self.same_stamps(time)
         if same is not None:
             return {name: values[same] for name, values in self.fields.items()}
         run = self._unbroken(time)
@@ -51,7 +51,7 @@ class Series:
         """The last values (K, ...) of the series before each stamp, (N, ...)."""
         return np.asarray(values[np.searchsorted(self.stamps, time + stamp_slack(time), side="right") - 1])
 
-    def _same_stamps(self, time: FloatArray) -> slice | None:
+    def same_stamps(self, time: FloatArray) -> slice | None:
         """The samples that have the stamps (N,) [s]; None where others are needed."""
         slack = stamp_slack(time)
         first, last = np.searchsorted(self.stamps, [time[0] - slack, time[-1] + slack])

@@ -17,6 +17,7 @@ from torchid.logs.log import (
     BoolArray,
     FloatArray,
     check_time,
+    describe_element,
     field_shape,
     is_quaternion,
     to_float64,
@@ -67,15 +68,16 @@ def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dic
     return out
 
 
-def refuse_gaps(name: str, values: FloatArray, time: FloatArray, where: str) -> None:
-    """Raise LogError for a field (N, ...) that is NaN in some samples, the first of which is `where`."""
+def refuse_gaps(name: str, values: FloatArray, time: FloatArray, labels: tuple[str, ...] = ()) -> None:
+    """Raise LogError for a field (N, ...) that is NaN in some samples; `labels`: names of its columns."""
+    where = describe_element(tuple(map(int, np.argwhere(np.isnan(values))[0])), labels)
     lengths = [
         time[stop] - time[start - 1]
         for column in _missing(name, values).reshape(len(time), -1).T
         for start, stop in _runs(column)
         if start > 0 and stop < len(time)
     ]
-    longest = f"the longest here takes {max(lengths):.3g} s" if lengths else "this one is at an end of the log"
+    longest = f"the longest here takes {max(lengths):.3g} s" if lengths else "none here has values on both sides"
     raise LogError.at_field(name, f"nan at {where}", f"finite numbers, or gaps that {KEY} bridges ({longest})")
 
 

@@ -16,14 +16,18 @@ from torchid.logs.column_map import Columns
 from torchid.logs.column_matching import columns_by_file
 from torchid.logs.columns import KINDS, names_field
 from torchid.logs.containers import LogKind, existing_log_kind, open_container
+from torchid.logs.gaps import refuse_gaps
 from torchid.logs.log import (
     NAME_FIELDS,
+    NAN_ALLOWED,
     NORMALS,
     SHAPES,
     FloatArray,
+    check_finite,
     check_shape,
     check_time,
     field_shape,
+    parse_names,
     to_float64,
 )
 from torchid.logs.tables import sample_table
@@ -89,7 +93,8 @@ def _stamped(raw: Fields, shift_s: float) -> Fields:
     check_shape("time", raw["time"], SHAPES["time"], {})
     time = to_float64("time", raw["time"])
     check_time(time)
-    out = {name: x for name, x in raw.items() if name not in NAME_FIELDS or x.size}
+    out = {name: x for name, x in raw.items() if name not in NAME_FIELDS}
+    out |= {name: np.array(of, np.str_) for name in NAME_FIELDS if name in raw and (of := parse_names(name, raw[name]))}
     if "joint_names" not in out and 0 in out.get("joint_position", time).shape[1:]:
         del out["joint_position"]  # what a table without joints has
     for name, array in out.items():
@@ -130,7 +135,7 @@ def _common_names(parts: Sequence[Fields]) -> dict[str, list[str]]:
     for part in parts:
         for field in NAME_FIELDS:
             if field in part:
-                names.setdefault(field, np.ravel(part[field]).tolist())
+                names.setdefault(field, part[field].tolist())
     return names
 
 
@@ -138,7 +143,7 @@ def _in_order(part: Fields, names: Mapping[str, list[str]], first: Path) -> Fiel
     """The fields of a file with samples, their columns in the order of the log's names."""
     out = {name: x for name, x in part.items() if name not in NAME_FIELDS}
     for field, common in names.items():
-        own = np.ravel(part[field]).tolist() if field in part else common
+        own = part[field].tolist() if field in part else common
         if own == common:
             continue
         if differing := sorted(set(own) ^ set(common)):
@@ -154,6 +159,16 @@ def _aligned(part: Fields, time: FloatArray, origin: float) -> Fields:
     sampled = {name: x for name, x in part.items() if field_shape(name)[:1] == ("N",) and name != "time"}
     moving = {name: to_float64(name, x) for name, x in sampled.items() if name not in _HELD}
     series = Series("", part["time"] - origin, moving, "file")
+    if series.same_stamps(time - origin) is None:
+        for name, x in moving.items():
+            _check_unbroken(name, x, part["time"])
     held = {name: series.hold(sampled[name], time - origin) for name in _HELD if name in sampled}
     text = {name: x for name, x in part.items() if name not in sampled and name != "time"}
     return {**text, **held, **series.at(time - origin)}
+
+
+def _check_unbroken(name: str, values: FloatArray, time: FloatArray) -> None:
+    """Refuse a field (K, ...) that no spline can be drawn through."""
+    if name not in NAN_ALLOWED and np.isnan(values).any():
+        refuse_gaps(name, values, time)
+    check_finite(name, values, allow_nan=True)

@@ -40,7 +40,6 @@ from torchid.logs.log import (
     check_shape,
     check_time,
     column_labels,
-    describe_element,
     field_shape,
     is_quaternion,
     normalize_normals,
@@ -203,8 +202,7 @@ def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, A
             continue
         values, may_be_nan = to_float64(name, array), allow_gaps or name in (*NAN_ALLOWED, NORMALS)
         if not may_be_nan and np.isnan(values).any():
-            first = tuple(map(int, np.argwhere(np.isnan(values))[0]))
-            refuse_gaps(name, values, time, describe_element(first, labels))
+            refuse_gaps(name, values, time, labels)
         check_finite(name, values, allow_nan=may_be_nan, labels=labels)
         fields[name] = normalize_quaternions(name, values, allow_gaps) if is_quaternion(name) else values
     if NORMALS in fields and not allow_gaps:
