@@ -175,8 +175,7 @@ def test_several_files_are_one_log_whose_name_says_which(folder: Path) -> None:
 def test_samples_of_several_files_are_those_of_the_first(folder: Path) -> None:
     with pytest.warns(TorchidWarning, match=r"a.npz is fitted on as well"):
         load(folder, train=[{"files": ["a.npz", "b.npz"], "to": 30}], test=["a.npz"])
-    with pytest.raises(ConfigError, match="share samples; accepted: every sample once"):
-        load(folder, train=[{"files": ["a.npz", "b.npz"]}, {"files": ["a.npz", "c.h5"]}])
+    load(folder, train=[{"files": ["a.npz", "b.npz"]}, {"files": ["a.npz", "c.h5"]}])  # one after the other, perhaps
     load(folder, train=[{"files": ["a.npz", "c.h5"]}, {"files": ["b.npz", "c.h5"]}])  # one file may last for both
     load(folder, train=["a.npz[0:30]"], test=[{"files": ["a.npz", "c.h5"], "from": 30}])  # decided by the stamps
 
@@ -188,6 +187,7 @@ def test_samples_of_several_files_are_those_of_the_first(folder: Path) -> None:
         ({"files": []}, r"logs.train.0.files: found \[\]"),
         ({"files": "a.npz"}, "logs.train.0.files: found 'a.npz'"),
         ({"files": ["a.npz", 3]}, "logs.train.0.files.1: found 3"),
+        ({"files": ["a.npz", "b.npz + c.h5"]}, r"logs.train.0.files.1: found '.*b.npz \+ c.h5'"),
         ({"files": ["a.npz", {"shift_s": 3}]}, r"logs.train.0.files.1: found \{'shift_s': 3\}"),
         ({"files": ["a.npz", {"file": "b.npz", "shift": 3}]}, "logs.train.0.files.1: unknown name 'shift'"),
         ({"files": ["a.npz", {"file": "b.npz", "shift_s": "3 s"}]}, "files.1.shift_s: found '3 s'; accepted: seconds"),

@@ -135,6 +135,14 @@ def test_what_is_no_number_beside_a_gap_is_refused_as_without_it(tmp_path: Path,
         read_log(written(tmp_path / "a.npz", position), bridge_gaps_s=0.05)
 
 
+def test_stamps_that_are_none_are_refused_before_any_gap_is_filled(tmp_path: Path) -> None:
+    broken = (signal(1.0) * gap(slice(50, 52)))[:, None]
+    for time, found in ((np.float64(3.0), r"time: shape \(\)"), (TIME[::-1], "time: .* accepted: strictly increasing")):
+        np.savez(tmp_path / "a.npz", time=time, joint_names=["hip"], joint_position=broken)
+        with pytest.raises(LogError, match=found):
+            read_log(tmp_path / "a.npz", bridge_gaps_s=0.05)
+
+
 def test_a_part_knows_nothing_of_what_is_beyond_its_ends(tmp_path: Path) -> None:
     path = written(tmp_path / "a.npz", signal(1.0) * gap(slice(99, 102)))
     with pytest.raises(LogError, match="nan at sample 99, hip"):

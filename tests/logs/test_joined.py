@@ -220,8 +220,10 @@ def test_files_that_make_up_no_log_are_refused_in_one_line(log: Log, tmp_path: P
     late = {"time": log.time + 0.003, "joint_names": log.joint_names}
     broken = np.where(np.arange(400)[:, None] == 7, np.nan, log.joint_position)
     np.savez(tmp_path / "broken.npz", **late, joint_velocity=broken)
+    np.savez(tmp_path / "flat.npz", **late, joint_torque=log.time)
     np.savez(tmp_path / "infinite.npz", **late, joint_torque=np.where(np.isnan(broken), np.inf, broken))
     refusals = {
+        "motion.npz + flat.npz": "flat.npz: joint_torque: shape (400,); accepted: shape (N, n) = (400, n)",
         "motion.npz + broken.npz": "broken.npz: joint_velocity: nan at sample 7, component 0; accepted: finite numbers",
         "motion.npz + infinite.npz": "infinite.npz: joint_torque: inf at sample 7",
         "motion.npz + absent.npz": "absent.npz: file: no such file",

@@ -17,7 +17,7 @@ from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, war
 from torchid.logs import Columns, Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
 from torchid.logs.remote import RemoteFile, as_path, list_matching
-from torchid.logs.time_range import JOINED_ACCEPTED, LogFile, LogPart, join_files, split_range
+from torchid.logs.time_range import JOINED, JOINED_ACCEPTED, LogFile, LogPart, join_files, split_range
 
 SETS = ("train", "test", "validation")
 """Keys of `logs` that list logs."""
@@ -137,7 +137,7 @@ def _joined(field: str, entry: object) -> LogFile:
         if key not in keys:
             raise UnknownNameError.at_field(field, str(key), keys)
     file, shift = given.get("file"), given.get("shift_s", 0.0)
-    if not isinstance(file, str) or not file:
+    if not isinstance(file, str) or not file or JOINED in file:
         raise ConfigError.at_field(field, f"found {excerpt(repr(entry))}", _FILES)
     if isinstance(shift, bool) or not isinstance(shift, (int, float)) or not math.isfinite(shift):
         raise ConfigError.at_field(f"{field}.shift_s", f"found {excerpt(repr(shift))}", "seconds, added to its stamps")

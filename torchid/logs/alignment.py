@@ -54,10 +54,11 @@ class Series:
     def same_stamps(self, time: FloatArray) -> slice | None:
         """The samples that have the stamps (N,) [s]; None where others are needed."""
         slack = stamp_slack(time)
-        first, last = np.searchsorted(self.stamps, [time[0] - slack, time[-1] + slack])
+        first = int(np.searchsorted(self.stamps, time[0] - slack))
+        last = int(np.searchsorted(self.stamps, time[-1] + slack, side="right"))
         stamps = self.stamps[first:last]
         same = len(stamps) == len(time) and bool(np.all(np.abs(stamps - time) <= slack))
-        return slice(int(first), int(last)) if same else None
+        return slice(first, last) if same else None
 
     def _unbroken(self, time: FloatArray) -> slice:
         """The samples around the log's time, checked for gaps that are too long to be interpolated."""

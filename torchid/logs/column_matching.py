@@ -302,9 +302,10 @@ def _entries_in(columns: Columns, given: Sequence[str]) -> set[str]:
     ]
     out = set[str]()
     for text in given:
-        letters = {field: most for field, most, regex in patterns if regex.fullmatch(text)}
-        most = max((*letters.values(), *(letters_of(one) for one in columns.ignore if fits(text, one))), default=0)
-        out |= {field for field in letters if letters[field] == most}
+        of_fields = [(field, letters) for field, letters, regex in patterns if regex.fullmatch(text)]
+        ignored = [letters_of(one) for one in columns.ignore if fits(text, one)]
+        most = max((*ignored, *(letters for _, letters in of_fields)), default=0)
+        out |= {field for field, letters in of_fields if letters == most}
     has = {*out, *(text.partition(".")[0] for text in given)}
     without = {name: _beside(columns, name) for name in (*columns.fields, "imu_frame")}
     named = {field for field, *_ in patterns}

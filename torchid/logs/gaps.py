@@ -14,8 +14,10 @@ from torchid.logs.log import (
     CONTACT_READINGS,
     LARGEST,
     NORMALS,
+    SHAPES,
     BoolArray,
     FloatArray,
+    check_shape,
     check_time,
     describe_element,
     field_shape,
@@ -51,6 +53,7 @@ def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dic
     out = dict(raw)
     if longest_s is None:
         return out
+    check_shape("time", raw["time"], SHAPES["time"], {})
     time = to_float64("time", raw["time"])
     check_time(time)
     filled = dict[str, BoolArray]()

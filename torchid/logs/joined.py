@@ -63,7 +63,7 @@ def read_joined(
     out: Fields = {}
     for path, part in zip(paths, parts, strict=True):
         with about_file(os.fspath(path)):
-            out |= _aligned(_in_order(part, names, paths[0]), time, parts[0]["time"][0])
+            out |= _aligned(_in_order(part, names), time, parts[0]["time"][0])
     return out | {name: np.array(of, dtype=np.str_) for name, of in names.items()} | {"time": time}
 
 
@@ -87,7 +87,7 @@ def _names_in(path: Path) -> list[str]:
 
 
 def _stamped(raw: Fields, shift_s: float) -> Fields:
-    """The fields of a file with its stamps (K,) [s] in the clock of the log, without those that it has not."""
+    """The fields of a file, those that have anything in them, with its stamps (K,) [s] in the clock of the log."""
     if "time" not in raw:
         raise LogError.at_field("time", "missing", "stamps in each of several files of a log")
     check_shape("time", raw["time"], SHAPES["time"], {})
@@ -98,8 +98,8 @@ def _stamped(raw: Fields, shift_s: float) -> Fields:
     if "joint_names" not in out and 0 in out.get("joint_position", time).shape[1:]:
         del out["joint_position"]  # what a table without joints has
     for name, array in out.items():
-        if field_shape(name)[:1] == ("N",) and array.shape[:1] != time.shape:
-            raise LogError.at_field(name, f"shape {array.shape}", f"{len(time)} samples, as time has")
+        if field_shape(name)[:1] == ("N",):
+            check_shape(name, array, field_shape(name), {"N": len(time)})
     return out | {"time": time + shift_s if shift_s else time}
 
 
@@ -139,7 +139,7 @@ def _common_names(parts: Sequence[Fields]) -> dict[str, list[str]]:
     return names
 
 
-def _in_order(part: Fields, names: Mapping[str, list[str]], first: Path) -> Fields:
+def _in_order(part: Fields, names: Mapping[str, list[str]]) -> Fields:
     """The fields of a file with samples, their columns in the order of the log's names."""
     out = {name: x for name, x in part.items() if name not in NAME_FIELDS}
     for field, common in names.items():

@@ -116,7 +116,9 @@ def share_samples(one: TimeRange | None, other: TimeRange | None) -> bool | None
     return False if early is False or late is False else None if None in (early, late) else True
 
 
-_JOINED = " + "
+JOINED = " + "
+"""Between the names of several files that are one log."""
+
 #: Seconds behind the name of one of several files: `plates.csv@-0.12s`.
 _SHIFT = re.compile(r"(.+)@([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)s?")
 JOINED_ACCEPTED = "FILE + FILE, each with @SECONDS where its clock is to be shifted: 'motion.csv + plates.csv@0.12s'"
@@ -138,17 +140,17 @@ def join_files(files: Sequence[LogFile]) -> str:
         beside = file.path.is_relative_to(folder)
         names.append(str(file.path.relative_to(folder) if beside else file.path))
     shifts = [f"@{file.shift_s!r}s" if file.shift_s else "" for file in files]
-    return _JOINED.join(f"{name}{shift}" for name, shift in zip(names, shifts, strict=True))
+    return JOINED.join(f"{name}{shift}" for name, shift in zip(names, shifts, strict=True))
 
 
 def log_title(log: str | os.PathLike[str]) -> str:
     """The name of a log without folders."""
-    return _JOINED.join(Path(text).name for text in str(log).split(_JOINED))
+    return JOINED.join(Path(text).name for text in str(log).split(JOINED))
 
 
 def _split_files(path: Path) -> tuple[LogFile, ...]:
     """The files that a name joins, the others relative to the folder of the first; one for a name of no several."""
-    first, *others = str(path).split(_JOINED)
+    first, *others = str(path).split(JOINED)
     if not others or not all(Path(text).suffix for text in (first, *others)) or os.path.lexists(path):
         return (LogFile(path),)
     found = [_shifted(text) for text in (first, *others)]
@@ -182,13 +184,13 @@ class LogPart:
     def kind(self) -> str:
         """Extensions of the files, with what their stamps are shifted by."""
         shifts = [f"@{file.shift_s!r}" if file.shift_s else "" for file in self.files]
-        return _JOINED.join(f"{x.path.suffix.lower()}{shift}" for x, shift in zip(self.files, shifts, strict=True))
+        return JOINED.join(f"{x.path.suffix.lower()}{shift}" for x, shift in zip(self.files, shifts, strict=True))
 
     @property
     def name(self) -> str:
         """The names of the files without their extensions, and the range."""
         stems = [file.path.stem for file in self.files]
-        return _JOINED.join(stems) + ("" if self.range is None else self.range.text)
+        return JOINED.join(stems) + ("" if self.range is None else self.range.text)
 
     def shares_samples(self, other: LogPart) -> bool | None:
         """Whether it overlaps with a part of the same (first) file; None where that depends on stamps.
@@ -197,8 +199,7 @@ class LogPart:
         """
         if self.file == other.file:
             return share_samples(self.range, other.range)
-        wholes = [part for part in (self, other) if part.range is None]
-        return True if len(wholes) == 2 or any(not part.joins for part in wholes) else None
+        return True if any(part.range is None and not part.joins for part in (self, other)) else None
 
     def __str__(self) -> str:
         return str(self.file) + ("" if self.range is None else self.range.text)
