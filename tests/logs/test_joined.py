@@ -14,7 +14,7 @@ from dialects import ORDER, in_order, parsed_map, save_csv
 from raw_logs import log_refusal
 from repository import DEMO
 
-from torchid.errors import LogError, TorchidWarning
+from torchid.errors import ConfigError, LogError, TorchidWarning
 from torchid.logs import Log, read_log, write_log
 from torchid.logs.time_range import LogFile, join_files, split_range
 
@@ -268,9 +268,10 @@ def test_entries_of_a_map_that_have_no_columns_go_with_the_fields_that_they_belo
     gravity = rng.standard_normal((50, 3))
     names = np.array([b"a", b"b"])
     np.savez(tmp_path / "joints.npz", time=time, joint_names=names, q=q, dq=dq, wanted=desired)
-    np.savez(tmp_path / "imu.npz", t=time, acc=gravity, imu_angular_velocity=-gravity)
+    np.savez(tmp_path / "imu.npz", t=1e3 * time, acc=gravity, imu_angular_velocity=-gravity)
     text = """
-    time: t
+    time: ticks
+    other_times: [{column: t, unit: ms}]
     joint_position: q
     joint_velocity: dq
     joint_torque: {pd: {kp: 20, kd: 2, position: wanted}}
@@ -287,3 +288,22 @@ def test_entries_of_a_map_that_have_no_columns_go_with_the_fields_that_they_belo
         assert found.contact_active.all()
         assert np.abs(found.joint_torque - 20.0 * (desired - q) + 2.0 * dq).max() < 1e-13
         assert np.abs(found.imu_specific_force - 9.80665 * gravity).max() < 1e-13
+
+
+def test_a_file_takes_the_column_of_stamps_that_it_has(tmp_path: Path) -> None:
+    text = """
+    time: {column: stamp, unit: ms}
+    other_times: [{column: t_us, unit: us}, t]
+    joint_position: "q_{joint}"
+    """
+    time = np.arange(5) / 8.0
+    for name, factor in (("stamp", 1e3), ("t_us", 1e6), ("t", 1.0)):
+        path = save_csv(tmp_path / f"{name}.csv", {name: factor * time, "q_hip": time})
+        assert np.array_equal(read_log(path, columns=parsed_map(text)).time, time)
+    save_csv(tmp_path / "both.csv", {"stamp": 1e3 * time, "t": time, "q_hip": time})
+    with pytest.raises(LogError, match="no entry for 't'"):
+        read_log(tmp_path / "both.csv", columns=parsed_map(text))
+    with pytest.raises(ConfigError, match=r"logs.columns.other_times.unit: 'h', an unknown unit"):
+        parsed_map("other_times: [{column: t, unit: h}]")
+    with pytest.raises(ConfigError, match="logs.columns.other_times: nothing that says where it is"):
+        parsed_map("other_times: [{unit: s}]")

@@ -270,6 +270,14 @@ def _regex(part: Part, text: str) -> re.Pattern[str]:
 # ----------------------------------------------------------------------------------------------- several files, one map
 
 
+def columns_of_file(columns: Columns, given: Sequence[str]) -> Columns:
+    """The map for a file with some columns or arrays: with one of `other_times` if that of `time` is not there."""
+    others = [entry for entry in columns.other_times if entry.column in given]
+    if not others or (columns.time is not None and columns.time.column in given):
+        return columns
+    return replace(columns, time=others[0])
+
+
 def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Sequence[str]) -> list[Columns | None]:
     """The map without the entries that are for others of several files, for each.
 
@@ -283,13 +291,14 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
     Raises:
         LogError: an entry of which no file has a column.
     """
-    found = [_entries_in(columns, of_file) for of_file in given]
+    maps = [columns_of_file(columns, of_file) for of_file in given]
+    found = [_entries_in(own, of_file) for own, of_file in zip(maps, given, strict=True)]
     for name in columns.fields:
         if not any(name in of_file for of_file in found):
             none = f"no column of it in {join_names(files, _LISTED)}"
             raise LogError.at_field(f"{KEY}.{name}", none, "columns that one of the files has")
     without: list[dict[str, Any]] = [dict.fromkeys({*columns.fields, "imu_frame"} - of_file) for of_file in found]
-    return [replace(columns, **lacking) for lacking in without]
+    return [replace(own, **lacking) for own, lacking in zip(maps, without, strict=True)]
 
 
 def _entries_in(columns: Columns, given: Sequence[str]) -> set[str]:
