@@ -111,6 +111,7 @@ def test_another_ridge_estimator_and_prior_read_and_compress_nothing(
 CHANGED = {
     "cutoff_hz": 7.0,
     "sample_rate_hz": 111.0,
+    "bridge_gaps_s": 0.05,
     "contact_margin_s": 0.02,
     "max_slip": 0.5,
     "detect_contacts": True,

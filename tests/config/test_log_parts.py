@@ -158,3 +158,44 @@ def test_a_range_without_quotes_in_a_list_is_refused_with_how_to_write_it(folder
     with pytest.raises(ConfigError) as raised:
         load_config(folder / "other.yaml")
     assert accepted in str(raised.value)
+
+
+def test_several_files_are_one_log_whose_name_says_which(folder: Path) -> None:
+    (folder / "b").mkdir()
+    joined = {"files": ["a.npz", {"file": "c.h5", "shift_s": 0.12}, "b/d.npz", "../e.npz"]}
+    logs = load(folder, train=[joined | {"from": 0, "to": 30}], test=[joined | {"fold": 5}])
+    elsewhere = folder.parent / "e.npz"
+    name = f"{folder}/a.npz + c.h5@0.12s + b/d.npz + {elsewhere}"
+    assert [str(path) for path in (*logs.train, *logs.test)] == [f"{name}[0:30]", f"{name}[80%:]"]
+    assert logs.files == [folder / "a.npz", folder / "c.h5", folder / "b/d.npz", elsewhere]
+    (folder / "again.yaml").write_text(dump_config(load_config(folder / "experiment.yaml")))
+    assert load_config(folder / "again.yaml").logs == logs
+
+
+def test_samples_of_several_files_are_those_of_the_first(folder: Path) -> None:
+    with pytest.warns(TorchidWarning, match=r"a.npz is fitted on as well"):
+        load(folder, train=[{"files": ["a.npz", "b.npz"], "to": 30}], test=["a.npz"])
+    load(folder, train=[{"files": ["a.npz", "b.npz"]}, {"files": ["a.npz", "c.h5"]}])  # one after the other, perhaps
+    load(folder, train=[{"files": ["a.npz", "c.h5"]}, {"files": ["b.npz", "c.h5"]}])  # one file may last for both
+    load(folder, train=["a.npz[0:30]"], test=[{"files": ["a.npz", "c.h5"], "from": 30}])  # decided by the stamps
+
+
+@pytest.mark.parametrize(
+    ("entry", "found"),
+    [
+        ({"files": ["a.npz"]}, r"logs.train.0.files: one file; accepted: several files as one log.*file for a single"),
+        ({"files": []}, r"logs.train.0.files: found \[\]"),
+        ({"files": "a.npz"}, "logs.train.0.files: found 'a.npz'"),
+        ({"files": ["a.npz", 3]}, "logs.train.0.files.1: found 3"),
+        ({"files": ["a.npz", "b.npz + c.h5"]}, r"logs.train.0.files.1: found '.*b.npz \+ c.h5'"),
+        ({"files": ["a.npz", {"shift_s": 3}]}, r"logs.train.0.files.1: found \{'shift_s': 3\}"),
+        ({"files": ["a.npz", {"file": "b.npz", "shift": 3}]}, "logs.train.0.files.1: unknown name 'shift'"),
+        ({"files": ["a.npz", {"file": "b.npz", "shift_s": "3 s"}]}, "files.1.shift_s: found '3 s'; accepted: seconds"),
+        ({"files": ["a.npz", {"file": "b.npz", "shift_s": True}]}, "files.1.shift_s: found True"),
+        ({"files": ["a.npz", "b.npz"], "file": "c.h5"}, "logs.train.0: file and files together"),
+        ({"files": ["a.npz", "*.h5"]}, r"logs.train: .*\*.h5, a pattern among several files"),
+    ],
+)
+def test_several_files_that_make_no_log_are_refused(folder: Path, entry: dict[str, Any], found: str) -> None:
+    with pytest.raises((ConfigError, UnknownNameError), match=found):
+        load(folder, train=[entry])

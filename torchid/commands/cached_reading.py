@@ -119,8 +119,10 @@ class CachedReader(LogReader):
 
     def _together(self, path: Path) -> float:
         room = self.scene.config.preprocessing.memory_gb - self._held
-        content, file = self._content(path), split_range(path).file
-        bound = room if file.suffix.lower() == ".csv" else 0.0  # for others, `log_bytes` does not depend on it
+        content, part = self._content(path), split_range(path)
+        file = part.file
+        is_csv = any(one.path.suffix.lower() == ".csv" for one in part.files)
+        bound = room if is_csv else 0.0  # for others, `log_bytes` does not depend on it
         size = None if content is None else self.cache.array_bytes(file, content.checksum, bound)
         if size is None:
             size = log_bytes(path, GIGABYTE * room)
@@ -190,7 +192,7 @@ class CachedReader(LogReader):
         masks = None if required is None or not drops else [required.torque.tolist(), required.wrench.tolist()]
         blocks = None if together is None else settings.memory_gb
         part = split_range(path)
-        log = [content.checksum, part.file.suffix.lower(), None if part.range is None else part.range.text]
+        log = [content.checksum, part.kind, None if part.range is None else part.range.text]
         return content_key([self._scene_content, log, blocks, masks])
 
     def _store(self, key: str, path: Path, read: ReadLog) -> bool:
@@ -289,7 +291,7 @@ class CachedReader(LogReader):
         size = sum(state[0] for state in self._contents[path].states)
         gigabytes = together - self._held
         in_place = existing_log_kind(path) is LogKind.ARRAYS and size >= GIGABYTE * gigabytes
-        return _Planned(path, key, too_much, size, in_place and self._takes_blocks(gigabytes))
+        return _Planned(path, key, too_much, size, in_place and self._takes_blocks(path, gigabytes))
 
 
 def _shares(sizes: Mapping[int, int]) -> list[list[int]]:

@@ -18,6 +18,7 @@ from torchid.commands.manifest import file_checksum
 from torchid.commands.reading import fits_contact_offsets
 from torchid.errors import TorchidWarning
 from torchid.fitting.experiment import Scene
+from torchid.logs.time_range import log_title
 from torchid.problem import Samples
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.motion_noise import MotionNoise
@@ -132,7 +133,7 @@ def _noise_of_document(document: dict[str, Any] | None) -> MotionNoise | None:
 
 def _about(source: str, before: str, text: str) -> str:
     """What was said of a log, said of one with the same content."""
-    names = {before: source, Path(before).name: Path(source).name}
+    names = {before: source, log_title(before): log_title(source)}
     return re.sub("|".join(map(re.escape, names)), lambda found: names[found[0]], text)
 
 

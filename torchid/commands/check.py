@@ -25,7 +25,7 @@ from torchid.log_checks.check import check
 from torchid.logs import Columns, Log, Topics, read_log, write_log
 from torchid.logs.blocks import open_log_blocks
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind, new_log_kind
-from torchid.logs.time_range import split_range
+from torchid.logs.time_range import log_title, split_range
 from torchid.report.figures import save_figure
 from torchid.report.log_checks import log_check_document, log_check_figure
 from torchid.report.tables import progress_bars
@@ -135,7 +135,7 @@ def read_log_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfi
         LogError: it cannot be read, or is larger than what may be in memory at once.
     """
     _require_memory(path, settings)
-    return read_log(path, logs.topics, allow_gaps=True, columns=logs.columns)
+    return _read_with_gaps(path, logs, settings)
 
 
 def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
@@ -147,14 +147,20 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
         LogError: as `read_log_to_check`.
     """
     _require_memory(path, settings)
-    if existing_log_kind(path) is LogKind.BAG:
-        log = read_log(path, logs.topics, allow_gaps=True)
+    if existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED) or settings.bridge_gaps_s is not None:
+        log = _read_with_gaps(path, logs, settings)
         for stretch in _stretches(len(log)):
             yield log.select(stretch), _stretch_name(path, stretch, len(log))
         return
     with open_log_blocks(path, None, logs.columns) as blocks:
         for stretch in _stretches(len(blocks)):
             yield blocks.read(stretch, allow_gaps=True), _stretch_name(path, stretch, len(blocks))
+
+
+def _read_with_gaps(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
+    """A log with those of its gaps that are too long to be bridged."""
+    gaps = settings.bridge_gaps_s
+    return read_log(path, logs.topics, allow_gaps=True, columns=logs.columns, bridge_gaps_s=gaps)
 
 
 def _stretches(samples: int) -> list[slice]:
@@ -164,9 +170,10 @@ def _stretches(samples: int) -> list[slice]:
 
 
 def _stretch_name(path: Path, stretch: slice, samples: int) -> str:
+    name = log_title(path)
     if stretch.stop - stretch.start == samples:
-        return path.name
-    return f"{path.name} (samples {stretch.start} to {stretch.stop - 1} of {samples}, counted from there)"
+        return name
+    return f"{name} (samples {stretch.start} to {stretch.stop - 1} of {samples}, counted from there)"
 
 
 def _require_memory(path: Path, settings: PreprocessingConfig) -> None:
@@ -248,7 +255,8 @@ def convert(
     """
     path = Path(target)
     new_log_kind(path)
-    inputs = (split_range(source).file, *(one for one in (topics, columns) if one is not None))
+    files = (file.path for file in split_range(source).files)
+    inputs = (*files, *(one for one in (topics, columns) if one is not None))
     check_free_file(path, "OUT", overwrite, inputs)
     of_topics, of_columns = _maps(topics, columns)
     with progress_bars() as bars:

@@ -26,7 +26,7 @@ from torchid.fitting.noise import NoiseSummary
 from torchid.identifiability.base_parameters import StateReport, merge_state_reports, require_base, state_reports
 from torchid.logs.containers import FACTORS, log_files
 from torchid.logs.remote import is_url
-from torchid.logs.time_range import split_range
+from torchid.logs.time_range import log_title, split_range
 from torchid.problem import Samples
 from torchid.problem.compressed_log import compress_log
 from torchid.problem.sampled_rows import LogElsewhere
@@ -161,7 +161,7 @@ def _compressed(
         yield FactorFile(
             compress_log(log, builder, lambda n: bars.advance(streaming, n)),
             model,
-            path.name,
+            log_title(path),
             _checksum(path),
             float(log.time[-1] - log.time[0]),
             left_out,
@@ -170,9 +170,13 @@ def _compressed(
 
 
 def _checksum(path: Path) -> str:
-    """SHA-256 of a log's files, and for a part of one of that with the range: parts of a log are different logs."""
+    """SHA-256 of a log's files, and for a part of one of that with the range: parts of a log are different logs.
+
+    So are files that are joined otherwise.
+    """
     whole, part = file_checksum(*log_files(path)), split_range(path)
-    return whole if part.range is None else hashlib.sha256(f"{whole}{part.range.text}".encode()).hexdigest()
+    text = ("" if part.range is None else part.range.text) + part.kind * part.joins
+    return hashlib.sha256(f"{whole}{text}".encode()).hexdigest() if text else whole
 
 
 def _write_all(

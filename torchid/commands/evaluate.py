@@ -95,7 +95,7 @@ def _output(run: Path, logs: Sequence[str | Path]) -> Path:
 
     def check() -> None:
         refuse_link(output.parent)
-        check_free(output, True, EVALUATION, [part.file for part in parts])
+        check_free(output, True, EVALUATION, [file.path for part in parts for file in part.files])
 
     ranks.from_first(check, "output")
     return output

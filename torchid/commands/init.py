@@ -84,7 +84,10 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
         raise ConfigError(target, "--output", "exists", "a new file: torchid init replaces none")
     check_free_file(target, "--output", False, [urdf, path])
     file = split_range(path).file
-    is_bag = existing_log_kind(file) is LogKind.BAG
+    kind = existing_log_kind(file)
+    if kind is LogKind.JOINED:
+        raise ConfigError("command line", "LOG", f"several files, '{excerpt(str(log))}'", "one of them at a time")
+    is_bag = kind is LogKind.BAG
     robot = load_robot(urdf)
     contacts, fields, proposal = _of_bag(file, robot) if is_bag else _of_columns(file, robot)
     out = Initiated(target)

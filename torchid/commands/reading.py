@@ -21,7 +21,7 @@ from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
-from torchid.logs.time_range import LogPart, share_samples, split_range
+from torchid.logs.time_range import LogPart, split_range
 from torchid.problem import Samples, bind_log
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip
@@ -86,10 +86,11 @@ class LogReader:
     def _small(self, path: Path, required: SensorSet | None) -> Samples:
         """A log that fits into memory."""
         settings, files = self.scene.config.preprocessing, self.scene.config.logs
-        if self._takes_blocks(log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
+        if self._takes_blocks(path, log_bytes(path, GIGABYTE * _WHOLE_GB) / GIGABYTE):
             return self._large_log(path, required, None).samples(fits_contact_offsets(self.scene))
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
-        read = read_log(path, topics, allow_gaps=settings.exclude_condemned, columns=columns)
+        allow_gaps, bridge_gaps_s = settings.exclude_condemned, settings.bridge_gaps_s
+        read = read_log(path, topics, allow_gaps=allow_gaps, columns=columns, bridge_gaps_s=bridge_gaps_s)
         recorded, certain = with_flags(read, self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
@@ -155,26 +156,31 @@ class LogReader:
     def _large(self, path: Path, required: SensorSet | None, together: float) -> Samples:
         """A log that does not, with those before it [GB]."""
         settings = self.scene.config.preprocessing
+        needed = f"a preprocessing.memory_gb above {together:.2g}"
+        if split_range(path).joins:
+            found = f"several files with arrays of {together:.2g} GB, which are not in memory at once"
+            raise LogError(path, "file", found, f"{needed}, or the one file that torchid convert makes of them")
         if self._needs_whole_logs:
             found = f"set for arrays of {together:.2g} GB, which are not in memory at once"
-            accepted = f"a preprocessing.memory_gb above {together:.2g}, or parts of the logs"
+            accepted = f"{needed}, or parts of the logs"
             if settings.exclude_condemned:
                 key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
             else:
-                keys = ("base_motion", "detect_contacts", "max_slip")
+                keys = ("base_motion", "detect_contacts", "max_slip", "bridge_gaps_s")
                 key = next(name for name in keys if getattr(settings, name) is not None)
             raise LogError(path, f"preprocessing.{key}", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
-    def _takes_blocks(self, gigabytes: float) -> bool:
+    def _takes_blocks(self, path: Path, gigabytes: float) -> bool:
         """Whether a log with so much in arrays is read block by block even if there is memory for it."""
-        return gigabytes > _WHOLE_GB and not self._needs_whole_logs
+        return gigabytes > _WHOLE_GB and not self._needs_whole_logs and not split_range(path).joins
 
     @property
     def _needs_whole_logs(self) -> bool:
-        """Whether samples are left out for what is known of a whole log alone."""
+        """Whether samples are left out or filled for what is known of a whole log alone."""
         settings = self.scene.config.preprocessing
-        return settings.exclude_condemned or bool(settings.derived) or settings.max_slip is not None
+        of_whole = settings.max_slip, settings.bridge_gaps_s
+        return settings.exclude_condemned or bool(settings.derived) or of_whole != (None, None)
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
@@ -228,7 +234,7 @@ def check_parts(logs: Mapping[str, Sequence[Samples]]) -> None:
 
     def share(one: LogPart, other: LogPart) -> bool:
         (start, stop), (of_other, until) = spans[one], spans[other]
-        return share_samples(one.range, other.range) is None and start <= until and of_other <= stop
+        return one.shares_samples(other) is None and start <= until and of_other <= stop
 
     require_apart(parts, share)
 

@@ -25,6 +25,7 @@ from torchid.fitting.robust import RobustSummary
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
+from torchid.logs.time_range import log_title
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, Metrics, Samples
 from torchid.problem.metrics import SETS, WHITENED, WorseThanNominal, describe_worse, worse_than_nominal
@@ -192,7 +193,7 @@ def draw_forces(evaluation: Evaluation, samples: Samples, compared: Comparison[C
         predicted.append(forces)
     robot, nominal = evaluation.robot, predicted[0] + np.nan_to_num(measured[1] - measured[0])  # NaN: not measured
     noise = None if evaluation.noise is None else noise_series(evaluation.builder, part, evaluation.noise)
-    series = ForceSeries(Path(samples.source).name, part.time.numpy(), measured[1], nominal, predicted[1], noise)
+    series = ForceSeries(log_title(samples.source), part.time.numpy(), measured[1], nominal, predicted[1], noise)
     return force_figure(series, robot.dof_names, robot.base_rows)
 
 
@@ -283,7 +284,7 @@ def _identifiability_document(run: Identification) -> dict[str, object]:
 def _bits(contributions: Contributions) -> dict[str, list[tuple[str, float]]]:
     """Names and bits, by kind."""
     return {
-        "logs": [(Path(log.name).name, log.bits) for log in contributions.logs],
+        "logs": [(log_title(log.name), log.bits) for log in contributions.logs],
         "contact states": [(state.name, state.bits) for state in contributions.states],
         "sensors": [(sensor.name, sensor.bits) for sensor in contributions.sensors],
     }

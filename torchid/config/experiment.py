@@ -108,7 +108,7 @@ _EXPERIMENT = FileKind(
     name="experiment",
     keys="robot, logs, sensors, output",
     list_example="contacts=[{frame: l_sole, type: flat}]",
-    paths=("robot.urdf", *(f"logs.{name}.*{of}" for name in SETS for of in ("", ".file"))),
+    paths=("robot.urdf", *(f"logs.{name}.*{of}" for name in SETS for of in ("", ".file", ".files.*", ".files.*.file"))),
     urls=("logs.train.*",),
     outputs=("output",),
     prepare=_spelled_out,

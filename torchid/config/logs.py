@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt, war
 from torchid.logs import Columns, Topics
 from torchid.logs.containers import FACTORS, READABLE, list_bag_files
 from torchid.logs.remote import RemoteFile, as_path, list_matching
-from torchid.logs.time_range import LogPart, share_samples, split_range
+from torchid.logs.time_range import JOINED, JOINED_ACCEPTED, LogFile, LogPart, join_files, split_range
 
 SETS = ("train", "test", "validation")
 """Keys of `logs` that list logs."""
@@ -24,8 +25,9 @@ SETS = ("train", "test", "validation")
 FOLDS = 5
 """Folds that a log is cut into where an entry names one and not their number."""
 
-_KEYS = ("file", "from", "to", "fold", "without_fold", "of")
-_ENTRY = "the name of a log, or a mapping with file and from, to, fold or without_fold"
+_KEYS = ("file", "files", "from", "to", "fold", "without_fold", "of")
+_ENTRY = "the name of a log, or a mapping with file, or files, and from, to, fold or without_fold"
+_FILES = "several files as one log, [motion.csv, {file: plates.csv, shift_s: 0.12}], the first with its stamps"
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -52,7 +54,8 @@ class LogsConfig:
     @property
     def files(self) -> list[Path]:
         """All files, of parts of logs as well; a bag may be a folder."""
-        return list(dict.fromkeys(split_range(path).file for name in SETS for path in getattr(self, name)))
+        parts = [split_range(path) for name in SETS for path in getattr(self, name)]
+        return list(dict.fromkeys(file.path for part in parts for file in part.files))
 
     def require_samples(self, command: str) -> None:
         """Refuse factors where samples are needed.
@@ -94,11 +97,8 @@ def _names(field: str, entry: object) -> Iterator[object]:
     for key in entry:
         if key not in _KEYS:
             raise UnknownNameError.at_field(field, str(key), _KEYS)
-    file, folds = entry.get("file"), [key for key in ("fold", "without_fold") if key in entry]
+    file, folds = _file(field, entry), [key for key in ("fold", "without_fold") if key in entry]
     bounds = [key for key in ("from", "to") if key in entry]
-    if not isinstance(file, str) or not file:
-        found = "missing" if "file" not in entry else f"found {excerpt(repr(file))}"
-        raise ConfigError.at_field(f"{field}.file", found, _ENTRY)
     if len(folds) + bool(bounds) > 1 or ("of" in entry and not folds):
         found = f"{' and '.join([*folds, *bounds, *(['of'] if not folds else [])])} together"
         accepted = "from and to, or fold, or without_fold; of (the number of folds) with one of the last two"
@@ -110,6 +110,38 @@ def _names(field: str, entry: object) -> Iterator[object]:
     number = _count(f"{field}.of", entry.get("of", FOLDS), 2)
     fold = _count(f"{field}.{folds[0]}", entry[folds[0]], 1, number)
     yield from (f"{file}{text}" for text in _fold_ranges(fold, number, folds[0] == "without_fold"))
+
+
+def _file(field: str, entry: Mapping[str, object]) -> str:
+    """The name of the log of a mapping without its range."""
+    if "files" in entry:
+        if "file" in entry:
+            raise ConfigError.at_field(field, "file and files together", "one of the two")
+        files = entry["files"]
+        if not isinstance(files, list) or len(files) < 2:
+            found = "one file" if isinstance(files, list) and files else f"found {excerpt(repr(files))}"
+            raise ConfigError.at_field(f"{field}.files", found, f"{_FILES}; file for a single one")
+        return join_files([_joined(f"{field}.files.{number}", one) for number, one in enumerate(files)])
+    file = entry.get("file")
+    if not isinstance(file, str) or not file:
+        found = "missing" if "file" not in entry else f"found {excerpt(repr(file))}"
+        raise ConfigError.at_field(f"{field}.file", found, _ENTRY)
+    return file
+
+
+def _joined(field: str, entry: object) -> LogFile:
+    """One of several files."""
+    keys = ("file", "shift_s")
+    given = entry if isinstance(entry, Mapping) else {"file": entry}
+    for key in given:
+        if key not in keys:
+            raise UnknownNameError.at_field(field, str(key), keys)
+    file, shift = given.get("file"), given.get("shift_s", 0.0)
+    if not isinstance(file, str) or not file or JOINED in file:
+        raise ConfigError.at_field(field, f"found {excerpt(repr(entry))}", _FILES)
+    if isinstance(shift, bool) or not isinstance(shift, (int, float)) or not math.isfinite(shift):
+        raise ConfigError.at_field(f"{field}.shift_s", f"found {excerpt(repr(shift))}", "seconds, added to its stamps")
+    return LogFile(Path(file), float(shift))
 
 
 def _fold_ranges(fold: int, folds: int, without: bool) -> list[str]:
@@ -150,7 +182,7 @@ def resolve_logs(logs: LogsConfig) -> LogsConfig:
     """
     files = {key: _matching(f"logs.{key}", getattr(logs, key)) for key in SETS}
     parts = {key: [_part(f"logs.{key}", path) for path in files[key]] for key in SETS}
-    require_apart(parts, lambda one, other: share_samples(one.range, other.range) is True)
+    require_apart(parts, lambda one, other: one.shares_samples(other) is True)
     return LogsConfig(**files, topics=logs.topics, columns=logs.columns)
 
 
@@ -163,7 +195,7 @@ def require_apart(parts: Parts, share: Callable[[LogPart, LogPart], bool]) -> No
 
     Args:
         parts: of logs.
-        share: whether two of the same file share samples.
+        share: whether two of the same file, or of the same first of several, share samples.
 
     Raises:
         ConfigError: samples that are fitted on twice, or decide when to stop as well.
@@ -187,9 +219,9 @@ def _sharing(
     """Pairs of parts of two lists, or of one, that share samples."""
     by_file = defaultdict[Path, list[tuple[int, LogPart]]](list)
     for number, part in enumerate(parts.get(key, ())):
-        by_file[part.file].append((number, part))
+        by_file[part.files[0].path].append((number, part))
     for number, part in enumerate(parts.get(other, ())):
-        for before, one in by_file.get(part.file, ()):
+        for before, one in by_file.get(part.files[0].path, ()):
             if (key != other or before < number) and share(one, part):
                 yield one, part
 
@@ -213,7 +245,11 @@ def _matching(field: str, paths: Sequence[Path]) -> list[Path]:
         if part.range is not None and part.file.suffix == FACTORS:
             found = f"{path}, a part of factors, which have no samples"
             raise ConfigError.at_field(field, found, f"{FACTORS} files as they are, or parts of logs")
-        if not {"*", "?"} & set(part.file.name) or part.file.exists():
+        if part.joins and {"*", "?"} & set("".join(file.path.name for file in part.files)):
+            raise ConfigError.at_field(
+                field, f"{path}, a pattern among several files", f"every file, {JOINED_ACCEPTED}"
+            )
+        if part.joins or not {"*", "?"} & set(part.file.name) or part.file.exists():
             out.append(path)
             continue
         files = _listed(part.file)

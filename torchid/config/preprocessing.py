@@ -32,6 +32,7 @@ _POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
 class PreprocessingConfig:
     """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
 
+    `bridge_gaps_s`: gaps (NaN) of at most so long [s] are filled before anything else is done; None leaves them.
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
     recorded ones.
@@ -45,6 +46,7 @@ class PreprocessingConfig:
 
     cutoff_hz: Positive | None = None
     sample_rate_hz: Positive | None = None
+    bridge_gaps_s: Positive | None = None
     contact_margin_s: NotNegative | None = None
     detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
     base_motion: Literal["contacts"] | None = None

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +36,7 @@ from torchid.log_checks.stamps import check_magnitudes, check_missing_values, ch
 from torchid.log_checks.weight import check_accelerometer, check_weight
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
+from torchid.logs.time_range import log_title
 from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
 from torchid.problem import Samples
 from torchid.problem.standing import longest_standing
@@ -289,7 +289,7 @@ def drop_condemned(samples: Samples, checked: Checked, cutoff_hz: float | None, 
     reasons = _exclusion_reasons(checked)
     if excluded.all():
         raise LogError(source, "preprocessing.exclude_condemned", f"no sample left: {reasons}", "a longer log")
-    warn(f"{Path(source).name}: {excluded.sum()} of {len(samples)} samples excluded: {reasons}")
+    warn(f"{log_title(source)}: {excluded.sum()} of {len(samples)} samples excluded: {reasons}")
     return samples[torch.from_numpy(np.flatnonzero(~excluded))]
 
 

@@ -43,7 +43,7 @@ _BYTES_PER_LETTER = 4  # of a table: a cell has at least two characters, a numbe
 def log_bytes(path: Path, limit: float) -> int:
     """Bytes of a log's arrays: an upper bound for CSV files below a limit, 0 for bags, which are read whole.
 
-    A part of a log counts as all of it.
+    A part of a log counts as all of it, several files count together.
 
     Raises:
         LogError: the file cannot be read.
@@ -51,6 +51,8 @@ def log_bytes(path: Path, limit: float) -> int:
     kind = existing_log_kind(path)
     if kind is LogKind.BAG:
         return 0
+    if kind is LogKind.JOINED:
+        return sum(log_bytes(file.path, limit) for file in split_range(path).files)
     with about_file(path):
         path = split_range(path).file
         if kind is LogKind.TABLE:
@@ -161,7 +163,7 @@ class LogBlocks:
 
 @contextmanager
 def open_log_blocks(path: Path, folder: Path | None, columns: Columns | None = None) -> Iterator[LogBlocks]:
-    """Open a log (.h5, .npz, .csv or .parquet).
+    """Open a log in one file (.h5, .npz, .csv or .parquet).
 
     Arrays of .h5 and .npz files are read in place unless these are compressed; others are unpacked to temporary files
     in `folder`, or to memory without one. Of a part of a log no other samples are there.

@@ -134,6 +134,7 @@ class Columns:
 
     Attributes:
         imu_frame: the frame of the URDF that the IMU sits at: no column, but the name itself.
+        other_times: entries like `time`, for files without its column.
         joint_order: names of joints by number, for entries without `order`, or the robot whose order it is (`go2`);
             `contact_order`, `sensor_order`: as well.
         joint_name: what the joint that the file calls {joint} is called in the URDF, such as `{joint}_joint`.
@@ -142,6 +143,7 @@ class Columns:
     """
 
     time: _Entry | None = None
+    other_times: list[_Entry] = dataclasses.field(default_factory=list)
     joint_position: _Entry | None = None
     joint_velocity: _Entry | None = None
     joint_acceleration: _Entry | None = None
@@ -280,9 +282,10 @@ def check_columns(columns: Columns) -> None:
         if columns.name_of(kind).count(f"{{{kind}}}") != 1:
             accepted = f"a pattern with {{{kind}}} once, such as {{{kind}}}_link"
             raise ConfigError.at_field(f"{KEY}.{kind}_name", f"found '{excerpt(columns.name_of(kind))}'", accepted)
-    for field in columns.fields:
-        _check_given(field, getattr(columns, field))
-    for part in list_parts(columns).values():
+    times = [("other_times", entry) for entry in columns.other_times]
+    for field, entry in (*((field, getattr(columns, field)) for field in columns.fields), *times):
+        _check_given(field, entry)
+    for part in (*list_parts(columns).values(), *(_part(name, "time", entry) for name, entry in times)):
         _check_part(part)
 
 
@@ -384,9 +387,8 @@ def require_names(columns: Columns, known: Mapping[str, Collection[str]]) -> Non
     """
     if (robot := robot_with_order(columns.joint_order)) and "joint" in known:
         require_joints_of(f"{KEY}.joint_order", robot, known["joint"])
-    stated: list[tuple[str, str, Iterable[str | None]]] = []
-    for kind in known:
-        stated.append((kind, f"{kind}_order", getattr(columns, f"{kind}_order") or ()))
+    stated: list[tuple[str, str, Iterable[str | None]]]
+    stated = [(kind, f"{kind}_order", getattr(columns, f"{kind}_order") or ()) for kind in known]
     for part in list_parts(columns).values():
         stated.append((part.kind, f"{part.key}.order", part.entry.order or ()))
         stated.append((part.kind, f"{part.key}.columns", part.entry.columns))

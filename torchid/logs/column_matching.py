@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from torchid.errors import ConfigError, LogError, excerpt, join_names
 from torchid.logs.column_map import AXES, KEY, PLACEHOLDER, Columns, Part, fits, letters_of, list_parts
 from torchid.logs.column_proposals import name_unknown
 from torchid.logs.columns import KINDS
-from torchid.logs.log import UnknownFieldError
+from torchid.logs.log import CONTACT_READINGS, IMU_FIELDS, UnknownFieldError
 
 _LISTED = 8
 
@@ -113,7 +114,8 @@ class _Search:
         self.parts, self.left_out = list_parts(columns), set[str]()
         fixed = {key: self._fixed(part) for key, part in self.parts.items()}
         self._fixed_by_key = {key: one for key, one in fixed.items() if one is not None}
-        self._free = {key: _regex(part) for key, part in self.parts.items() if key not in self._fixed_by_key}
+        free = {key: part for key, part in self.parts.items() if key not in self._fixed_by_key}
+        self._free = {key: _regex(part, part.entry.column or "") for key, part in free.items()}
         self._found = self._assign()
 
     @property
@@ -254,15 +256,77 @@ def _filled(text: str, values: Mapping[str, str], number: int) -> str:
     return PLACEHOLDER.sub(value, text)
 
 
-def _regex(part: Part) -> re.Pattern[str]:
-    """Columns that fit a pattern; the group `name` has the name."""
-    text, out, end = part.entry.column or "", "", 0
+def _regex(part: Part, text: str) -> re.Pattern[str]:
+    """Columns that fit a pattern of an entry; the group `name` has the name."""
+    out, end = "", 0
     axes = "|".join(part.components)
-    groups = {part.kind: "(?P<name>.+)", "axis": f"(?:{axes})", "AXIS": f"(?:{axes.upper()})"}
+    groups = {part.kind: "(?P<name>.+)", "index": r"\d+", "axis": f"(?:{axes})", "AXIS": f"(?:{axes.upper()})"}
     for found in PLACEHOLDER.finditer(text):
         out += re.escape(text[end : found.start()]) + groups[found[1]]
         end = found.end()
     return re.compile(out + re.escape(text[end:]))
+
+
+# ----------------------------------------------------------------------------------------------- several files, one map
+
+
+def columns_of_file(columns: Columns, given: Sequence[str]) -> Columns:
+    """The map for a file with some columns or arrays: with one of `other_times` if that of `time` is not there."""
+    others = [entry for entry in columns.other_times if entry.column in given]
+    if not others or (columns.time is not None and columns.time.column in given):
+        return columns
+    return replace(columns, time=others[0])
+
+
+def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Sequence[str]) -> list[Columns | None]:
+    """The map without the entries that are for others of several files, for each.
+
+    Entries without columns are for the file with the field that they belong to.
+
+    Args:
+        columns: the map.
+        given: columns or arrays of each file.
+        files: their names.
+
+    Raises:
+        LogError: an entry of which no file has a column.
+    """
+    maps = [columns_of_file(columns, of_file) for of_file in given]
+    found = [_entries_in(own, of_file) for own, of_file in zip(maps, given, strict=True)]
+    for name in columns.fields:
+        if not any(name in of_file for of_file in found):
+            none = f"no column of it in {join_names(files, _LISTED)}"
+            raise LogError.at_field(f"{KEY}.{name}", none, "columns that one of the files has")
+    without: list[dict[str, Any]] = [dict.fromkeys({*columns.fields, "imu_frame"} - of_file) for of_file in found]
+    return [replace(own, **lacking) for own, lacking in zip(maps, without, strict=True)]
+
+
+def _entries_in(columns: Columns, given: Sequence[str]) -> set[str]:
+    """Entries of a map of which a file has a column, and those without columns that belong to one of its fields."""
+    patterns = [
+        (part.key.partition(".")[0], letters_of(text), _regex(part, text))
+        for part in list_parts(columns).values()
+        for text in (part.entry.column, *part.entry.columns.values())
+        if text
+    ]
+    out = set[str]()
+    for text in given:
+        of_fields = [(field, letters) for field, letters, regex in patterns if regex.fullmatch(text)]
+        ignored = [letters_of(one) for one in columns.ignore if fits(text, one)]
+        most = max((*ignored, *(letters for _, letters in of_fields)), default=0)
+        out |= {field for field, letters in of_fields if letters == most}
+    has = {*out, *(text.partition(".")[0] for text in given)}
+    without = {name: _beside(columns, name) for name in (*columns.fields, "imu_frame")}
+    named = {field for field, *_ in patterns}
+    return out | {name for name, beside in without.items() if name not in named and has & set(beside)}
+
+
+def _beside(columns: Columns, name: str) -> Sequence[str]:
+    """Fields to one of which an entry without columns belongs."""
+    if name == "contact_active" and (columns.contact_active is None or columns.contact_active.above is None):
+        return ("joint_position",)  # contacts that always touch, which any file could have
+    beside = {"contact_active": CONTACT_READINGS, "joint_torque": ("joint_velocity",), "imu_frame": IMU_FIELDS}
+    return beside.get(name, ())
 
 
 # ------------------------------------------------------------------------------------------------- checks of a matching

@@ -37,20 +37,28 @@ READABLE = (*WRITABLE, *BAGS)
 
 
 class LogKind(Enum):
-    """Content of a file: named arrays, one column per scalar, or messages."""
+    """Content of a log: named arrays, one column per scalar, messages, or several files of the first two kinds."""
 
     ARRAYS = "arrays"
     TABLE = "table"
     BAG = "bag"
+    JOINED = "joined"
 
 
 def existing_log_kind(path: Path) -> LogKind:
     """The kind of an existing log, or of the file that it is a part of.
 
     Raises:
-        LogError: the file does not exist, or its extension is unknown.
+        LogError: the file does not exist, or its extension is unknown; or one of several files is a bag.
     """
-    path = split_range(path).file
+    part = split_range(path)
+    if part.joins:
+        for file in part.files:
+            if existing_log_kind(file.path) is LogKind.BAG:
+                accepted = f"{', '.join(WRITABLE)}: the topics of a bag have common stamps already; or convert it"
+                raise LogError(file.path, "file", "a bag, one of several files of a log", accepted)
+        return LogKind.JOINED
+    path = part.file
     if os.path.isdir(path):  # Path.is_dir raises where a name is too long
         if list_bag_files(path):
             return LogKind.BAG
@@ -79,9 +87,9 @@ def list_bag_files(path: Path) -> list[Path]:
 
 
 def log_files(path: Path) -> list[Path]:
-    """The files of a log, or of the one that it is a part of: several of a bag in a folder."""
-    file = split_range(path).file
-    return list_bag_files(file) or [file]
+    """The files of a log, or of the one that it is a part of: several of a bag in a folder, or of joined files."""
+    files = (file.path for file in split_range(path).files)
+    return [one for file in files for one in list_bag_files(file) or [file]]
 
 
 def _kind(path: Path, accepted: tuple[str, ...]) -> LogKind:

@@ -72,6 +72,7 @@ def warn_of_gaps(log: Log, name: str, coverage: Coverage) -> None:
     ]
     if broken:
         message = f"{log.source}: {name}: NaN in part of {', '.join(broken)}: NaN throughout after preprocessing"
+        message += ", unless preprocessing.bridge_gaps_s bridges these gaps"
         warn(message)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt
 from torchid.logs.column_map import KEY, Columns, Gains, Part, PdLaw, check_columns, fits, letters_of
-from torchid.logs.column_matching import Matched, match_columns
+from torchid.logs.column_matching import Matched, columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
 from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, SHAPES, VARIANTS, WRENCHES, FloatArray, parse_names
 from torchid.logs.spill import LazyArray
@@ -335,6 +335,7 @@ def map_table(columns: Columns, header: Sequence[str]) -> MappedFields | None:
         InputError: a map that does not fit the columns, or itself.
     """
     check_columns(columns)
+    columns = columns_of_file(columns, header)
     matching = match_columns(columns, header, is_column)
     if matching is None:
         return None
@@ -355,6 +356,7 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
         InputError: a map that does not fit the arrays, or itself.
     """
     check_columns(columns)
+    columns = columns_of_file(columns, given)
     named = {name: parse_names(name, load(name)) for name in NAME_FIELDS if name in given}
     matching = match_columns(columns, given, lambda name: name in SHAPES or name in VARIANTS, named)
     if matching is None:

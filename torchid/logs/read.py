@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from torchid.logs.containers import (
     reader_errors_explained,
     save_arrays,
 )
+from torchid.logs.gaps import bridge_gaps, refuse_gaps
+from torchid.logs.joined import read_joined
 from torchid.logs.log import (
     EXCLUSIVE,
     NAME_FIELDS,
@@ -60,6 +63,7 @@ def read_log(
     progress: Callable[[float], None] | None = None,
     allow_gaps: bool = False,
     columns: Columns | None = None,
+    bridge_gaps_s: float | None = None,
 ) -> Log:
     """Read a log: arrays (.npz, never pickled, .h5, .hdf5), a table (.csv, .parquet) or a bag of ROS messages.
 
@@ -69,28 +73,35 @@ def read_log(
 
     Args:
         path: the file; of a ROS 2 bag also its folder. A range of time behind it takes a part of the log, as if nothing
-            else had been recorded: `walk.npz[0:30]`, see `TimeRange`.
+            else had been recorded: `walk.npz[0:30]`, see `TimeRange`. Several files of one recording are one log with
+            the stamps of the first: `motion.csv + plates.csv`, see `read_joined`.
         topics: topics of a bag (.bag, .mcap, .db3).
         progress: called with the share of a bag that has been read.
         allow_gaps: accept NaN in poses and their derivatives, which `torchid.check` reports.
         columns: what the columns of a table, or the arrays of a file, hold where these have other names.
+        bridge_gaps_s: fill gaps of at most so long [s], see `bridge_gaps`; None leaves them.
 
     Raises:
         LogError: one line with the file, the field, its value and the accepted values.
         ConfigError: a map of columns that does not fit itself.
 
     Warns:
-        TorchidWarning: messages of a bag without time stamps, duplicate messages, or channels that are NaN in some.
+        TorchidWarning: messages of a bag without time stamps, duplicate messages, channels that are NaN in some, or
+            gaps that are filled.
     """
     with during("reading", os.fspath(path)):
         part = split_range(path)
         kind = existing_log_kind(part.file)
         if kind is LogKind.ARRAYS:
-            raw = _read_arrays(part.file, columns)
+            raw = _read_arrays(part.file, columns, check_fields_given)
         else:
-            raw = read_table(part.file, columns) if kind is LogKind.TABLE else read_bag(part.file, topics, progress)
+            if kind is LogKind.JOINED:
+                raw = read_joined(part.files, columns, partial(_read_one, bridge_gaps_s))
+            else:
+                raw = read_table(part.file, columns) if kind is LogKind.TABLE else read_bag(part.file, topics, progress)
             check_fields_given(raw)
-        return build_log(raw if part.range is None else _cut(raw, part.range), allow_gaps)
+        raw = raw if part.range is None else _cut(raw, part.range)
+        return build_log(bridge_gaps(raw, bridge_gaps_s), allow_gaps)
 
 
 def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
@@ -114,11 +125,25 @@ def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange) -> dict[str, NDArray[A
 
 def check_fields_given(names: Collection[str]) -> None:
     """Raise LogError for unknown or missing fields, and for invalid combinations."""
-    _check_names(names)
+    _check_known(names)
+    for name in REQUIRED:
+        if name not in names:
+            raise LogError.at_field(name, "missing", f"a log with {', '.join(REQUIRED)}")
     _check_combination(names)
 
 
-def _read_arrays(path: Path, columns: Columns | None) -> dict[str, NDArray[Any]]:
+def _read_one(bridge_gaps_s: float | None, path: Path, columns: Columns | None) -> dict[str, NDArray[Any]]:
+    """The fields of one of several files of a log, whose gaps no spline to the stamps of others can cross."""
+    if existing_log_kind(path) is LogKind.TABLE:
+        raw = read_table(path, columns)
+    else:
+        raw = _read_arrays(path, columns, _check_known)
+    return bridge_gaps(raw, bridge_gaps_s if "time" in raw else None)
+
+
+def _read_arrays(
+    path: Path, columns: Columns | None, check: Callable[[Collection[str]], None]
+) -> dict[str, NDArray[Any]]:
     """The arrays of a .npz or HDF5 file; all names are checked first."""
     with open_container(path) as container:
 
@@ -128,21 +153,18 @@ def _read_arrays(path: Path, columns: Columns | None) -> dict[str, NDArray[Any]]
 
         names = list(container.declared_bytes())
         mapped = None if columns is None else map_arrays(columns, names, load)
-        check_fields_given(names if mapped is None else mapped.given)
+        check(names if mapped is None else mapped.given)
         return {name: load(name) for name in names} if mapped is None else mapped.read(load)
 
 
-def _check_names(names: Collection[str]) -> None:
-    """Raise LogError on unknown or missing fields."""
+def _check_known(names: Collection[str]) -> None:
+    """Raise LogError on unknown fields."""
     known = (*SHAPES, *VARIANTS)
     unknown = [name for name in names if name not in known]
     if len(unknown) == 1 and not is_foreign(unknown[0]):
         raise UnknownFieldError.at_field("field", unknown[0], known)
     if unknown:
         raise unknown_columns(unknown)
-    for name in REQUIRED:
-        if name not in names:
-            raise LogError.at_field(name, "missing", f"a log with {', '.join(REQUIRED)}")
 
 
 def _check_combination(names: Collection[str]) -> None:
@@ -178,8 +200,10 @@ def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, A
         if name == "contact_active":
             fields[name] = parse_flags(name, array, labels)
             continue
-        values = to_float64(name, array)
-        check_finite(name, values, allow_nan=allow_gaps or name in (*NAN_ALLOWED, NORMALS), labels=labels)
+        values, may_be_nan = to_float64(name, array), allow_gaps or name in (*NAN_ALLOWED, NORMALS)
+        if not may_be_nan and np.isnan(values).any():
+            refuse_gaps(name, values, time, labels)
+        check_finite(name, values, allow_nan=may_be_nan, labels=labels)
         fields[name] = normalize_quaternions(name, values, allow_gaps) if is_quaternion(name) else values
     if NORMALS in fields and not allow_gaps:
         fields[NORMALS] = normalize_normals(fields[NORMALS], fields["contact_active"], names["contact_names"])

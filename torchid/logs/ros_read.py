@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import LogError, UnknownNameError, how_to_install, warn_about_file
+from torchid.logs.alignment import Series
 from torchid.logs.containers import list_bag_files, reader_errors_explained
-from torchid.logs.log import FloatArray, is_quaternion, normalize_quaternions
-from torchid.logs.quaternion import make_sign_continuous
+from torchid.logs.log import FloatArray
 from torchid.logs.ros_low_state import LowState
 from torchid.logs.ros_messages import (
     ContactFlag,
@@ -41,7 +41,6 @@ from torchid.logs.ros_topics import (
     WrenchTopic,
     check_topics,
 )
-from torchid.logs.timeline import LONGEST_STEP, spline_derivatives
 
 if TYPE_CHECKING:
     from torchid.logs.ros_files import BagFile, Channel
@@ -63,54 +62,15 @@ class _CommonClock:
         return (stamps - self.stamps[0]) / 1e9
 
     def align(self, series: TopicSeries) -> dict[str, FloatArray]:
-        """The fields of a topic at the log's stamps: unchanged for equal stamps, else by a quintic spline.
-
-        Quaternions are interpolated as in `preprocess`, component by component without sign flips, then normalised.
-        A channel with any NaN becomes NaN throughout.
-
-        Raises:
-            LogError: too long a gap in a topic that must be interpolated.
-
-        Warns:
-            TorchidWarning: a field is NaN in some samples.
-        """
-        first, last = np.searchsorted(series.stamps, self.stamps[[0, -1]])
-        if np.array_equal(series.stamps[first : last + 1], self.stamps):
-            return {name: values[first : last + 1] for name, values in series.fields.items()}
-        run = self._unbroken(series)
-        return {name: self._interpolated(series, run, name) for name in series.fields}
+        """The fields of a topic at the log's stamps, see `Series.at`."""
+        return self._series(series).at(self.time)
 
     def hold(self, series: TopicSeries, values: FloatArray) -> FloatArray:
         """The last values (K, ...) of a topic before each stamp, (N, ...)."""
-        return np.asarray(values[np.searchsorted(series.stamps, self.stamps, side="right") - 1])
+        return self._series(series).hold(values, self.time)
 
-    def _unbroken(self, series: TopicSeries) -> slice:
-        """The samples around the log's time, checked for gaps that are too long to be interpolated."""
-        steps = np.diff(series.stamps)
-        long = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) if len(steps) else steps
-        inside = long[(series.stamps[long + 1] > self.stamps[0]) & (series.stamps[long] < self.stamps[-1])]
-        if len(inside):
-            step, median = steps[inside[0]] / 1e9, np.median(steps) / 1e9
-            at = self.seconds(series.stamps[inside])[0]
-            found = f"a gap of {step:.4g} s from {at:.4g} s on, where the median step is {median:.4g} s"
-            accepted = f"steps of at most {LONGEST_STEP:g} median steps: cut the bag there"
-            raise LogError.at_field(series.topic, found, accepted)
-        before, after = np.searchsorted(series.stamps[long], self.stamps[[0, -1]])
-        start = int(long[before - 1]) + 1 if before else 0
-        return slice(start, int(long[after]) + 1 if after < len(long) else len(series.stamps))
-
-    def _interpolated(self, series: TopicSeries, run: slice, name: str) -> FloatArray:
-        values, stamps = series.fields[name][run], self.seconds(series.stamps[run])
-        if is_quaternion(name):
-            quat = make_sign_continuous(normalize_quaternions(f"{series.topic}: {name}", values))
-            quat = spline_derivatives(stamps, quat, self.time, (0,))[0]
-            return np.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True))
-        gaps = np.isnan(values).any(axis=0)
-        if gaps.any() and not np.isnan(values[:, gaps]).all():
-            warn_about_file(f"{series.topic}: NaN in part of {name}: NaN throughout after interpolation")
-        out = np.full((len(self.stamps), values.shape[1]), np.nan)
-        out[:, ~gaps] = spline_derivatives(stamps, values[:, ~gaps], self.time, (0,))[0]
-        return out
+    def _series(self, series: TopicSeries) -> Series:
+        return Series(series.topic, self.seconds(series.stamps), series.fields, "bag")
 
 
 def _make_common_clock(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -114,17 +116,90 @@ def share_samples(one: TimeRange | None, other: TimeRange | None) -> bool | None
     return False if early is False or late is False else None if None in (early, late) else True
 
 
+JOINED = " + "
+"""Between the names of several files that are one log."""
+
+#: Seconds behind the name of one of several files: `plates.csv@-0.12s`.
+_SHIFT = re.compile(r"(.+)@([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)s?")
+JOINED_ACCEPTED = "FILE + FILE, each with @SECONDS where its clock is to be shifted: 'motion.csv + plates.csv@0.12s'"
+"""Accepted as a name of several files, in messages."""
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """A file of a log, and what is added to its stamps [s]."""
+
+    path: Path
+    shift_s: float = 0.0
+
+
+def join_files(files: Sequence[LogFile]) -> str:
+    """The name of several files as one log; all but the first by how they lie in its folder, if they do."""
+    folder, names = files[0].path.parent, [str(files[0].path)]
+    for file in files[1:]:
+        beside = file.path.is_relative_to(folder)
+        names.append(str(file.path.relative_to(folder) if beside else file.path))
+    shifts = [f"@{file.shift_s!r}s" if file.shift_s else "" for file in files]
+    return JOINED.join(f"{name}{shift}" for name, shift in zip(names, shifts, strict=True))
+
+
+def log_title(log: str | os.PathLike[str]) -> str:
+    """The name of a log without folders."""
+    return JOINED.join(Path(text).name for text in str(log).split(JOINED))
+
+
+def _split_files(path: Path) -> tuple[LogFile, ...]:
+    """The files that a name joins, the others relative to the folder of the first; one for a name of no several."""
+    first, *others = str(path).split(JOINED)
+    if not others or not all(Path(text).suffix for text in (first, *others)) or os.path.lexists(path):
+        return (LogFile(path),)
+    found = [_shifted(text) for text in (first, *others)]
+    folder = found[0].path.parent
+    return (found[0], *(LogFile(folder / file.path, file.shift_s) for file in found[1:]))
+
+
+def _shifted(text: str) -> LogFile:
+    found = _SHIFT.fullmatch(text)
+    return LogFile(Path(text)) if found is None else LogFile(Path(found[1]), float(found[2]))
+
+
 @dataclass(frozen=True)
 class LogPart:
-    """The file (or folder) of a log, and which part of it in time is meant, None for all."""
+    """The file (or folder) of a log, or several as one name, and which part of it in time is meant, None for all."""
 
     file: Path
     range: TimeRange | None
 
+    @cached_property
+    def files(self) -> tuple[LogFile, ...]:
+        """The file, or those that make up one log; the first has its stamps."""
+        return _split_files(self.file)
+
+    @property
+    def joins(self) -> bool:
+        """Whether it is made up of several files."""
+        return len(self.files) > 1
+
+    @property
+    def kind(self) -> str:
+        """Extensions of the files, with what their stamps are shifted by."""
+        shifts = [f"@{file.shift_s!r}" if file.shift_s else "" for file in self.files]
+        return JOINED.join(f"{x.path.suffix.lower()}{shift}" for x, shift in zip(self.files, shifts, strict=True))
+
     @property
     def name(self) -> str:
-        """The name of the file without its extension, and the range."""
-        return self.file.stem + ("" if self.range is None else self.range.text)
+        """The names of the files without their extensions, and the range."""
+        stems = [file.path.stem for file in self.files]
+        return JOINED.join(stems) + ("" if self.range is None else self.range.text)
+
+    def shares_samples(self, other: LogPart) -> bool | None:
+        """Whether it overlaps with a part of the same (first) file; None where that depends on stamps.
+
+        Ranges count from the first stamp of all files together.
+        """
+        if self.file == other.file:
+            return share_samples(self.range, other.range)
+        return True if any(part.range is None and not part.joins for part in (self, other)) else None
 
     def __str__(self) -> str:
         return str(self.file) + ("" if self.range is None else self.range.text)

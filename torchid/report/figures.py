@@ -24,6 +24,7 @@ from torchid.estimators import Estimate
 from torchid.estimators.least_squares import FIXED
 from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
+from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY, WRENCH_COMPONENTS, Array
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS, group_name
@@ -198,7 +199,7 @@ def extra_figure(extras: Sequence[ExtraEstimate]) -> Figure:
     axes[0, 0].set_title("95 % intervals; hollow: confounded with other parameters", loc="left", fontsize=8)
     # made by hand: a log need not have a point in every panel, nor a filled one
     keys = [Line2D([], [], marker="o", linestyle="", color=color) for color in colors.values()]
-    names = [Path(log).name or "all logs" for log in logs]
+    names = [log_title(log) or "all logs" for log in logs]
     figure.legend(keys, names, loc="outside upper right", ncols=min(len(logs), 4))
     return figure
 

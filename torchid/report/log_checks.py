@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from textwrap import fill
 from typing import Any
 
@@ -21,6 +20,7 @@ from torchid.log_checks import CONDEMNED, NOTE, SUSPICIOUS, Checked, Finding, Sp
 from torchid.log_checks.findings import channel_names, channel_unit
 from torchid.logs import Log
 from torchid.logs.log import FloatArray
+from torchid.logs.time_range import log_title
 from torchid.report.figures import STYLE
 
 COLORS = {CONDEMNED: "tab:red", SUSPICIOUS: "tab:orange", NOTE: "tab:blue"}
@@ -56,7 +56,7 @@ def log_check_figure(logs: Sequence[Checked]) -> Figure:
 
 def _title(checked: Checked) -> str:
     """Name and verdict, wrapped here: matplotlib parses texts that it wraps as formulas, whatever its settings."""
-    return fill(excerpt(f"{Path(checked.log.source).name}: {checked.verdict}", _TITLE_LETTERS), _LINE_LETTERS)
+    return fill(excerpt(f"{log_title(checked.log.source)}: {checked.verdict}", _TITLE_LETTERS), _LINE_LETTERS)
 
 
 def _marked_findings(checked: Checked) -> list[Finding]:
@@ -120,7 +120,7 @@ def _range_text(field: str, name: str, values: FloatArray) -> str:
 def log_heading(checked: Checked) -> str:
     """Name, length and duration of a log."""
     log = checked.log
-    return f"{Path(log.source).name}: {len(log)} samples, {log.time[-1] - log.time[0]:.4g} s"
+    return f"{log_title(log.source)}: {len(log)} samples, {log.time[-1] - log.time[0]:.4g} s"
 
 
 def finding_table(findings: Sequence[Finding]) -> Table:

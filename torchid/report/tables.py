@@ -6,7 +6,6 @@ import io
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR,
 from torchid.fitting.calibration import Comparison
 from torchid.identifiability.confounding import ExtraEstimate
 from torchid.identifiability.contributions import Contribution, Contributions, PartContribution
+from torchid.logs.time_range import log_title
 from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS
@@ -190,7 +190,7 @@ def contribution_table(contributions: Contributions, max_rows: int = 12) -> Tabl
             counts = ("", "", "")
             if isinstance(member, PartContribution):
                 counts = (str(member.samples), str(member.rank), str(member.rank_lost))
-            name = Path(member.name).name if kind == "logs" else member.name
+            name = log_title(member.name) if kind == "logs" else member.name
             table.add_row(Text(name), *counts, f"{member.determined:.1f}", f"{member.bits:.1f}")
         if len(members) > max_rows:
             table.add_row(f"and {len(members) - max_rows} more {kind}")
@@ -266,7 +266,7 @@ def extra_table(extras: Sequence[ExtraEstimate]) -> Table:
     table.add_column("unit", no_wrap=True)
     shown = logs[:_MAX_COLUMNS]
     for log in shown:
-        table.add_column(Text(Path(log).name or "all logs"), justify="right", overflow="fold")
+        table.add_column(Text(log_title(log) or "all logs"), justify="right", overflow="fold")
     for label in labels[:_MAX_ROWS]:
         unit = next(x.extra.unit for x in extras if x.extra.label == label)
         cells = (by_label.get((label, log)) for log in shown)

@@ -1,0 +1,148 @@
+"""Commands on several files of one recording, and on logs with gaps: what they find is what one whole file gives."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from demo import shortened_demo
+from trainings import without_figures
+
+from torchid.cli import main
+from torchid.config import load_config
+from torchid.errors import TorchidWarning
+from torchid.logs import read_log
+
+FIELDS = {
+    "motion": ("joint_names", "joint_position", "base_quat_wxyz", "base_position_world"),
+    "plates": ("contact_names", "contact_active", "contact_wrench_local"),
+    "torques": ("joint_names", "joint_torque"),
+}
+JOINED = {"files": ["motion.npz", {"file": "plates.npz", "shift_s": -3.0}, "torques.npz"]}
+NAME = "motion.npz + plates.npz@-3.0s + torques.npz"
+
+
+@pytest.fixture(autouse=True)
+def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_figures(monkeypatch)
+
+
+@pytest.fixture
+def demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The demo with its training log in three files, of which the plates have a clock of their own."""
+    folder = shortened_demo(tmp_path / "demo", 1_000)
+    with np.load(folder / "sway_train.npz") as log:
+        for name, fields in FIELDS.items():
+            shift = 3.0 if name == "plates" else 0.0
+            np.savez(folder / f"{name}.npz", time=log["time"] + shift, **{field: log[field] for field in fields})
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def identified(out: str, train: list[Any], test: list[Any], *overrides: str) -> dict[str, Any]:
+    given = [f"logs.{name}={json.dumps(of)}" for name, of in (("train", train), ("test", test))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        assert main(["identify", "quadruped.yaml", f"output={out}", *given, *overrides]) == 0
+    found: dict[str, Any] = json.loads(Path(out, "metrics.json").read_text())
+    return found
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    capsys.readouterr()
+    assert main(list(arguments)) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    return error
+
+
+def test_a_fit_of_several_files_is_that_of_the_whole_log(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = identified("runs/whole", ["sway_train.npz[:7]"], ["sway_train.npz[7:]"])
+    joined = identified("runs/joined", [JOINED | {"to": 7}], [JOINED | {"from": 7}])
+    assert Path("runs/joined/parameters.json").read_bytes() == Path("runs/whole/parameters.json").read_bytes()
+    for key in ("train", "test", "cross_validation", "samples", "rank"):
+        assert joined[key] == whole[key], key
+
+    assert main(["evaluate", "runs/joined", "--log", f"{NAME}[7:]"]) == 0
+    name = "motion + plates + torques[7:]"
+    evaluated = json.loads((demo / f"runs/joined/evaluation/{name}/metrics.json").read_text())
+    for group, value in evaluated[name]["identified"].items():
+        assert value == pytest.approx(joined["test"][group], rel=1e-9), group
+    assert load_config("runs/joined/config.yaml").logs.train == [demo / f"{NAME}[:7]"]
+
+    capsys.readouterr()
+    identified("runs/again", [JOINED | {"to": 7}], [JOINED | {"from": 7}])
+    assert "samples of 2 logs" in capsys.readouterr().out  # from the cache
+    with np.load("plates.npz") as plates:
+        np.savez("new.npz", **dict(plates) | {"contact_wrench_local": 1.01 * plates["contact_wrench_local"]})
+    os.replace("new.npz", "plates.npz")
+    identified("runs/changed", [JOINED | {"to": 7}], [JOINED | {"from": 7}])
+    assert "samples of" not in capsys.readouterr().out
+    shifted = {"files": ["motion.npz", {"file": "plates.npz", "shift_s": -3.01}, "torques.npz"]}
+    identified("runs/shifted", [shifted | {"to": 7}], [shifted | {"from": 7}])
+    assert "samples of" not in capsys.readouterr().out
+
+
+def test_several_files_are_checked_converted_and_compressed(demo: Path) -> None:
+    assert main(["convert", NAME, "one.h5"]) == 0
+    whole, one = read_log("sway_train.npz"), read_log("one.h5")
+    for name, x in whole.arrays().items():
+        assert np.array_equal(x, one.arrays()[name], equal_nan=True), name
+    assert main(["check", f"{NAME}[1:5]", "--urdf", "quadruped.urdf"]) == 0
+    train = f"logs.train={json.dumps([JOINED])}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        assert main(["check", "quadruped.yaml", train]) == 0
+        assert main(["compress", "quadruped.yaml", train, "--output", "factors"]) == 0
+    assert Path("factors/motion + plates + torques.factor").is_file()
+
+
+def test_no_sample_of_the_first_file_is_used_twice(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = "motion.npz + torques.npz + plates.npz@-3"
+    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:6]', other + '[5:]'])}")
+    assert "share samples; accepted: every sample once" in error
+    error = refusal(capsys, "identify", "quadruped.yaml", f"logs.train={json.dumps([NAME, other])}")
+    assert "share samples" in error
+    test = f"logs.test={json.dumps([other + '[5:]'])}"
+    assert main(["identify", "quadruped.yaml", f"logs.train={json.dumps([NAME + '[:6]'])}", test, "output=runs/x"]) == 0
+    assert f"{other}[5:] is fitted on as well" in capsys.readouterr().err
+
+
+def test_what_several_files_are_not_for_is_refused(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    large = f"logs.train={json.dumps([JOINED])}", "preprocessing.memory_gb=1e-4"
+    assert "file: several files with arrays of" in refusal(capsys, "identify", "quadruped.yaml", *large)
+    assert "several files" in refusal(capsys, "init", "quadruped.urdf", NAME, "--output", "new.yaml")
+    assert "belongs to what is read" in refusal(capsys, "convert", NAME, "plates.npz", "--overwrite")
+
+
+def test_short_gaps_of_a_recording_hardly_change_the_fit(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with np.load("sway_train.npz") as log:
+        broken = dict(log)
+    rng = np.random.default_rng(2)
+    for start in rng.integers(10, 980, 25):
+        broken["joint_position"][start : start + 4, rng.integers(12)] = np.nan
+        broken["base_quat_wxyz"][start + 5 : start + 8] = np.nan
+    np.savez("broken.npz", **broken)
+    error = refusal(capsys, "identify", "quadruped.yaml", "logs.train=[broken.npz]", "output=runs/refused")
+    assert "joint_position: nan at sample" in error
+    assert "preprocessing.bridge_gaps_s" in error
+    bridge = "preprocessing.bridge_gaps_s=0.2"  # some of the gaps touch
+    large = "preprocessing.memory_gb=1e-4"
+    error = refusal(capsys, "identify", "quadruped.yaml", "logs.train=[broken.npz]", bridge, large, "output=runs/large")
+    assert "preprocessing.bridge_gaps_s: set for arrays of" in error
+    whole = identified("runs/whole", ["sway_train.npz"], ["sway_test.npz"])
+    found = identified("runs/bridged", ["broken.npz"], ["sway_test.npz"], bridge)
+    assert found["samples"] == whole["samples"]
+    for group, value in found["test"].items():
+        if isinstance(value, float):
+            assert value == pytest.approx(whole["test"][group], rel=0.05), group
+    capsys.readouterr()
+    identified("runs/other", ["broken.npz"], ["sway_test.npz"], "preprocessing.bridge_gaps_s=0.3")
+    assert "samples of" not in capsys.readouterr().out  # of the cache: other gaps would be bridged
+    assert main(["check", "quadruped.yaml", "logs.train=[broken.npz]", bridge]) == 0
+    assert "broken.npz: joint_position, base_quat_wxyz: gaps of at most 0.2 s bridged in" in capsys.readouterr().err

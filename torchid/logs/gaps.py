@@ -1,0 +1,160 @@
+"""Short gaps in a recording, bridged by splines: markers lost from view, packets lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from torchid.errors import LogError, warn_about_file
+from torchid.logs.log import (
+    CONTACT_READINGS,
+    LARGEST,
+    NORMALS,
+    SHAPES,
+    BoolArray,
+    FloatArray,
+    check_shape,
+    check_time,
+    describe_element,
+    field_shape,
+    is_quaternion,
+    to_float64,
+)
+from torchid.logs.quaternion import make_sign_continuous
+
+KEY = "preprocessing.bridge_gaps_s"
+#: Share of a gap's longest length by which rounded stamps may exceed it.
+_SLACK = 1e-6
+_FLAGS = "contact_active"
+
+
+def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dict[str, NDArray[Any]]:
+    """The fields of a file without their short gaps: NaN between two values that are not further apart than a length.
+
+    A cubic spline through the channel's other samples fills them: it passes 2 times the noise of the samples in the
+    middle of a gap of five steps, a quintic one 5 times. Quaternions are filled as a whole and normalised, contact
+    flags hold. A contact's reading is filled only where the contact touches all the while. Channels that are NaN
+    throughout, gaps at the ends of a log and normals of the ground stay as they are.
+
+    Args:
+        raw: arrays by field, those with samples (N, ...).
+        longest_s: from the value before a gap to that after it [s]; None leaves all as it is.
+
+    Raises:
+        LogError: stamps that are none.
+
+    Warns:
+        TorchidWarning: how many samples were filled.
+    """
+    out = dict(raw)
+    if longest_s is None:
+        return out
+    check_shape("time", raw["time"], SHAPES["time"], {})
+    time = to_float64("time", raw["time"])
+    check_time(time)
+    filled = dict[str, BoolArray]()
+    for name in sorted(_with_gaps(raw), key=lambda name: name != _FLAGS):  # readings depend on flags
+        missing = _missing(name, raw[name])
+        usable = _touching(out, missing.shape) if name in CONTACT_READINGS else None
+        short = _short_gaps(time, missing, longest_s, usable)
+        if short.any():
+            out[name] = _held(raw[name], short) if name == _FLAGS else _filled(time, name, raw[name], short)
+            filled[name] = np.asarray(short.reshape(len(time), -1).any(axis=1))
+    if filled:
+        count = int(np.any(list(filled.values()), axis=0).sum())
+        what = f"gaps of at most {longest_s:g} s bridged in {count} of {len(time)} samples"
+        warn_about_file(f"{', '.join(filled)}: {what}")
+    return out
+
+
+def refuse_gaps(name: str, values: FloatArray, time: FloatArray, labels: tuple[str, ...] = ()) -> None:
+    """Raise LogError for a field (N, ...) that is NaN in some samples; `labels`: names of its columns."""
+    where = describe_element(tuple(map(int, np.argwhere(np.isnan(values))[0])), labels)
+    lengths = [
+        time[stop] - time[start - 1]
+        for column in _missing(name, values).reshape(len(time), -1).T
+        for start, stop in _runs(column)
+        if start > 0 and stop < len(time)
+    ]
+    longest = f"the longest here takes {max(lengths):.3g} s" if lengths else "none here has values on both sides"
+    raise LogError.at_field(name, f"nan at {where}", f"finite numbers, or gaps that {KEY} bridges ({longest})")
+
+
+def _with_gaps(raw: Mapping[str, NDArray[Any]]) -> Iterator[str]:
+    """Fields of which some but not all samples of a channel may be bridged."""
+    samples = len(raw["time"])
+    for name, array in raw.items():
+        has_samples = field_shape(name)[:1] == ("N",) and array.shape[:1] == (samples,)
+        is_usual = array.dtype.kind == "f" and array.ndim == len(field_shape(name))
+        if not has_samples or not is_usual or name in ("time", NORMALS):
+            continue
+        if np.isnan(array).any() and not (np.abs(array) > LARGEST).any():  # which is refused as it is
+            yield name
+
+
+def _missing(name: str, values: NDArray[Any]) -> BoolArray:
+    """Which elements (N, ...) are missing; of quaternions all or none."""
+    nan = np.isnan(values)
+    return np.asarray(np.broadcast_to(nan.any(axis=1, keepdims=True), nan.shape) if is_quaternion(name) else nan)
+
+
+def _runs(missing: BoolArray) -> list[tuple[int, int]]:
+    """First samples of the gaps (N,), and those after them."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]])))
+    return [(int(start), int(stop)) for start, stop in ends.reshape(-1, 2)]
+
+
+def _touching(raw: Mapping[str, NDArray[Any]], shape: tuple[int, ...]) -> BoolArray | None:
+    """Whether the contact of each element (N, C, ...) touches; None where its file does not say."""
+    flags = raw.get(_FLAGS)
+    if flags is None or flags.shape != shape[:2]:
+        return None
+    return np.asarray(np.broadcast_to((flags == 1.0).reshape(*shape[:2], *[1] * (len(shape) - 2)), shape))
+
+
+def _short_gaps(time: FloatArray, missing: BoolArray, longest_s: float, usable: BoolArray | None) -> BoolArray:
+    """Those elements (N, ...) that are missing between two values not further apart than a length [s].
+
+    Where it matters which samples are `usable` (N, ...), these are all in the gap and beside it.
+    """
+    short = np.zeros(missing.shape, dtype=np.bool_)
+    for channel in np.ndindex(*missing.shape[1:]):
+        for start, stop in _runs(missing[(slice(None), *channel)]):
+            inside = start and stop < len(time) and time[stop] - time[start - 1] <= longest_s * (1.0 + _SLACK)
+            if inside and (usable is None or usable[(slice(start - 1, stop + 1), *channel)].all()):
+                short[(slice(start, stop), *channel)] = True
+    return short
+
+
+def _filled(time: FloatArray, name: str, array: NDArray[Any], short: BoolArray) -> FloatArray:
+    """A field (N, ...) with a spline through each channel where its gaps are short.
+
+    No spline crosses a long gap, beside which it would swing.
+    """
+    values = to_float64(name, array).copy()
+    if is_quaternion(name):
+        values[short.any(axis=1)] = np.nan
+        values = make_sign_continuous(values)
+    for channel in np.ndindex(*values.shape[1:]):
+        column, of_channel = values[(slice(None), *channel)], short[(slice(None), *channel)]
+        for start, stop in _runs(~np.isnan(column) | of_channel):
+            gaps, since = of_channel[start:stop], time[start:stop] - time[start]
+            if gaps.any():
+                column[start:stop][gaps] = CubicSpline(since[~gaps], column[start:stop][~gaps])(since[gaps])
+    if is_quaternion(name):
+        rows = short.any(axis=1)
+        values[rows] /= np.linalg.norm(values[rows], axis=1, keepdims=True)
+    return values
+
+
+def _held(flags: NDArray[Any], short: BoolArray) -> NDArray[Any]:
+    """Flags (N, C), where they are missing those before."""
+    out = flags.copy()
+    for column, gaps in zip(out.T, short.T, strict=True):
+        for start, stop in _runs(gaps):
+            column[start:stop] = column[start - 1]
+    return out
