@@ -147,7 +147,8 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
         LogError: as `read_log_to_check`.
     """
     _require_memory(path, settings)
-    if existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED) or settings.bridge_gaps_s is not None:
+    whole = settings.bridge_gaps_s is not None or not settings.needs_flags
+    if whole or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
         log = _read_with_gaps(path, logs, settings)
         for stretch in _stretches(len(log)):
             yield log.select(stretch), _stretch_name(path, stretch, len(log))
@@ -159,8 +160,14 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
 
 def _read_with_gaps(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
     """A log with those of its gaps that are too long to be bridged."""
-    gaps = settings.bridge_gaps_s
-    return read_log(path, logs.topics, allow_gaps=True, columns=logs.columns, bridge_gaps_s=gaps)
+    return read_log(
+        path,
+        logs.topics,
+        allow_gaps=True,
+        columns=logs.columns,
+        bridge_gaps_s=settings.bridge_gaps_s,
+        needs_flags=settings.needs_flags,
+    )
 
 
 def _stretches(samples: int) -> list[slice]:

@@ -19,6 +19,7 @@ from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
+from torchid.logs.flags import with_flags_by_force
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
 from torchid.logs.time_range import LogPart, split_range
@@ -90,7 +91,14 @@ class LogReader:
             return self._large_log(path, required, None).samples(fits_contact_offsets(self.scene))
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
         allow_gaps, bridge_gaps_s = settings.exclude_condemned, settings.bridge_gaps_s
-        read = read_log(path, topics, allow_gaps=allow_gaps, columns=columns, bridge_gaps_s=bridge_gaps_s)
+        read = read_log(
+            path,
+            topics,
+            allow_gaps=allow_gaps,
+            columns=columns,
+            bridge_gaps_s=bridge_gaps_s,
+            needs_flags=settings.needs_flags,
+        )
         recorded, certain = with_flags(read, self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
@@ -166,7 +174,7 @@ class LogReader:
             if settings.exclude_condemned:
                 key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
             else:
-                keys = ("base_motion", "detect_contacts", "max_slip", "bridge_gaps_s")
+                keys = ("base_motion", "detect_contacts", "contact_threshold", "max_slip", "bridge_gaps_s")
                 key = next(name for name in keys if getattr(settings, name) is not None)
             raise LogError(path, f"preprocessing.{key}", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
@@ -210,11 +218,13 @@ class LogReader:
 
 
 def with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
-    """A log as it was read, and where its contact flags are certain: from joint torques if the settings want these."""
-    settings = scene.config.preprocessing.detect_contacts
-    if settings is None:
-        return log, np.ones(len(log), dtype=bool)
-    return with_detected_contacts(log, scene.robot, scene.contacts, settings)
+    """A log with contact flags as recorded, from joint torques or from forces, and where they are certain."""
+    settings = scene.config.preprocessing
+    if settings.detect_contacts is not None:
+        return with_detected_contacts(log, scene.robot, scene.contacts, settings.detect_contacts)
+    if settings.contact_threshold is not None:
+        return with_flags_by_force(log, settings.contact_threshold)
+    return log, np.ones(len(log), dtype=bool)
 
 
 def check_parts(logs: Mapping[str, Sequence[Samples]]) -> None:

@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, PlainValidator, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT
+from torchid.logs.flags import ContactThreshold
 from torchid.problem.contact_detection import DetectionConfig
 from torchid.settings import NotNegative, Positive
 
@@ -15,6 +16,11 @@ from torchid.settings import NotNegative, Positive
 def _switch(value: object) -> object:
     """All settings at their defaults for true, none for false."""
     return ({} if value else None) if isinstance(value, bool) else value
+
+
+def _threshold(value: object) -> object:
+    """A number is the threshold of both changes."""
+    return {"above": value} if isinstance(value, (int, float)) else value
 
 
 def _speed(value: object) -> float | str | None:
@@ -36,6 +42,7 @@ class PreprocessingConfig:
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
     recorded ones.
+    `contact_threshold`: a force [N], or its settings, for contact flags from forces (`ContactThreshold`) likewise.
     `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
     `max_slip`: speed [m/s] above which a contact that should stand slips, so that the sample is dropped; auto, from the
     noise of each contact's velocity; None keeps all.
@@ -49,6 +56,7 @@ class PreprocessingConfig:
     bridge_gaps_s: Positive | None = None
     contact_margin_s: NotNegative | None = None
     detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
+    contact_threshold: Annotated[ContactThreshold | None, BeforeValidator(_threshold)] = None
     base_motion: Literal["contacts"] | None = None
     max_slip: Annotated[float | Literal["auto"] | None, PlainValidator(_speed)] = None
     exclude_condemned: bool = False
@@ -64,5 +72,10 @@ class PreprocessingConfig:
     @property
     def derived(self) -> tuple[str, ...]:
         """How names of fields of a log begin that are worked out of others, whatever was recorded."""
-        flags = () if self.detect_contacts is None else ("contact_active",)
+        flags = () if self.needs_flags else ("contact_active",)
         return flags if self.base_motion is None else (*flags, "base_")
+
+    @property
+    def needs_flags(self) -> bool:
+        """Whether nothing but a log says which contact touches when."""
+        return self.detect_contacts is None and self.contact_threshold is None

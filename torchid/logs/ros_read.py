@@ -135,7 +135,10 @@ class _Bag:
 
 
 def read_bag(
-    path: Path, topics: Topics | None, progress: Callable[[float], None] | None = None
+    path: Path,
+    topics: Topics | None,
+    progress: Callable[[float], None] | None = None,
+    needs_flags: bool = True,
 ) -> dict[str, NDArray[Any]]:
     """The fields of a log file, from a bag.
 
@@ -143,6 +146,7 @@ def read_bag(
         path: a .bag, .mcap or .db3 file, or the folder of several.
         topics: roles of the topics.
         progress: called with the share that has been read.
+        needs_flags: as in `read_log`; a contact of which nothing says when it touches has flags that are all true else.
 
     Raises:
         LogError: the bag is damaged, or its messages do not make up a log.
@@ -154,7 +158,7 @@ def read_bag(
     """
     files = list_bag_files(path)
     if topics is not None:
-        check_topics(topics)
+        check_topics(topics, needs_flags)
     channels = list_channels(files)
     if topics is None:
         raise LogError.at_field("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
@@ -320,7 +324,9 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
     else:
         measured = series[f"contact_force_normal.{name}"]
         force = measured.fields["force"][:, 0]
-    if np.isnan(force).any() or threshold is None:
+    if threshold is None:  # flags are worked out later
+        return np.ones(len(clock.stamps), dtype=np.bool_)
+    if np.isnan(force).any():
         accepted = "forces to compare with contact_force_threshold, or contact_active"
         raise LogError.at_field(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
     return clock.hold(measured, force) > threshold

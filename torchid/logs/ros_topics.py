@@ -201,8 +201,8 @@ class Topics:
         return tuple(name for name in (*self.contact_force_normal, *counted) if name is not None)
 
 
-def check_topics(topics: Topics) -> None:
-    """Check that a map of topics is complete.
+def check_topics(topics: Topics, needs_flags: bool = True) -> None:
+    """Check that a map of topics is complete; `needs_flags` as in `read_log`.
 
     Raises:
         ConfigError: no joints or these twice, a contact without a flag, a threshold or `always`, a low state that
@@ -219,7 +219,8 @@ def check_topics(topics: Topics) -> None:
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
             raise ConfigError.at_field(f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
-    _check_flags(topics)
+    if needs_flags:
+        _check_flags(topics)
     stamped = [role for role in topics.by_role if not role.startswith("contact_active.")]
     if topics.clock not in stamped:
         raise UnknownNameError.at_field("logs.topics.rate_topic", topics.clock, stamped)
@@ -235,7 +236,8 @@ def _check_flags(topics: Topics) -> None:
         raise ConfigError.at_field("logs.topics.low_state.above", found, "a reading [counts], or contact_active")
     if unflagged and topics.contact_force_threshold is None:
         found = f"missing, though nothing else says when {unflagged[0]} touches"
-        raise ConfigError.at_field("logs.topics.contact_force_threshold", found, "a force [N], or contact_active")
+        accepted = "a force [N], contact_active, or preprocessing.contact_threshold"
+        raise ConfigError.at_field("logs.topics.contact_force_threshold", found, accepted)
 
 
 def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:
