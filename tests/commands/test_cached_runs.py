@@ -116,6 +116,7 @@ CHANGED = {
     "max_slip": 0.5,
     "detect_contacts": True,
     "contact_threshold": 30.0,
+    "zero_in_air": True,
     "base_motion": "contacts",
     "exclude_condemned": True,
     "memory_gb": 3.0,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.reading import memory_needed, with_flags
+from torchid.commands.reading import memory_needed, settle_contacts
 from torchid.config import load_analysis
 from torchid.config.logs import LogsConfig
 from torchid.config.maps import load_columns, load_topics
@@ -84,7 +84,7 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
             settings = config.preprocessing
-            log, _ = with_flags(read_log_to_check(file, config.logs, settings), scene)
+            log, _ = settle_contacts(read_log_to_check(file, config.logs, settings), scene)
             found = check(log, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
             checked.append(replace(found, rolling=scene.rolling))
     return checked

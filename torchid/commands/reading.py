@@ -27,6 +27,7 @@ from torchid.problem import Samples, bind_log
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip
 from torchid.problem.standing import preprocess_standing
+from torchid.problem.zeroing import zero_in_air
 from torchid.sensing import SensorSet
 
 _WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
@@ -99,7 +100,7 @@ class LogReader:
             bridge_gaps_s=bridge_gaps_s,
             needs_flags=settings.needs_flags,
         )
-        recorded, certain = with_flags(read, self.scene)
+        recorded, certain = settle_contacts(read, self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         rates = settings.cutoff_hz, settings.sample_rate_hz
@@ -174,8 +175,15 @@ class LogReader:
             if settings.exclude_condemned:
                 key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
             else:
-                keys = ("base_motion", "detect_contacts", "contact_threshold", "max_slip", "bridge_gaps_s")
-                key = next(name for name in keys if getattr(settings, name) is not None)
+                keys = (
+                    "base_motion",
+                    "detect_contacts",
+                    "contact_threshold",
+                    "zero_in_air",
+                    "max_slip",
+                    "bridge_gaps_s",
+                )
+                key = next(name for name in keys if getattr(settings, name) not in (None, False))
             raise LogError(path, f"preprocessing.{key}", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
@@ -188,7 +196,8 @@ class LogReader:
         """Whether samples are left out or filled for what is known of a whole log alone."""
         settings = self.scene.config.preprocessing
         of_whole = settings.max_slip, settings.bridge_gaps_s
-        return settings.exclude_condemned or bool(settings.derived) or of_whole != (None, None)
+        of_all = settings.exclude_condemned or settings.zero_in_air or bool(settings.derived)
+        return of_all or of_whole != (None, None)
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
@@ -217,7 +226,18 @@ class LogReader:
         return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz, settings.derived)
 
 
-def with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
+def settle_contacts(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
+    """A log with the flags and zeros of contacts that the settings want, and where the flags (N,) are certain."""
+    flagged, certain = _with_flags(log, scene)
+    if not scene.config.preprocessing.zero_in_air:
+        return flagged, certain
+    zeroed = zero_in_air(flagged, scene.contacts)
+    if scene.config.preprocessing.contact_threshold is None:
+        return zeroed, certain
+    return _with_flags(zeroed, scene)
+
+
+def _with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
     """A log with contact flags as recorded, from joint torques or from forces, and where they are certain."""
     settings = scene.config.preprocessing
     if settings.detect_contacts is not None:

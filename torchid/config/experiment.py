@@ -203,6 +203,10 @@ def _check_extras(config: _Common) -> None:
     if actuators.torque_offset and "joint_torque" in sensors.offsets:
         found = "set together with sensors.offsets.joint_torque, which is the same"
         raise ConfigError.at_field("actuators.torque_offset", found, "one of the two")
+    twice = [kind for kind in ("contact_force", "contact_moment") if kind in sensors.offsets]
+    if config.preprocessing.zero_in_air and twice:
+        found = "set together with preprocessing.zero_in_air, which subtracts the same"
+        raise ConfigError.at_field(f"sensors.offsets.{twice[0]}", found, "one of the two")
     unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items()}
     unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
     for field, is_set in unknowns.items():

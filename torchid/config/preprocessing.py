@@ -43,6 +43,7 @@ class PreprocessingConfig:
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
     recorded ones.
     `contact_threshold`: a force [N], or its settings, for contact flags from forces (`ContactThreshold`) likewise.
+    `zero_in_air`: subtract from contact sensors what they read on average in the air, from each log for itself.
     `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
     `max_slip`: speed [m/s] above which a contact that should stand slips, so that the sample is dropped; auto, from the
     noise of each contact's velocity; None keeps all.
@@ -57,6 +58,7 @@ class PreprocessingConfig:
     contact_margin_s: NotNegative | None = None
     detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
     contact_threshold: Annotated[ContactThreshold | None, BeforeValidator(_threshold)] = None
+    zero_in_air: bool = False
     base_motion: Literal["contacts"] | None = None
     max_slip: Annotated[float | Literal["auto"] | None, PlainValidator(_speed)] = None
     exclude_condemned: bool = False

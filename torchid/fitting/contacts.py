@@ -71,6 +71,8 @@ def suited_to_preprocessing(
     for key in ("detect_contacts", "contact_threshold"):
         if getattr(settings, key) is not None and not contacts:
             raise ConfigError.at_field(f"preprocessing.{key}", "set, without contacts", "contacts to detect")
+    if settings.zero_in_air and not contacts:
+        raise ConfigError.at_field("preprocessing.zero_in_air", "true, without contacts", "false, or contacts")
     if settings.detect_contacts is not None:
         touch, lift = settings.detect_contacts.touch, settings.detect_contacts.lift
         if lift > touch:
