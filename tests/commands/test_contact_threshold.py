@@ -119,6 +119,9 @@ def test_settings_that_contradict_each_other_are_refused(tmp_path: Path) -> None
     refused(said(contact_threshold=10, detect_contacts=True), f"{place}: set together with prepro", ConfigError)
     refused(said(contact_threshold=-1), f"{place}.above: ", ConfigError)
     refused(said(contact_threshold={"below": 20}), f"{place}.above", ConfigError)
+    assert "a force [N], or a mapping" in refused(said(contact_threshold="30N"), f"{place}: found '30N'", ConfigError)
+    start = f"{tmp_path / 'run.yaml'}: preprocessing.zero_in_air"
+    refused(said(zero_in_air="contacts"), start, ConfigError)
     assert "below" in refused(said(contact_threshold={"above": 2, "belw": 1}), f"{place}: unknown name 'belw'")
     settings = load_config(experiment(tmp_path, contact_threshold=30)).preprocessing.contact_threshold
     assert settings is not None

@@ -20,6 +20,8 @@ def _switch(value: object) -> object:
 
 def _threshold(value: object) -> object:
     """A number is the threshold of both changes."""
+    if isinstance(value, str):
+        raise ValueError("a force [N], or a mapping with above, below, shortest_s")
     return {"above": value} if isinstance(value, (int, float)) else value
 
 

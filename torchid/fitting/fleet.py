@@ -19,6 +19,7 @@ _THE_EXPERIMENT = "the experiment file"
 _APART = (
     "detect_contacts",
     "contact_threshold",
+    "zero_in_air",
     "base_motion",
     "max_slip",
     "exclude_condemned",

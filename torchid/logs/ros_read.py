@@ -324,7 +324,7 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
     else:
         measured = series[f"contact_force_normal.{name}"]
         force = measured.fields["force"][:, 0]
-    if threshold is None:  # flags are worked out later
+    if threshold is None or name in bag.topics.feet:  # flags are worked out later
         return np.ones(len(clock.stamps), dtype=np.bool_)
     if np.isnan(force).any():
         accepted = "forces to compare with contact_force_threshold, or contact_active"

@@ -226,6 +226,9 @@ def check_topics(topics: Topics, needs_flags: bool = True) -> None:
         raise UnknownNameError.at_field("logs.topics.rate_topic", topics.clock, stamped)
 
 
+_OTHER_FLAGS = "contact_active, or preprocessing.contact_threshold"
+
+
 def _check_flags(topics: Topics) -> None:
     """Refuse contacts of which nothing says when they touch."""
     by_count = topics.feet if topics.low_state is not None and topics.low_state.above is not None else ()
@@ -233,10 +236,11 @@ def _check_flags(topics: Topics) -> None:
     counted = [name for name in unflagged if name in topics.feet]
     if counted:
         found = f"missing, though nothing else says when {counted[0]} touches"
-        raise ConfigError.at_field("logs.topics.low_state.above", found, "a reading [counts], or contact_active")
+        accepted = f"a reading [counts], {_OTHER_FLAGS}"
+        raise ConfigError.at_field("logs.topics.low_state.above", found, accepted)
     if unflagged and topics.contact_force_threshold is None:
         found = f"missing, though nothing else says when {unflagged[0]} touches"
-        accepted = "a force [N], contact_active, or preprocessing.contact_threshold"
+        accepted = f"a force [N], {_OTHER_FLAGS}"
         raise ConfigError.at_field("logs.topics.contact_force_threshold", found, accepted)
 
 
