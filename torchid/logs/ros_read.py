@@ -317,6 +317,8 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
     if name in bag.topics.feet and low_state is not None and low_state.above is not None:
         counts = series["low_state"].fields[_FEET][:, bag.topics.feet.index(name)]
         return clock.hold(series["low_state"], counts) > low_state.above
+    if threshold is None or name in bag.topics.feet:  # flags are worked out later
+        return np.ones(len(clock.stamps), dtype=np.bool_)
     if name in bag.topics.contact_wrenches:
         measured = series[f"contact_wrenches.{name}"]
         with np.errstate(over="ignore"):  # infinite is above any threshold
@@ -324,8 +326,6 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
     else:
         measured = series[f"contact_force_normal.{name}"]
         force = measured.fields["force"][:, 0]
-    if threshold is None or name in bag.topics.feet:  # flags are worked out later
-        return np.ones(len(clock.stamps), dtype=np.bool_)
     if np.isnan(force).any():
         accepted = "forces to compare with contact_force_threshold, or contact_active"
         raise LogError.at_field(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
