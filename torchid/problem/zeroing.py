@@ -92,5 +92,5 @@ def _say(log: Log, offsets: FloatArray, masked: Sequence[str]) -> None:
     if texts:
         warn(f"{log.source}: {KEY} has subtracted {'; '.join(texts)}")
     if masked:
-        text = "is 0 or clamped in the air, where no offset shows"
-        warn(f"{log.source}: {KEY}: {', '.join(masked)} {text}; {_FITTED}, may find it")
+        text = f"readings of {', '.join(masked)} in the air are 0 or clamped and show no offset"
+        warn(f"{log.source}: {KEY}: {text}; {_FITTED}, may find it")
