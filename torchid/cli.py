@@ -231,8 +231,9 @@ def _print_fit(run: Identification) -> None:
         print(fill(f"motion noise  {run.motion_noise}", 100, subsequent_indent=" " * 14))
     if run.validation is not None:
         _print_validation(run.validation)
-    if run.ridge is not None:
-        print(f"ridge         {run.ridge.ridge:g}, chosen by cross-validation on blocks of the training logs")
+    for name, choice in (("ridge", run.ridge), ("sign width", run.sign_width)):
+        if choice is not None:
+            print(fill(f"{name:14}{choice}", 100, subsequent_indent=" " * 14))
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
     print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
     if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:

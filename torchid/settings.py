@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 
@@ -23,8 +23,17 @@ def _has_name(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
+def _positive_or_auto(value: object) -> float | str | None:
+    try:
+        return value if value is None or value == "auto" else TypeAdapter(Positive).validate_python(value)
+    except ValueError as error:
+        raise ValueError("auto, null, or a number greater than 0") from error
+
+
 Number = Annotated[float, BeforeValidator(_not_bool), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
+PositiveOrAuto = Annotated[float | Literal["auto"] | None, PlainValidator(_positive_or_auto)]
+"""A positive number, one that the data choose, or none."""
 NotNegative = Annotated[Number, Field(ge=0.0)]
 BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]

@@ -12,10 +12,12 @@ import yaml
 from misread import WIDTH, World, with_actuators
 from motions import value
 from recordings import Miscalibration
-from synthetic import Oracle, load, make_log
+from repository import DEMO
+from synthetic import Array, Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
 from torchid.cli import main
+from torchid.commands.reading import LogReader
 from torchid.config import load_config
 from torchid.fitting.calibration import Calibration
 from torchid.fitting.experiment import set_up
@@ -99,6 +101,39 @@ def test_a_run_through_files_finds_them_and_another_log_is_predicted_with_them(r
     found = json.loads(written.read_text())["new"]
     assert max(errors_in(found["identified"]).values()) < 1e-8
     assert min(errors_in(found["nominal"]).values()) > 1e-2
+
+
+def test_the_width_of_the_sign_is_found(run: Run) -> None:
+    """Nobody knows it: everything else is fitted anew for each, and a run folder has the number."""
+    output = run.folder / "auto"
+    assert main(["identify", str(run.file), "actuators.sign_width=auto", f"output={output}"]) == 0
+    found = json.loads((output / "metrics.json").read_text())
+    choice = found["sign_width_selection"]
+    assert choice["width"] == pytest.approx(WIDTH, rel=2e-3)
+    assert min(choice["residual"]) < 1e-2 * choice["residual"][choice["tried"].index(None)]
+    assert load_config(output / "config.yaml").actuators.sign_width == choice["width"]
+    assert errors_in(found["train"])["joint_torque"] < 1e-2 * errors_in(found["train_nominal"])["joint_torque"]
+
+
+def test_friction_that_reverses_at_once_is_given_no_width(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ["actuators.sign_width=auto", "preprocessing.cache_gb=0", f"output={tmp_path / 'run'}"]
+    assert main(["identify", str(DEMO / "quadruped.yaml"), *settings]) == 0
+    assert "sign width    none: Coulomb friction with tanh(velocity / width)" in capsys.readouterr().out
+    assert load_config(tmp_path / "run" / "config.yaml").actuators.sign_width is None
+
+
+def test_a_width_counts_where_logs_are_read_block_by_block_too() -> None:
+    """Likewise for the samples that other widths would have."""
+
+    def directions(width: float | None, memory_gb: float) -> Array:
+        settings = [f"actuators.sign_width={width or 'null'}", f"preprocessing.memory_gb={memory_gb}"]
+        scene = set_up(load_config(DEMO / "quadruped.yaml", settings))
+        (samples,) = LogReader(scene).read(scene.config.logs.train, scene.sensors)
+        assert samples.direction is not None
+        return samples.direction.numpy()
+
+    np.testing.assert_allclose(directions(0.1, 1e-6), directions(0.1, 2.0), rtol=0.0, atol=1e-9)
+    assert np.abs(directions(0.1, 2.0) - directions(None, 2.0)).max() > 0.1
 
 
 def test_a_urdf_that_is_right_has_no_errors_whatever_the_offsets(tmp_path: Path) -> None:

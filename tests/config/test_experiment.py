@@ -299,7 +299,10 @@ def test_a_value_of_the_wrong_kind_is_refused_by_its_place(file: Path, settings:
         ("estimator.robust=cauchy", "estimator.robust: found 'cauchy'; accepted: huber, tukey, or a mapping"),
         ("analysis.compare.a=3", "analysis.compare.a: found 3; accepted: full, contacts, joints, or a mapping"),
         ("preprocessing.contact_margin_s=50ms", "contact_margin_s: found '50ms'; accepted: a number"),
-        ("actuators.sign_width=wide", "actuators.sign_width: found 'wide'; accepted: a number"),
+        (
+            "actuators.sign_width=wide",
+            "actuators.sign_width: found 'wide'; accepted: auto, null, or a number",
+        ),
         ("estimator.training.epochs=2.5", "estimator.training.epochs: found 2.5; accepted: a whole number"),
         ("overwrite=perhaps", "overwrite: found 'perhaps'; accepted: true or false"),
         (

@@ -159,3 +159,23 @@ def test_dry_friction_is_smeared_as_the_filter_smears_its_torque(time: FloatArra
 def test_a_joint_at_rest_has_no_direction() -> None:
     log = Log("rest.npz", uniform(2.0), ("a",), np.ones((len(uniform(2.0)), 1)))
     assert not value(preprocess(log, cutoff_hz=10.0).joint_direction).any()
+
+
+@pytest.mark.parametrize("time", [uniform(), jittered()], ids=["uniform", "jittered"])
+@pytest.mark.parametrize("given", ["joint_position", "joint_velocity"])
+def test_friction_that_reverses_over_a_width_is_smeared_as_well(time: FloatArray, given: str) -> None:
+    width, angle = 0.08, 2 * np.pi * 1.3 * time[:, None] + np.array([0.3, 2.0])
+    q, v = np.sin(angle) / (2 * np.pi * 1.3), np.cos(angle)
+    torque = np.tanh(v / width)
+    log = Log("friction.npz", time, ("a", "b"), q, v if given == "joint_velocity" else None, joint_torque=torque)
+
+    def off(sign_width: float | None) -> float:
+        out = preprocess(log, cutoff_hz=10.0, sign_width=sign_width)
+        return float(np.abs(value(out.joint_direction) - value(out.joint_torque)).max())
+
+    assert off(width) < 0.02  # the width acts on what is left of the velocity by the filter
+    assert off(None) > 10 * off(width)
+    sharp = preprocess(log, cutoff_hz=10.0, sign_width=1e-9)
+    np.testing.assert_allclose(
+        value(sharp.joint_direction), value(preprocess(log, cutoff_hz=10.0).joint_direction), rtol=0.0, atol=1e-6
+    )

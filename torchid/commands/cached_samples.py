@@ -64,6 +64,7 @@ def content_of_scene(scene: Scene) -> dict[str, Any]:
         "unloaded": fits_contact_offsets(scene),
         "preprocessing": settings,
         "motion_noise": config.sensors.noise.motion,
+        "sign_width": config.actuators.sign_width,
         "topics": topics,
         "columns": json.dumps(columns),  # as text: the order of names in it is that of the log
     }

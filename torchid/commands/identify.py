@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from functools import partial
 
 from rich.progress import Progress
@@ -14,6 +13,8 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.cached_factors import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
+from torchid.commands.chosen_sign_width import with_sign_width
+from torchid.commands.clock import Clock
 from torchid.commands.folder import RUN, check_free, claim_folder
 from torchid.commands.plausibility import require_not_worse, require_plausible
 from torchid.commands.reading import LogReader, check_parts
@@ -31,6 +32,7 @@ from torchid.fitting.fleet import read_fleet
 from torchid.fitting.misfit import misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary, fit_robustly
+from torchid.fitting.sign_width import SignWidthChoice
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
@@ -41,17 +43,6 @@ from torchid.problem.compression import Part, compress_in_blocks, merge_folds, m
 from torchid.problem.contact_state import ContactState, state_name
 from torchid.problem.metrics import SETS
 from torchid.report.tables import progress_bars
-
-
-@dataclass
-class _Clock:
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
 def identify(config: ExperimentConfig, resume: bool = False) -> Identification:
@@ -98,6 +89,7 @@ class _Data:
     blocks: Sequence[Block]
     parts: list[Part]
     reused: list[str]
+    sign_width: SignWidthChoice | None
 
 
 @dataclass
@@ -109,7 +101,7 @@ class _Prepared(_Data):
     ridge: RidgeChoice | None
 
 
-def _prepare(config: ExperimentConfig, clock: _Clock, bars: Progress) -> _Prepared:
+def _prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> _Prepared:
     with clock("read"):
         experiment = set_up(config)
         conditions = experiment.conditions()
@@ -122,8 +114,10 @@ def _prepare(config: ExperimentConfig, clock: _Clock, bars: Progress) -> _Prepar
     return _Prepared(**vars(data) | {"experiment": experiment}, conditions=conditions, fitter=fitter, ridge=ridge)
 
 
-def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
+def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
     """The logs of an experiment, read and compressed."""
+    with clock("sign width"):
+        experiment, width = with_sign_width(experiment, bars)
     with clock("read"):
         reader = open_reader(experiment)
         logs = _read(reader, experiment, bars)
@@ -137,10 +131,10 @@ def _data_of_logs(experiment: Experiment, clock: _Clock, bars: Progress) -> _Dat
         blocks = split_into_folds(logs["train"], builder)
         parts, there = _compressed(experiment, reader, builder, blocks, bars)
     reused = [*_reused(reader), *(["factors"] if there else [])]
-    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused)
+    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, width)
 
 
-def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _Data:
+def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
     """The logs of an experiment that fits factors of logs."""
     with clock("read"):
         reading = bars.add_task("reading factors", total=len(experiment.config.logs.train))
@@ -153,7 +147,7 @@ def _data_of_factors(experiment: Experiment, clock: _Clock, bars: Progress) -> _
         blocks = fold_compressed([one.log for one in fleet.files], builder)
         parts = merge_blocks(blocks, builder)
     excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
-    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader))
+    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), None)
     return _Data(fleet.experiment, logs, fleet.files, excluded, *same)
 
 
@@ -185,7 +179,7 @@ def _solved(ready: _Prepared, evaluation: Evaluation, bars: Progress, resume: bo
 
 
 def _identify(config: ExperimentConfig, resume: bool) -> Identification:
-    clock = _Clock()
+    clock = Clock()
     with progress_bars() as bars:
         ready = _prepare(config, clock, bars)
         experiment, fitter, logs, blocks = ready.experiment, ready.fitter, ready.logs, ready.blocks
@@ -228,6 +222,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             mass=solved.mass,
             validation=scores.validation,
             ridge=ready.ridge,
+            sign_width=ready.sign_width,
             reused=ready.reused,
         )
         plotted = next(iter([*logs["test"], *logs["train"]]), None)

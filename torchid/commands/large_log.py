@@ -61,6 +61,7 @@ class LargeLog:
         required: sensors whose every value must be there, None if gaps are allowed.
         folder: where there is room for the samples; None: in memory.
         motion_noise: of the recorded motion, as far as it is stated, as `preprocess` takes it.
+        sign_width: as `preprocess` takes it.
         columns: as of `read_log`.
     """
 
@@ -71,6 +72,7 @@ class LargeLog:
     required: SensorSet | None
     folder: Path | None
     motion_noise: Mapping[str, float] = field(default_factory=dict)
+    sign_width: float | None = None
     columns: Columns | None = None
 
     def samples(self, with_unloaded: bool = True) -> Samples:
@@ -124,7 +126,8 @@ class LargeLog:
     def _course(self, blocks: LogBlocks, with_unloaded: bool) -> _Course:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
         first, settings = blocks.read(slice(0, min(len(blocks), MOST_SAMPLES))), self.settings
-        timeline = make_timeline(blocks.time, lacks_derivatives(first), settings.cutoff_hz, settings.sample_rate_hz)
+        rates = settings.cutoff_hz, settings.sample_rate_hz
+        timeline = make_timeline(blocks.time, lacks_derivatives(first), *rates, self.sign_width)
         coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
         time = blocks.time if timeline is None else blocks.time[0] + timeline.output_stamps
         contacts = self._contacts(blocks, first)

@@ -103,11 +103,11 @@ class LogReader:
         recorded, certain = settle_contacts(read, self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
-        rates = settings.cutoff_hz, settings.sample_rate_hz
+        rates, sign_width = (settings.cutoff_hz, settings.sample_rate_hz), self.scene.terms.sign_width
         if settings.base_motion is None:
-            log = preprocess(clean, *rates, self._stated)
+            log = preprocess(clean, *rates, self._stated, sign_width)
         else:
-            log = preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates)
+            log = preprocess_standing(clean, self.scene.robot, self.scene.contacts, *rates, sign_width)
         samples = bind_log(log, self.scene.robot, self.scene.contacts, required)
         slip = self._slipping(log, samples, recorded)
         if not fits_contact_offsets(self.scene):
@@ -211,6 +211,7 @@ class LogReader:
             required,
             folder,
             motion_noise=self._stated,
+            sign_width=scene.terms.sign_width,
             columns=None if scene.config.logs is None else scene.config.logs.columns,
         )
 

@@ -22,6 +22,7 @@ from torchid.fitting.factor_files import FactorFile
 from torchid.fitting.misfit import Misfit
 from torchid.fitting.noise import NoiseSummary
 from torchid.fitting.robust import RobustSummary
+from torchid.fitting.sign_width import SignWidthChoice
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
@@ -79,6 +80,7 @@ class Identification:
         mass: the total mass and how well it is known.
         validation: errors on held-out blocks, None where the samples are too few to leave some out.
         ridge: how it was chosen, if it was.
+        sign_width: likewise.
         reused: what an earlier run has left in the cache, in words.
     """
 
@@ -102,6 +104,7 @@ class Identification:
     mass: TotalMass
     validation: CrossValidation | None
     ridge: RidgeChoice | None
+    sign_width: SignWidthChoice | None
     reused: Sequence[str] = ()
 
     def violations_by_name(self) -> list[dict[str, object]]:
@@ -232,6 +235,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "solution": _solution_document(estimate),
         "cross_validation": _validation_document(run),
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
+        "sign_width_selection": None if run.sign_width is None else asdict(run.sign_width),
         "worse_than_nominal": [asdict(one) for one in run.worse],
         "verdict": describe_worse(run.worse),
         "contact_states": run.state_entries(),

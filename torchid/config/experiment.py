@@ -32,7 +32,7 @@ from torchid.errors import ConfigError, about_file
 from torchid.logs.column_map import check_columns
 from torchid.logs.containers import FACTORS
 from torchid.logs.ros_topics import check_topics
-from torchid.settings import Positive
+from torchid.settings import PositiveOrAuto
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -49,13 +49,14 @@ class ActuatorsConfig:
     """Unknown terms of the actuators, of every joint whose torque is measured.
 
     `armature`: reflected rotor inertia; `torque_offset`; `asymmetric_coulomb`: Coulomb friction that differs by
-    direction; `sign_width` [rad/s or m/s]: Coulomb friction goes with tanh(velocity / width) instead of the sign.
+    direction; `sign_width` [rad/s or m/s]: Coulomb friction goes with tanh(velocity / width) instead of the sign; auto,
+    with the width that leaves least of the training logs.
     """
 
     armature: bool = False
     torque_offset: bool = False
     asymmetric_coulomb: bool = False
-    sign_width: Positive | None = None
+    sign_width: PositiveOrAuto = None
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
@@ -238,14 +239,21 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
         if path.suffix != FACTORS:
             found = f"{path} beside factors of other logs"
             raise ConfigError.at_field("logs.train", found, f"logs alone, or {FACTORS} files alone")
-    reason, logs_too = "but logs.train names factors, which have no samples", ", or the logs"
-    if config.estimator.name == "sgd":
-        raise ConfigError.at_field("estimator.name", f"sgd, {reason}", f"least_squares or consistent{logs_too}")
-    if config.estimator.robust is not None:
-        raise ConfigError.at_field("estimator.robust", f"set, {reason}", f"null{logs_too}")
-    if config.preprocessing.exclude_condemned:
-        accepted = f"false, as torchid compress has left them out if it was told so{logs_too}"
-        raise ConfigError.at_field("preprocessing.exclude_condemned", f"true, {reason}", accepted)
+    reason = "but logs.train names factors, which have no samples"
+    unfit = (
+        ("estimator.name", "sgd", config.estimator.name == "sgd", "least_squares or consistent"),
+        ("estimator.robust", "set", config.estimator.robust is not None, "null"),
+        ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that they were made with"),
+        (
+            "preprocessing.exclude_condemned",
+            "true",
+            config.preprocessing.exclude_condemned,
+            "false, as torchid compress has left them out if it was told so",
+        ),
+    )
+    for field, found, is_unfit, accepted in unfit:
+        if is_unfit:
+            raise ConfigError.at_field(field, f"{found}, {reason}", f"{accepted}, or the logs")
 
 
 def _check_held_out(estimator: EstimatorConfig, logs: LogsConfig) -> None:

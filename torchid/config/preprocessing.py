@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, PlainValidator, TypeAdapter
+from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT
 from torchid.logs.flags import ContactThreshold
 from torchid.problem.contact_detection import DetectionConfig
-from torchid.settings import NotNegative, Positive
+from torchid.settings import NotNegative, Positive, PositiveOrAuto
 
 
 def _switch(value: object) -> object:
@@ -23,17 +23,6 @@ def _threshold(value: object) -> object:
     if isinstance(value, str):
         raise ValueError("a force [N], or a mapping with above, below, shortest_s")
     return {"above": value} if isinstance(value, (int, float)) else value
-
-
-def _speed(value: object) -> float | str | None:
-    """A positive number, auto, or none."""
-    try:
-        return None if value is None else "auto" if value == "auto" else _POSITIVE.validate_python(value)
-    except ValueError as error:
-        raise ValueError("auto, null, or a number greater than 0 [m/s]") from error
-
-
-_POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -62,7 +51,7 @@ class PreprocessingConfig:
     contact_threshold: Annotated[ContactThreshold | None, BeforeValidator(_threshold)] = None
     zero_in_air: bool = False
     base_motion: Literal["contacts"] | None = None
-    max_slip: Annotated[float | Literal["auto"] | None, PlainValidator(_speed)] = None
+    max_slip: PositiveOrAuto = None
     exclude_condemned: bool = False
     memory_gb: Positive = 2.0
     cache_gb: NotNegative = 2.0

@@ -56,6 +56,10 @@ class RidgeChoice:
     mean_square: tuple[float, ...]
     standard_error: tuple[float, ...]
 
+    def __str__(self) -> str:
+        """The ridge, and how it was chosen."""
+        return f"{self.ridge:g}, chosen by cross-validation on blocks of the training logs"
+
 
 def cross_validate(
     logs: Sequence[Samples], fitter: LogFitter, terms: ExtraTerms | None = None, loss: RobustLoss | None = None

@@ -65,7 +65,9 @@ class Scene:
         sensors = self.config.sensors
         offsets = {str(channel): scope for channel, scope in sensors.offsets.items()}
         scales = {str(channel): scope for channel, scope in sensors.scales.items()}
-        return ExtraTerms(offsets, scales, **vars(self.config.actuators))
+        actuators = vars(self.config.actuators)
+        width = actuators["sign_width"]
+        return ExtraTerms(offsets, scales, **actuators | {"sign_width": None if width == "auto" else width})
 
     @property
     def loss(self) -> RobustLoss | None:

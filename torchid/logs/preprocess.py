@@ -37,6 +37,7 @@ DERIVATIVE_CHAINS = (
 _ANGULAR = DERIVATIVE_CHAINS[2]
 #: Norm of a filtered quaternion: below, the filter removes the rotation of the base.
 _MIN_QUATERNION_NORM = 0.5
+_LEAST_CHANGE = 1e-4  # of a tanh's argument over a step, across which its mean is its middle
 
 
 def preprocess(
@@ -44,6 +45,7 @@ def preprocess(
     cutoff_hz: float | None = None,
     sample_rate_hz: float | None = None,
     motion_noise: Mapping[str, float] | None = None,
+    sign_width: float | None = None,
 ) -> Log:
     """Fill in velocities and accelerations, after a zero-phase low-pass filter and before resampling, both optional.
 
@@ -71,6 +73,8 @@ def preprocess(
         sample_rate_hz: sample rate [Hz] of the result, at most ten times the median one; None for the log's own.
         motion_noise: standard deviations of the recorded motion by the keys of `STATED_FIELDS`, as far as they are
             known; others are estimated, see `signal_noise`.
+        sign_width: over which the sign of a joint's velocity changes, as tanh(velocity / width) [rad/s or m/s]; None
+            for at once.
 
     Returns:
         The preprocessed log, which shares the memory of unchanged fields: `log` itself where nothing has to be done and
@@ -85,7 +89,7 @@ def preprocess(
             are noise to a large part.
     """
     with about_file(log.source):
-        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
+        timeline = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width)
     noise = log.motion_noise or signal_noise(log, timeline, motion_noise)
     if timeline is None:
         return replace(log, motion_noise=noise) if noise.found else log
@@ -99,12 +103,16 @@ def preprocess(
 
 
 def make_timeline(
-    time: FloatArray, differentiates: bool, cutoff_hz: float | None, sample_rate_hz: float | None
+    time: FloatArray,
+    differentiates: bool,
+    cutoff_hz: float | None,
+    sample_rate_hz: float | None,
+    sign_width: float | None = None,
 ) -> Timeline | None:
     """The timeline of `preprocess`; None where nothing has to be done. Raises and warns as `lay_out_timeline`."""
     if cutoff_hz is None and sample_rate_hz is None and not differentiates:
         return None
-    return lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates)
+    return replace(lay_out_timeline(time, cutoff_hz, sample_rate_hz, differentiates), sign_width=sign_width)
 
 
 def gapless_fields(log: Log, timeline: Timeline) -> list[str]:
@@ -191,7 +199,8 @@ def _motion(log: Log, timeline: Timeline) -> dict[str, FloatArray]:
 def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline) -> FloatArray | None:
     """What the filter makes of the sign of the joint velocities, (K, n); None where nothing is filtered.
 
-    Dry friction reverses at once, and the filter smears its torque as it smears all others.
+    Dry friction reverses at once, or over the width of the timeline, and the filter smears its torque as it smears all
+    others.
 
     Args:
         log: the log.
@@ -204,15 +213,28 @@ def _direction(log: Log, smoothed: Mapping[str, FloatArray], timeline: Timeline)
         return None
     velocity = smoothed.get("joint_velocity")
     known = smoothed["joint_position"] if velocity is None else velocity
+    steps, width = np.diff(timeline.grid), timeline.sign_width
     out = np.empty((len(timeline.output_stamps), known.shape[1]))
     for column in range(known.shape[1]):  # one by one: temporaries stay small
         x = known[:, column]
-        halfway = np.diff(x) if velocity is None else x[1:] + x[:-1]
+        halfway = np.diff(x) / steps if velocity is None else 0.5 * (x[1:] + x[:-1])
         before, after = np.append(halfway[:1], halfway), np.append(halfway, halfway[-1:])
-        size = np.abs(before) + np.abs(after)
-        sign = np.divide(before + after, size, out=np.zeros_like(size), where=size > 0.0)  # mean over a step, v linear
+        sign = _mean_sign(before, after) if width is None else _mean_tanh(before / width, after / width)
         out[:, column] = timeline.evaluate(timeline.low_pass(sign), (0,))[0]
     return out
+
+
+def _mean_sign(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Mean of the sign of what goes from one value to another, (M,)."""
+    size = np.abs(before) + np.abs(after)
+    return np.divide(before + after, size, out=np.zeros_like(size), where=size > 0.0)
+
+
+def _mean_tanh(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Likewise of the hyperbolic tangent, whose integral is log cosh."""
+    change, tanh = after - before, np.tanh(0.5 * (before + after))
+    integral = np.logaddexp(after, -after) - np.logaddexp(before, -before)
+    return np.divide(integral, change, out=tanh, where=np.abs(change) > _LEAST_CHANGE)
 
 
 def _continuous(log: Log, name: str) -> FloatArray:

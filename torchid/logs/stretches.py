@@ -24,7 +24,11 @@ from torchid.logs.timeline import DROPPED_PERIODS, FEWEST_DIFFERENTIATED, Timeli
 
 
 def preprocess_stretches(
-    log: Log, stretches: Sequence[slice], cutoff_hz: float | None, sample_rate_hz: float | None
+    log: Log,
+    stretches: Sequence[slice],
+    cutoff_hz: float | None,
+    sample_rate_hz: float | None,
+    sign_width: float | None = None,
 ) -> tuple[Log, int]:
     """As `preprocess`, of stretches of a log without what is between them.
 
@@ -33,6 +37,7 @@ def preprocess_stretches(
         stretches: of its samples.
         cutoff_hz: as of `preprocess`.
         sample_rate_hz: likewise.
+        sign_width: likewise.
 
     Returns:
         One log of all stretches, and how many samples were in stretches too short for the filter or for derivatives.
@@ -44,7 +49,7 @@ def preprocess_stretches(
         TorchidWarning: as `preprocess`.
     """
     with about_file(log.source):
-        whole = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz)
+        whole = make_timeline(log.time, lacks_derivatives(log), cutoff_hz, sample_rate_hz, sign_width)
         if whole is None:
             return _joined([log.select(stretch) for stretch in stretches]), 0
         usable = [stretch for stretch in stretches if _is_long_enough(log, stretch, whole)]
@@ -62,7 +67,7 @@ def preprocess_stretches(
     for stretch in usable:
         part = log.select(stretch)
         with about_file(log.source):
-            timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz)
+            timeline = make_timeline(part.time, True, cutoff_hz, sample_rate_hz, sign_width)
         if timeline is None:
             raise ValueError("nothing to derive")
         parts.append(move_to_timeline(part, timeline, coverage))

@@ -131,6 +131,7 @@ class Timeline:
         reach: how far the filter smears what it filters [s], 0 without one.
         origin: stamp of the log's first sample [s].
         bandwidth_hz: [Hz], up to where the filter leaves white noise white, None without one.
+        sign_width: of Coulomb friction's sign [rad/s or m/s], as in `KinematicTree`, None for the sign itself.
     """
 
     native: FloatArray
@@ -141,6 +142,7 @@ class Timeline:
     reach: float
     origin: float = 0.0
     bandwidth_hz: float | None = None
+    sign_width: float | None = None
 
     @property
     def output_stamps(self) -> FloatArray:

@@ -49,7 +49,12 @@ class StandingBase:
 
 
 def preprocess_standing(
-    log: Log, robot: Robot, contacts: Sequence[Contact], cutoff_hz: float | None, sample_rate_hz: float | None
+    log: Log,
+    robot: Robot,
+    contacts: Sequence[Contact],
+    cutoff_hz: float | None,
+    sample_rate_hz: float | None,
+    sign_width: float | None = None,
 ) -> Log:
     """As `preprocess`, with the motion of the base from the feet that stand; samples with too few of them are left out.
 
@@ -59,6 +64,7 @@ def preprocess_standing(
         contacts: its feet.
         cutoff_hz: as of `preprocess`.
         sample_rate_hz: likewise.
+        sign_width: likewise.
 
     Raises:
         InputError: as `stand_on_feet` and `preprocess`, or no stretch is long enough for the filter.
@@ -67,7 +73,7 @@ def preprocess_standing(
         TorchidWarning: as `preprocess`; number of samples left out, with the reasons; feet that are not on one floor.
     """
     standing = stand_on_feet(log, robot, contacts)
-    out, too_short = preprocess_stretches(standing.log, standing.stretches, cutoff_hz, sample_rate_hz)
+    out, too_short = preprocess_stretches(standing.log, standing.stretches, cutoff_hz, sample_rate_hz, sign_width)
     dropped = standing.dropped | ({"stretches too short to differentiate": too_short} if too_short else {})
     if dropped:
         reasons = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())

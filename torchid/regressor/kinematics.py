@@ -110,7 +110,7 @@ def joint_motion(tree: KinematicTree, motion: Motion) -> JointMotion:
     moving = tree.joint_map[:, : tree.n]
     position = moving @ motion.joint_position.T + tree.joint_constant
     velocity = moving @ motion.joint_velocity.T
-    if motion.joint_direction is None or tree.sign_width is not None:
+    if motion.joint_direction is None:
         direction = tree.coulomb_sign(velocity)
     else:
         direction = torch.sign(moving) @ motion.joint_direction.T  # a mimic joint may turn the other way
