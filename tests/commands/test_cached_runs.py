@@ -115,6 +115,8 @@ CHANGED = {
     "contact_margin_s": 0.02,
     "max_slip": 0.5,
     "detect_contacts": True,
+    "contact_threshold": 30.0,
+    "zero_in_air": True,
     "base_motion": "contacts",
     "exclude_condemned": True,
     "memory_gb": 3.0,

@@ -19,6 +19,7 @@ from synthetic import G1, ROBOTS
 
 from torchid.errors import InputError, TorchidWarning
 from torchid.logs import Log, read_log
+from torchid.logs.flags import ContactThreshold, with_flags_by_force
 from torchid.logs.joint_orders import GO, HG, JOINT_ORDERS
 from torchid.logs.ros_files import Channel
 from torchid.logs.ros_messages import make_deserializer
@@ -169,6 +170,9 @@ def test_flags_of_others_stand_beside_counts_that_are_forces(tmp_path: Path) -> 
         lambda: read_log(path, parsed(topics)), f"{path}: logs.topics.low_state.above: missing, though noth"
     )
     assert "when FR_foot touches" in message
+    bare = read_log(path, parsed(topics | {"contact_force_threshold": 3.0}), needs_flags=False)
+    flags = value(with_flags_by_force(bare, ContactThreshold(22, 10))[0].contact_active)
+    assert flags.astype(int).T.tolist() == [[0, 1, 1, 0], [1, 1, 0, 0], [1, 1, 1, 0], [0, 0, 0, 0]]
 
 
 # ------------------------------------------------------------------------------------------------------------ stamps

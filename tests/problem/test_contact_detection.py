@@ -23,8 +23,6 @@ from torchid.log_checks.check import check
 from torchid.logs import Log
 from torchid.problem.contact_detection import (
     DetectionConfig,
-    _hysteresis,
-    _without_short,
     detect_contacts,
     normal_forces,
     with_detected_contacts,
@@ -215,16 +213,6 @@ def test_feet_of_a_robot_that_something_else_carries_do_not_stand(carried: float
     np.testing.assert_array_equal(
         detect_contacts(log, robot, contacts, DEFAULT).active, np.tile([True, True, True, False], (len(log), 1))
     )
-
-
-def test_a_force_between_both_thresholds_keeps_its_flag() -> None:
-    force = np.array([0.0, 0.04, 0.06, 0.04, 0.02, 0.04, 0.06, 0.01])
-    assert _hysteresis(force, 0.05, 0.03).tolist() == [False, False, True, True, False, False, True, False]
-    assert _hysteresis(np.full(3, 0.045), 0.05, 0.03).all()
-    assert not _hysteresis(np.full(3, 0.035), 0.05, 0.03).any()
-    flags = np.array([1, 1, 1, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1], dtype=bool)
-    assert _without_short(flags, 2).tolist() == [True] * 4 + [False] * 8 + [True] * 2
-    assert _without_short(flags, 1).tolist() == flags.tolist()
 
 
 # -------------------------------------------------------------------------------------------------- checks and refusals

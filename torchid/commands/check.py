@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchid.commands.folder import check_free_file
-from torchid.commands.reading import memory_needed, with_flags
+from torchid.commands.reading import memory_needed, settle_contacts
 from torchid.config import load_analysis
 from torchid.config.logs import LogsConfig
 from torchid.config.maps import load_columns, load_topics
@@ -84,7 +84,7 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
     with progress_bars() as bars:
         for file in bars.track(files, description="checking"):
             settings = config.preprocessing
-            log, _ = with_flags(read_log_to_check(file, config.logs, settings), scene)
+            log, _ = settle_contacts(read_log_to_check(file, config.logs, settings), scene)
             found = check(log, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
@@ -147,7 +147,8 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
         LogError: as `read_log_to_check`.
     """
     _require_memory(path, settings)
-    if existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED) or settings.bridge_gaps_s is not None:
+    whole = settings.bridge_gaps_s is not None or not settings.needs_flags
+    if whole or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
         log = _read_with_gaps(path, logs, settings)
         for stretch in _stretches(len(log)):
             yield log.select(stretch), _stretch_name(path, stretch, len(log))
@@ -159,8 +160,14 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
 
 def _read_with_gaps(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Log:
     """A log with those of its gaps that are too long to be bridged."""
-    gaps = settings.bridge_gaps_s
-    return read_log(path, logs.topics, allow_gaps=True, columns=logs.columns, bridge_gaps_s=gaps)
+    return read_log(
+        path,
+        logs.topics,
+        allow_gaps=True,
+        columns=logs.columns,
+        bridge_gaps_s=settings.bridge_gaps_s,
+        needs_flags=settings.needs_flags,
+    )
 
 
 def _stretches(samples: int) -> list[slice]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchid import parameters
 from torchid.commands.check import stretches_to_check
-from torchid.commands.reading import with_flags
+from torchid.commands.reading import settle_contacts
 from torchid.errors import (
     ImplausibleFitError,
     InputError,
@@ -209,7 +209,7 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
     for path in files.train:
         with suppress(InputError):  # larger than memory: it is not checked
             for log, name in stretches_to_check(path, files, settings):
-                flagged, _ = with_flags(log, scene)
+                flagged, _ = settle_contacts(log, scene)
                 checked = check(flagged, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
                 severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
                 findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]

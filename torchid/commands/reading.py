@@ -19,6 +19,7 @@ from torchid.log_checks.check import check
 from torchid.logs import Log, read_log
 from torchid.logs.blocks import GIGABYTE, log_bytes
 from torchid.logs.containers import LogKind, existing_log_kind
+from torchid.logs.flags import with_flags_by_force
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import away_from_changes, away_from_stamps, preprocess
 from torchid.logs.time_range import LogPart, split_range
@@ -26,6 +27,7 @@ from torchid.problem import Samples, bind_log
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip
 from torchid.problem.standing import preprocess_standing
+from torchid.problem.zeroing import zero_in_air
 from torchid.sensing import SensorSet
 
 _WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
@@ -90,8 +92,15 @@ class LogReader:
             return self._large_log(path, required, None).samples(fits_contact_offsets(self.scene))
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
         allow_gaps, bridge_gaps_s = settings.exclude_condemned, settings.bridge_gaps_s
-        read = read_log(path, topics, allow_gaps=allow_gaps, columns=columns, bridge_gaps_s=bridge_gaps_s)
-        recorded, certain = with_flags(read, self.scene)
+        read = read_log(
+            path,
+            topics,
+            allow_gaps=allow_gaps,
+            columns=columns,
+            bridge_gaps_s=bridge_gaps_s,
+            needs_flags=settings.needs_flags,
+        )
+        recorded, certain = settle_contacts(read, self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         rates, sign_width = (settings.cutoff_hz, settings.sample_rate_hz), self.scene.terms.sign_width
@@ -166,8 +175,15 @@ class LogReader:
             if settings.exclude_condemned:
                 key, accepted = "exclude_condemned", f"{accepted} that torchid check passes"
             else:
-                keys = ("base_motion", "detect_contacts", "max_slip", "bridge_gaps_s")
-                key = next(name for name in keys if getattr(settings, name) is not None)
+                keys = (
+                    "base_motion",
+                    "detect_contacts",
+                    "contact_threshold",
+                    "zero_in_air",
+                    "max_slip",
+                    "bridge_gaps_s",
+                )
+                key = next(name for name in keys if getattr(settings, name) not in (None, False))
             raise LogError(path, f"preprocessing.{key}", found, accepted)
         return self._large_log(path, required, self.folder).samples(fits_contact_offsets(self.scene))
 
@@ -180,7 +196,8 @@ class LogReader:
         """Whether samples are left out or filled for what is known of a whole log alone."""
         settings = self.scene.config.preprocessing
         of_whole = settings.max_slip, settings.bridge_gaps_s
-        return settings.exclude_condemned or bool(settings.derived) or of_whole != (None, None)
+        of_all = settings.exclude_condemned or settings.zero_in_air or bool(settings.derived)
+        return of_all or of_whole != (None, None)
 
     def _large_log(self, path: Path, required: SensorSet | None, folder: Path | None) -> LargeLog:
         """A log that is read block by block."""
@@ -210,12 +227,25 @@ class LogReader:
         return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz, settings.derived)
 
 
-def with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
-    """A log as it was read, and where its contact flags are certain: from joint torques if the settings want these."""
-    settings = scene.config.preprocessing.detect_contacts
-    if settings is None:
-        return log, np.ones(len(log), dtype=bool)
-    return with_detected_contacts(log, scene.robot, scene.contacts, settings)
+def settle_contacts(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
+    """A log with the flags and zeros of contacts that the settings want, and where the flags (N,) are certain."""
+    flagged, certain = _with_flags(log, scene)
+    if not scene.config.preprocessing.zero_in_air:
+        return flagged, certain
+    zeroed = zero_in_air(flagged, scene.contacts)
+    if scene.config.preprocessing.contact_threshold is None:
+        return zeroed, certain
+    return _with_flags(zeroed, scene)
+
+
+def _with_flags(log: Log, scene: Scene) -> tuple[Log, BoolArray]:
+    """A log with contact flags as recorded, from joint torques or from forces, and where they are certain."""
+    settings = scene.config.preprocessing
+    if settings.detect_contacts is not None:
+        return with_detected_contacts(log, scene.robot, scene.contacts, settings.detect_contacts)
+    if settings.contact_threshold is not None:
+        return with_flags_by_force(log, settings.contact_threshold)
+    return log, np.ones(len(log), dtype=bool)
 
 
 def check_parts(logs: Mapping[str, Sequence[Samples]]) -> None:

@@ -151,6 +151,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> ExperimentCo
         validate_choice("sensors", config.sensors)
         validate_keys(config.estimator)
         _check_extras(config)
+        _check_threshold(config.preprocessing)
         return dataclasses.replace(config, logs=_checked_logs(config, config.logs))
 
 
@@ -162,6 +163,7 @@ def load_analysis(path: str | Path, overrides: Sequence[str] = ()) -> AnalyzeCon
         validate_choice("sensors", config.sensors, may_be_empty=True)
         validate_keys(config.estimator)
         _check_extras(config)
+        _check_threshold(config.preprocessing)
         for name, choice in config.analysis.compare.items():
             validate_choice(f"analysis.compare.{name}", choice)
         if config.logs is not None:
@@ -183,12 +185,29 @@ def dump_config(config: ExperimentConfig | AnalyzeConfig) -> str:
     return dump(config)
 
 
+def _check_threshold(settings: PreprocessingConfig) -> None:
+    """Refuse two sources of contact flags, and a threshold below that is above."""
+    threshold, key = settings.contact_threshold, "preprocessing.contact_threshold"
+    if threshold is None:
+        return
+    if settings.detect_contacts is not None:
+        found = "set together with preprocessing.detect_contacts, which makes the same flags"
+        raise ConfigError.at_field(key, found, "one of the two")
+    if threshold.below is not None and threshold.below > threshold.above:
+        found = f"{threshold.below:g}, more than above ({threshold.above:g})"
+        raise ConfigError.at_field(f"{key}.below", found, "a force [N] up to that of above")
+
+
 def _check_extras(config: _Common) -> None:
     """Refuse the same extra parameter under two keys, and extra parameters for a descent, which has none."""
     actuators, sensors = config.actuators, config.sensors
     if actuators.torque_offset and "joint_torque" in sensors.offsets:
         found = "set together with sensors.offsets.joint_torque, which is the same"
         raise ConfigError.at_field("actuators.torque_offset", found, "one of the two")
+    twice = [kind for kind in ("contact_force", "contact_moment") if kind in sensors.offsets]
+    if config.preprocessing.zero_in_air and twice:
+        found = "set together with preprocessing.zero_in_air, which subtracts the same"
+        raise ConfigError.at_field(f"sensors.offsets.{twice[0]}", found, "one of the two")
     unknowns = {f"actuators.{name}": x is True for name, x in vars(actuators).items()}
     unknowns |= {f"sensors.{name}": bool(getattr(sensors, name)) for name in ("offsets", "scales")}
     for field, is_set in unknowns.items():
@@ -201,7 +220,7 @@ def _checked_logs(config: _Common, logs: LogsConfig) -> LogsConfig:
     _check_held_out(config.estimator, logs)
     checked = resolve_logs(logs)
     if logs.topics is not None:
-        check_topics(logs.topics)
+        check_topics(logs.topics, needs_flags=config.preprocessing.needs_flags)
     if logs.columns is not None:
         check_columns(logs.columns)
     _check_factors(config, checked)

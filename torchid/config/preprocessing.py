@@ -8,6 +8,7 @@ from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT
+from torchid.logs.flags import ContactThreshold
 from torchid.problem.contact_detection import DetectionConfig
 from torchid.settings import NotNegative, Positive, PositiveOrAuto
 
@@ -15,6 +16,13 @@ from torchid.settings import NotNegative, Positive, PositiveOrAuto
 def _switch(value: object) -> object:
     """All settings at their defaults for true, none for false."""
     return ({} if value else None) if isinstance(value, bool) else value
+
+
+def _threshold(value: object) -> object:
+    """A number is the threshold of both changes."""
+    if isinstance(value, str):
+        raise ValueError("a force [N], or a mapping with above, below, shortest_s")
+    return {"above": value} if isinstance(value, (int, float)) else value
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -25,6 +33,8 @@ class PreprocessingConfig:
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
     recorded ones.
+    `contact_threshold`: a force [N], or its settings, for contact flags from forces (`ContactThreshold`) likewise.
+    `zero_in_air`: subtract from contact sensors what they read on average in the air, from each log for itself.
     `base_motion`: contacts, from the feet that stand on a floor, whatever was recorded of it; None for as recorded.
     `max_slip`: speed [m/s] above which a contact that should stand slips, so that the sample is dropped; auto, from the
     noise of each contact's velocity; None keeps all.
@@ -38,6 +48,8 @@ class PreprocessingConfig:
     bridge_gaps_s: Positive | None = None
     contact_margin_s: NotNegative | None = None
     detect_contacts: Annotated[DetectionConfig | None, BeforeValidator(_switch)] = None
+    contact_threshold: Annotated[ContactThreshold | None, BeforeValidator(_threshold)] = None
+    zero_in_air: bool = False
     base_motion: Literal["contacts"] | None = None
     max_slip: PositiveOrAuto = None
     exclude_condemned: bool = False
@@ -53,5 +65,10 @@ class PreprocessingConfig:
     @property
     def derived(self) -> tuple[str, ...]:
         """How names of fields of a log begin that are worked out of others, whatever was recorded."""
-        flags = () if self.detect_contacts is None else ("contact_active",)
+        flags = () if self.needs_flags else ("contact_active",)
         return flags if self.base_motion is None else (*flags, "base_")
+
+    @property
+    def needs_flags(self) -> bool:
+        """Whether nothing but a log says which contact touches when."""
+        return self.detect_contacts is None and self.contact_threshold is None

@@ -68,9 +68,12 @@ def suited_to_preprocessing(
         if getattr(settings, key) is not None and config.robot.fixed_base:
             accepted = "null, or a base that floats"
             raise ConfigError.at_field(f"preprocessing.{key}", "set, though robot.fixed_base is true", accepted)
+    for key in ("detect_contacts", "contact_threshold"):
+        if getattr(settings, key) is not None and not contacts:
+            raise ConfigError.at_field(f"preprocessing.{key}", "set, without contacts", "contacts to detect")
+    if settings.zero_in_air and not contacts:
+        raise ConfigError.at_field("preprocessing.zero_in_air", "true, without contacts", "false, or contacts")
     if settings.detect_contacts is not None:
-        if not contacts:
-            raise ConfigError.at_field("preprocessing.detect_contacts", "set, without contacts", "contacts to detect")
         touch, lift = settings.detect_contacts.touch, settings.detect_contacts.lift
         if lift > touch:
             found, accepted = f"{lift:g}, above touch ({touch:g})", "a share of the weight up to that of touch"

@@ -16,7 +16,16 @@ from torchid.problem import RowBuilder
 from torchid.problem.sampled_rows import noise_of_groups, std_by_group
 
 _THE_EXPERIMENT = "the experiment file"
-_APART = ("detect_contacts", "base_motion", "max_slip", "exclude_condemned", "memory_gb", "cache_gb")
+_APART = (
+    "detect_contacts",
+    "contact_threshold",
+    "zero_in_air",
+    "base_motion",
+    "max_slip",
+    "exclude_condemned",
+    "memory_gb",
+    "cache_gb",
+)
 """Keys of preprocessing that do not change what a row is."""
 
 

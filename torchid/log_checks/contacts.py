@@ -84,7 +84,7 @@ def check_contact_flags(log: Log) -> Iterator[Finding | Skipped]:
         size = np.linalg.norm(contact.force - offset, axis=1)
         if (constant := float(np.linalg.norm(offset))) > MIN_ACTIVE_WEIGHT_SHARE * weight:
             text = f"{contact.name}: reads a steady {constant:.3g} N in the air"
-            advice = "identify it, sensors.offsets: {contact_force: log}, or subtract it"
+            advice = "identify it, sensors.offsets: {contact_force: log}, or subtract it, preprocessing.zero_in_air"
             yield Finding("offset", NOTE, "contact_wrench", text, advice, (contact.name,))
         yield from _load_findings(log, contact, size, weight)
         yield from _delay_findings(log, contact, size, weight)

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from torchid.errors import LogError, warn_about_file
 from torchid.logs.log import (
     CONTACT_READINGS,
+    FLAGS,
     LARGEST,
     NORMALS,
     SHAPES,
@@ -29,7 +30,6 @@ from torchid.logs.quaternion import make_sign_continuous
 KEY = "preprocessing.bridge_gaps_s"
 #: Share of a gap's longest length by which rounded stamps may exceed it.
 _SLACK = 1e-6
-_FLAGS = "contact_active"
 
 
 def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dict[str, NDArray[Any]]:
@@ -57,12 +57,12 @@ def bridge_gaps(raw: Mapping[str, NDArray[Any]], longest_s: float | None) -> dic
     time = to_float64("time", raw["time"])
     check_time(time)
     filled = dict[str, BoolArray]()
-    for name in sorted(_with_gaps(raw), key=lambda name: name != _FLAGS):  # readings depend on flags
+    for name in sorted(_with_gaps(raw), key=lambda name: name != FLAGS):  # readings depend on flags
         missing = _missing(name, raw[name])
         usable = _touching(out, missing.shape) if name in CONTACT_READINGS else None
         short = _short_gaps(time, missing, longest_s, usable)
         if short.any():
-            out[name] = _held(raw[name], short) if name == _FLAGS else _filled(time, name, raw[name], short)
+            out[name] = _held(raw[name], short) if name == FLAGS else _filled(time, name, raw[name], short)
             filled[name] = np.asarray(short.reshape(len(time), -1).any(axis=1))
     if filled:
         count = int(np.any(list(filled.values()), axis=0).sum())
@@ -110,7 +110,7 @@ def _runs(missing: BoolArray) -> list[tuple[int, int]]:
 
 def _touching(raw: Mapping[str, NDArray[Any]], shape: tuple[int, ...]) -> BoolArray | None:
     """Whether the contact of each element (N, C, ...) touches; None where its file does not say."""
-    flags = raw.get(_FLAGS)
+    flags = raw.get(FLAGS)
     if flags is None or flags.shape != shape[:2]:
         return None
     return np.asarray(np.broadcast_to((flags == 1.0).reshape(*shape[:2], *[1] * (len(shape) - 2)), shape))

@@ -64,6 +64,7 @@ REQUIRED = ("time", "joint_names", "joint_position")
 NAME_FIELDS = {"joint_names": "n", "contact_names": "C", "ft_names": "F"}
 WRENCHES = ("contact_wrench_local", "contact_wrench_world")
 NORMALS = "contact_normal_world"
+FLAGS = "contact_active"
 FORCE_NORMAL = "contact_force_normal"
 
 #: Readings of sensors at contacts: 0, whatever was recorded, where nothing touches.

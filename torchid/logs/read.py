@@ -25,7 +25,9 @@ from torchid.logs.containers import (
 from torchid.logs.gaps import bridge_gaps, refuse_gaps
 from torchid.logs.joined import read_joined
 from torchid.logs.log import (
+    CONTACT_READINGS,
     EXCLUSIVE,
+    FLAGS,
     NAME_FIELDS,
     NAN_ALLOWED,
     NORMALS,
@@ -64,6 +66,7 @@ def read_log(
     allow_gaps: bool = False,
     columns: Columns | None = None,
     bridge_gaps_s: float | None = None,
+    needs_flags: bool = True,
 ) -> Log:
     """Read a log: arrays (.npz, never pickled, .h5, .hdf5), a table (.csv, .parquet) or a bag of ROS messages.
 
@@ -80,6 +83,7 @@ def read_log(
         allow_gaps: accept NaN in poses and their derivatives, which `torchid.check` reports.
         columns: what the columns of a table, or the arrays of a file, hold where these have other names.
         bridge_gaps_s: fill gaps of at most so long [s], see `bridge_gaps`; None leaves them.
+        needs_flags: refuse readings of contacts without `contact_active`; false where flags are worked out of them.
 
     Raises:
         LogError: one line with the file, the field, its value and the accepted values.
@@ -90,16 +94,18 @@ def read_log(
             gaps that are filled.
     """
     with during("reading", os.fspath(path)):
-        part = split_range(path)
+        part, check = split_range(path), partial(check_fields_given, needs_flags=needs_flags)
         kind = existing_log_kind(part.file)
         if kind is LogKind.ARRAYS:
-            raw = _read_arrays(part.file, columns, check_fields_given)
+            raw = _read_arrays(part.file, columns, check)
         else:
             if kind is LogKind.JOINED:
                 raw = read_joined(part.files, columns, partial(_read_one, bridge_gaps_s))
+            elif kind is LogKind.TABLE:
+                raw = read_table(part.file, columns)
             else:
-                raw = read_table(part.file, columns) if kind is LogKind.TABLE else read_bag(part.file, topics, progress)
-            check_fields_given(raw)
+                raw = read_bag(part.file, topics, progress, needs_flags)
+            check(raw)
         raw = raw if part.range is None else _cut(raw, part.range)
         return build_log(bridge_gaps(raw, bridge_gaps_s), allow_gaps)
 
@@ -123,13 +129,13 @@ def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange) -> dict[str, NDArray[A
     return out
 
 
-def check_fields_given(names: Collection[str]) -> None:
-    """Raise LogError for unknown or missing fields, and for invalid combinations."""
+def check_fields_given(names: Collection[str], needs_flags: bool = True) -> None:
+    """Raise LogError for unknown or missing fields, and for invalid combinations; `needs_flags` as in `read_log`."""
     _check_known(names)
     for name in REQUIRED:
         if name not in names:
             raise LogError.at_field(name, "missing", f"a log with {', '.join(REQUIRED)}")
-    _check_combination(names)
+    _check_combination(names, needs_flags)
 
 
 def _read_one(bridge_gaps_s: float | None, path: Path, columns: Columns | None) -> dict[str, NDArray[Any]]:
@@ -167,15 +173,18 @@ def _check_known(names: Collection[str]) -> None:
         raise unknown_columns(unknown)
 
 
-def _check_combination(names: Collection[str]) -> None:
+def _check_combination(names: Collection[str], needs_flags: bool) -> None:
     """Raise LogError on fields that exclude each other, or that need a field that is missing."""
     for first, second in EXCLUSIVE:
         if first in names and second in names:
             raise LogError.at_field(first, f"given together with {second}", "one of the two")
     for name, required in REQUIRED_WITH.items():
-        missing = [field for field in required if field not in names]
+        missing = [field for field in required if field not in names and (needs_flags or field != FLAGS)]
         if name in names and missing:
-            raise LogError.at_field(name, f"given without {missing[0]}", f"{name} together with {missing[0]}")
+            accepted = f"{name} together with {missing[0]}"
+            if missing[0] == FLAGS and name in CONTACT_READINGS:
+                accepted += ", or flags by preprocessing.contact_threshold in an experiment file"
+            raise LogError.at_field(name, f"given without {missing[0]}", accepted)
     for name, canonical in VARIANTS.items():
         if name in names and not is_quaternion(name) and not any(map(is_quaternion, names)):
             accepted = f"with base_quat_wxyz or base_quat_xyzw, or as {canonical}"
@@ -197,7 +206,7 @@ def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, A
             continue
         check_shape(name, array, field_shape(name), sizes)
         labels = column_labels(name, names)
-        if name == "contact_active":
+        if name == FLAGS:
             fields[name] = parse_flags(name, array, labels)
             continue
         values, may_be_nan = to_float64(name, array), allow_gaps or name in (*NAN_ALLOWED, NORMALS)
@@ -206,7 +215,8 @@ def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, A
         check_finite(name, values, allow_nan=may_be_nan, labels=labels)
         fields[name] = normalize_quaternions(name, values, allow_gaps) if is_quaternion(name) else values
     if NORMALS in fields and not allow_gaps:
-        fields[NORMALS] = normalize_normals(fields[NORMALS], fields["contact_active"], names["contact_names"])
+        active = fields.get(FLAGS, np.zeros(fields[NORMALS].shape[:2], dtype=bool))
+        fields[NORMALS] = normalize_normals(fields[NORMALS], active, names["contact_names"])
     return fields
 
 

@@ -135,7 +135,10 @@ class _Bag:
 
 
 def read_bag(
-    path: Path, topics: Topics | None, progress: Callable[[float], None] | None = None
+    path: Path,
+    topics: Topics | None,
+    progress: Callable[[float], None] | None = None,
+    needs_flags: bool = True,
 ) -> dict[str, NDArray[Any]]:
     """The fields of a log file, from a bag.
 
@@ -143,6 +146,7 @@ def read_bag(
         path: a .bag, .mcap or .db3 file, or the folder of several.
         topics: roles of the topics.
         progress: called with the share that has been read.
+        needs_flags: as in `read_log`; a contact of which nothing says when it touches has flags that are all true else.
 
     Raises:
         LogError: the bag is damaged, or its messages do not make up a log.
@@ -154,7 +158,7 @@ def read_bag(
     """
     files = list_bag_files(path)
     if topics is not None:
-        check_topics(topics)
+        check_topics(topics, needs_flags)
     channels = list_channels(files)
     if topics is None:
         raise LogError.at_field("logs.topics", f"missing; the bag has {_listed(channels)}", "what its topics hold")
@@ -313,6 +317,8 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
     if name in bag.topics.feet and low_state is not None and low_state.above is not None:
         counts = series["low_state"].fields[_FEET][:, bag.topics.feet.index(name)]
         return clock.hold(series["low_state"], counts) > low_state.above
+    if threshold is None or name in bag.topics.feet:  # flags are worked out later
+        return np.ones(len(clock.stamps), dtype=np.bool_)
     if name in bag.topics.contact_wrenches:
         measured = series[f"contact_wrenches.{name}"]
         with np.errstate(over="ignore"):  # infinite is above any threshold
@@ -320,7 +326,7 @@ def _active(bag: _Bag, clock: _CommonClock, series: Mapping[str, TopicSeries], n
     else:
         measured = series[f"contact_force_normal.{name}"]
         force = measured.fields["force"][:, 0]
-    if np.isnan(force).any() or threshold is None:
+    if np.isnan(force).any():
         accepted = "forces to compare with contact_force_threshold, or contact_active"
         raise LogError.at_field(measured.topic, f"a force of NaN in message {np.argmax(np.isnan(force))}", accepted)
     return clock.hold(measured, force) > threshold

@@ -201,8 +201,8 @@ class Topics:
         return tuple(name for name in (*self.contact_force_normal, *counted) if name is not None)
 
 
-def check_topics(topics: Topics) -> None:
-    """Check that a map of topics is complete.
+def check_topics(topics: Topics, needs_flags: bool = True) -> None:
+    """Check that a map of topics is complete; `needs_flags` as in `read_log`.
 
     Raises:
         ConfigError: no joints or these twice, a contact without a flag, a threshold or `always`, a low state that
@@ -219,10 +219,14 @@ def check_topics(topics: Topics) -> None:
         if (contact.topic is None) != contact.always:
             accepted = "a topic of std_msgs/Bool, or true for a contact that always touches"
             raise ConfigError.at_field(f"logs.topics.contact_active.{name}", "not one of topic and always", accepted)
-    _check_flags(topics)
+    if needs_flags:
+        _check_flags(topics)
     stamped = [role for role in topics.by_role if not role.startswith("contact_active.")]
     if topics.clock not in stamped:
         raise UnknownNameError.at_field("logs.topics.rate_topic", topics.clock, stamped)
+
+
+_OTHER_FLAGS = "contact_active, or preprocessing.contact_threshold"
 
 
 def _check_flags(topics: Topics) -> None:
@@ -232,10 +236,12 @@ def _check_flags(topics: Topics) -> None:
     counted = [name for name in unflagged if name in topics.feet]
     if counted:
         found = f"missing, though nothing else says when {counted[0]} touches"
-        raise ConfigError.at_field("logs.topics.low_state.above", found, "a reading [counts], or contact_active")
+        accepted = f"a reading [counts], {_OTHER_FLAGS}"
+        raise ConfigError.at_field("logs.topics.low_state.above", found, accepted)
     if unflagged and topics.contact_force_threshold is None:
         found = f"missing, though nothing else says when {unflagged[0]} touches"
-        raise ConfigError.at_field("logs.topics.contact_force_threshold", found, "a force [N], or contact_active")
+        accepted = f"a force [N], {_OTHER_FLAGS}"
+        raise ConfigError.at_field("logs.topics.contact_force_threshold", found, accepted)
 
 
 def _check_low_state(topics: Topics, low_state: LowStateTopic) -> None:

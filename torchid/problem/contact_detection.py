@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from torchid.errors import InputError, LogError, TorchidWarning
 from torchid.logs import Log, preprocess
+from torchid.logs.flags import hysteresis, samples_of, without_short
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.problem.base_motion import BaseMotion, base_motion
 from torchid.problem.floor_pose import levelled
@@ -114,12 +115,12 @@ def detect_contacts(log: Log, robot: Robot, contacts: Sequence[Contact], setting
     weight = GRAVITY * float(robot.nominal[:, 0].sum())
     known, samples, rotation = _prepared(log, robot, contacts, settings.cutoff_hz)
     share = _normal_forces(samples, rotation, robot, contacts) / weight
-    shortest = round(settings.shortest_s / float(np.median(np.diff(known.time)))) if len(known) > 1 else 0
-    loaded = np.stack([_hysteresis(one, settings.touch, settings.lift) for one in share.T], axis=1)
+    shortest = samples_of(settings.shortest_s, known.time)
+    loaded = np.stack([hysteresis(one, settings.touch, settings.lift) for one in share.T], axis=1)
     if known.imu_frame or known.base_quat_xyzw is not None:
         light = share > settings.light
         loaded |= keep_still(known, samples, robot, contacts, loaded, light, 2 * shortest)
-    flags = np.stack([_without_short(one, shortest) for one in loaded.T], axis=1)
+    flags = np.stack([without_short(one, shortest) for one in loaded.T], axis=1)
     nearest = np.searchsorted(0.5 * (known.time[1:] + known.time[:-1]), log.time)
     inside = (log.time >= known.time[0]) & (log.time <= known.time[-1])
     doubtful = np.asarray((loaded & ~flags).any(axis=1))
@@ -373,25 +374,3 @@ def _filled(values: FloatArray) -> FloatArray:
         if good.any():
             column[~good] = np.interp(index[~good], index[good], column[good])
     return out
-
-
-def _hysteresis(values: FloatArray, on: float, off: float) -> BoolArray:
-    """Which values (N,) are above `on`, or have been since and are not below `off`."""
-    state = np.where(values > on, 1, np.where(values < off, 0, -1))
-    known = np.flatnonzero(state >= 0)
-    if not len(known):
-        return np.full(len(values), bool(len(values)) and float(values.mean()) > 0.5 * (on + off))
-    last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
-    return np.asarray(state[known[np.maximum(last, 0)]] == 1)
-
-
-def _without_short(flags: BoolArray, shortest: int) -> BoolArray:
-    """The flags (N,) without runs of fewer samples, the shortest first, but for those at the ends."""
-    out = flags.copy()
-    while True:
-        ends = np.flatnonzero(out[1:] != out[:-1]) + 1
-        lengths = np.diff(ends)
-        if not len(lengths) or lengths.min() >= shortest:
-            return out
-        first = int(lengths.argmin())
-        out[ends[first] : ends[first + 1]] ^= True

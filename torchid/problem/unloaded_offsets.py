@@ -12,7 +12,9 @@ from torchid.problem.rows import RowBuilder
 from torchid.problem.samples import Samples
 from torchid.rounding import MAD_PER_STD
 
-_LEAST_READINGS = 16  # readings for one equation
+LEAST_READINGS = 16
+"""In the air, for one equation."""
+
 _BATCHES = 8  # batches of successive readings, whose means show drift
 _MASKED_SHARE = 0.01  # readings are masked or clamped, not measured, if more than this share is exactly 0 ...
 _ONE_SIDED = 0.05  # ... and less than this share has one of the signs (else 0 is one step of a coarse sensor)
@@ -65,16 +67,17 @@ def unloaded_offset_equations(builder: RowBuilder, samples: Samples) -> Iterator
         contact, axis = extra.contact
         y = samples.unloaded[:, contact, axis]
         y = y[torch.isfinite(y)]
-        if len(y) < _LEAST_READINGS:
+        if len(y) < LEAST_READINGS:
             continue
-        if _is_masked(y):
+        if is_masked(y):
             yield UnloadedOffsetEquation(number, None, gated=True)
         else:
             mean, deviation = _robust_mean(y, noise[axis], samples.oversampling)
             yield UnloadedOffsetEquation(number, scales.get(extra.contact), False, mean, deviation)
 
 
-def _is_masked(y: Tensor) -> bool:
+def is_masked(y: Tensor) -> bool:
+    """Whether readings (M,) in the air are masked or clamped, not measured: many are exactly 0, and few of one sign."""
     above, below = ((y > 0.0).double().mean(), (y < 0.0).double().mean())
     return bool(1.0 - above - below > _MASKED_SHARE and min(above, below) < _ONE_SIDED)
 

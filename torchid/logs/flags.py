@@ -1,0 +1,119 @@
+"""Which contacts stand when, by thresholds with hysteresis of what they carry."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+
+from torchid.errors import LogError, about_file
+from torchid.logs.log import FORCE_NORMAL, BoolArray, FloatArray, Log, describe_element, normalize_normals
+from torchid.settings import NotNegative, Positive
+
+KEY = "preprocessing.contact_threshold"
+
+
+@dataclass(config=ConfigDict(extra="forbid"), frozen=True)
+class ContactThreshold:
+    """When a contact stands by its force: from where that exceeds `above` [N] until it is below `below` [N].
+
+    Without `below` both are the same. Stances and swings shorter than `shortest_s` [s] are none.
+    """
+
+    above: Positive
+    below: Positive | None = None
+    shortest_s: NotNegative = 0.0
+
+
+def with_flags_by_force(log: Log, settings: ContactThreshold) -> tuple[Log, BoolArray]:
+    """The log with flags by `contact_forces` in the place of what it has, and where they are certain.
+
+    A contact without a force keeps its recorded flag. Samples (N,) of stances that are too short to count are not
+    certain.
+
+    Raises:
+        LogError: no force, or no flag either, of a contact; a force that is NaN in some samples; no normal of the
+            ground where a contact stands.
+    """
+    force = contact_forces(log)
+    active = np.zeros(force.shape, dtype=bool) if log.contact_active is None else log.contact_active.copy()
+    certain = np.ones(len(log), dtype=bool)
+    below = settings.above if settings.below is None else settings.below
+    shortest = samples_of(settings.shortest_s, log.time)
+    for column, name in enumerate(log.contact_names):
+        missing = np.isnan(force[:, column])
+        if missing.all() and log.contact_active is not None:
+            continue
+        if missing.any():
+            found = f"nan at {describe_element((int(np.argmax(missing)), column), log.contact_names)}"
+            accepted = f"forces to compare with {KEY}, or gaps that preprocessing.bridge_gaps_s bridges"
+            if missing.all():
+                found, accepted = f"no force of {name}", f"forces to compare with {KEY}, or contact_active"
+            raise LogError(log.source, _force_field(log, column), found, accepted)
+        loaded = hysteresis(force[:, column], settings.above, below)
+        active[:, column] = without_short(loaded, shortest)
+        certain &= active[:, column] | ~loaded
+    normals = log.contact_normal_world
+    if normals is not None:
+        with about_file(log.source):
+            normals = normalize_normals(normals, active, log.contact_names)
+    return dataclasses.replace(log, contact_active=active, contact_normal_world=normals), certain
+
+
+def contact_forces(log: Log) -> FloatArray:
+    """What contacts carry, (N, C) [N]: `contact_force_normal`, or the size of a wrench's force where there is none.
+
+    The size needs no orientation of foot, base or ground. A component that is NaN throughout counts as 0, a contact of
+    which all are has NaN.
+
+    Raises:
+        LogError: the log has neither.
+    """
+    scalar, wrench = log.contact_force_normal, log.contact_wrench
+    if not log.contact_names or (scalar is None and wrench is None):
+        accepted = f"contact_wrench_local or {FORCE_NORMAL}, to compare with {KEY}"
+        raise LogError(log.source, "contact_wrench", "missing", accepted)
+    force = np.full((len(log), len(log.contact_names)), np.nan)
+    if wrench is not None:
+        parts, measured = wrench[:, :, :3], ~np.isnan(wrench[:, :, :3]).all(axis=0)
+        sizes = np.linalg.norm(np.where(measured, parts, 0.0), axis=2)
+        force = np.where(np.any(measured, axis=1), sizes, np.nan)
+    if scalar is not None:
+        force = np.where(np.isnan(scalar).all(axis=0), force, scalar)
+    return np.asarray(force)
+
+
+def _force_field(log: Log, column: int) -> str:
+    """The field of which `contact_forces` are for a contact."""
+    scalar = log.contact_force_normal
+    is_scalar = scalar is not None and (log.contact_wrench is None or not np.isnan(scalar[:, column]).all())
+    return FORCE_NORMAL if is_scalar else log.contact_wrench_field
+
+
+def samples_of(seconds: float, time: FloatArray) -> int:
+    """How many median steps of stamps (N,) [s] a duration [s] is."""
+    return round(seconds / float(np.median(np.diff(time)))) if len(time) > 1 else 0
+
+
+def hysteresis(values: FloatArray, on: float, off: float) -> BoolArray:
+    """Which values (N,) are above `on`, or have been since and are not below `off`."""
+    state = np.where(values > on, 1, np.where(values < off, 0, -1))
+    known = np.flatnonzero(state >= 0)
+    if not len(known):
+        return np.full(len(values), bool(len(values)) and float(values.mean()) > 0.5 * (on + off))
+    last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
+    return np.asarray(state[known[np.maximum(last, 0)]] == 1)
+
+
+def without_short(flags: BoolArray, shortest: int) -> BoolArray:
+    """The flags (N,) without runs of fewer samples, the shortest first, but for those at the ends."""
+    out = flags.copy()
+    while True:
+        ends = np.flatnonzero(out[1:] != out[:-1]) + 1
+        lengths = np.diff(ends)
+        if not len(lengths) or lengths.min() >= shortest:
+            return out
+        first = int(lengths.argmin())
+        out[ends[first] : ends[first + 1]] ^= True
