@@ -117,3 +117,9 @@ def without_short(flags: BoolArray, shortest: int) -> BoolArray:
             return out
         first = int(lengths.argmin())
         out[ends[first] : ends[first + 1]] ^= True
+
+
+def runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """First samples of the runs of flags (N,) that are set, and those after them."""
+    ends = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
+    return [(int(start), int(stop)) for start, stop in ends.reshape(-1, 2)]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from torchid.errors import LogError, warn_about_file
+from torchid.logs.flags import runs
 from torchid.logs.log import (
     CONTACT_READINGS,
     FLAGS,
@@ -77,7 +78,7 @@ def refuse_gaps(name: str, values: FloatArray, time: FloatArray, labels: tuple[s
     lengths = [
         time[stop] - time[start - 1]
         for column in _missing(name, values).reshape(len(time), -1).T
-        for start, stop in _runs(column)
+        for start, stop in runs(column)
         if start > 0 and stop < len(time)
     ]
     longest = f"the longest here takes {max(lengths):.3g} s" if lengths else "none here has values on both sides"
@@ -102,12 +103,6 @@ def _missing(name: str, values: NDArray[Any]) -> BoolArray:
     return np.asarray(np.broadcast_to(nan.any(axis=1, keepdims=True), nan.shape) if is_quaternion(name) else nan)
 
 
-def _runs(missing: BoolArray) -> list[tuple[int, int]]:
-    """First samples of the gaps (N,), and those after them."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]])))
-    return [(int(start), int(stop)) for start, stop in ends.reshape(-1, 2)]
-
-
 def _touching(raw: Mapping[str, NDArray[Any]], shape: tuple[int, ...]) -> BoolArray | None:
     """Whether the contact of each element (N, C, ...) touches; None where its file does not say."""
     flags = raw.get(FLAGS)
@@ -123,7 +118,7 @@ def _short_gaps(time: FloatArray, missing: BoolArray, longest_s: float, usable: 
     """
     short = np.zeros(missing.shape, dtype=np.bool_)
     for channel in np.ndindex(*missing.shape[1:]):
-        for start, stop in _runs(missing[(slice(None), *channel)]):
+        for start, stop in runs(missing[(slice(None), *channel)]):
             inside = start and stop < len(time) and time[stop] - time[start - 1] <= longest_s * (1.0 + _SLACK)
             if inside and (usable is None or usable[(slice(start - 1, stop + 1), *channel)].all()):
                 short[(slice(start, stop), *channel)] = True
@@ -141,7 +136,7 @@ def _filled(time: FloatArray, name: str, array: NDArray[Any], short: BoolArray) 
         values = make_sign_continuous(values)
     for channel in np.ndindex(*values.shape[1:]):
         column, of_channel = values[(slice(None), *channel)], short[(slice(None), *channel)]
-        for start, stop in _runs(~np.isnan(column) | of_channel):
+        for start, stop in runs(~np.isnan(column) | of_channel):
             gaps, since = of_channel[start:stop], time[start:stop] - time[start]
             if gaps.any():
                 column[start:stop][gaps] = CubicSpline(since[~gaps], column[start:stop][~gaps])(since[gaps])
@@ -155,6 +150,6 @@ def _held(flags: NDArray[Any], short: BoolArray) -> NDArray[Any]:
     """Flags (N, C), where they are missing those before."""
     out = flags.copy()
     for column, gaps in zip(out.T, short.T, strict=True):
-        for start, stop in _runs(gaps):
+        for start, stop in runs(gaps):
             column[start:stop] = column[start - 1]
     return out

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchid.logs import Log
+from torchid.logs.flags import runs
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.problem.contact_slip import base_velocity, contact_velocities
 from torchid.problem.samples import Samples
@@ -54,9 +55,8 @@ def keep_still(
 
 def _lasting(flags: BoolArray, shortest: int) -> BoolArray:
     """The flags (N,) without runs of fewer true ones."""
-    ends = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
     out = np.zeros_like(flags)
-    for start, stop in zip(ends[::2], ends[1::2], strict=True):
+    for start, stop in runs(flags):
         out[start:stop] = stop - start >= shortest
     return out
 
