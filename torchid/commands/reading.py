@@ -26,6 +26,7 @@ from torchid.problem import Samples, bind_log
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip
 from torchid.problem.standing import preprocess_standing
+from torchid.problem.welded_joints import without_welded_joints
 from torchid.sensing import SensorSet
 
 _WHOLE_GB = 4.0 * BLOCK_GB  # recorded arrays that are taken whole: no block is worth its neighbourhood
@@ -91,7 +92,7 @@ class LogReader:
         topics, columns = (None, None) if files is None else (files.topics, files.columns)
         allow_gaps, bridge_gaps_s = settings.exclude_condemned, settings.bridge_gaps_s
         read = read_log(path, topics, allow_gaps=allow_gaps, columns=columns, bridge_gaps_s=bridge_gaps_s)
-        recorded, certain = with_flags(read, self.scene)
+        recorded, certain = with_flags(without_welded_joints(read, self.scene.robot), self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         rates = settings.cutoff_hz, settings.sample_rate_hz
