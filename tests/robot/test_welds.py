@@ -27,9 +27,9 @@ def _arm(folder: Path) -> Path:
     """A base, an upper arm, a wrist between two moving joints, and a slide."""
     links = [link(name) for name in ("base", "upper", "wrist", "hand", "slide")]
     joints = [
-        joint("shoulder", "base", "upper", extra=TURNED),
+        joint("shoulder", "base", "upper", extra=TURNED + LIMITS),
         joint("roll", "upper", "wrist", extra=TURNED + LIMITS),
-        joint("pitch", "wrist", "hand", extra=TURNED),
+        joint("pitch", "wrist", "hand", extra=TURNED + LIMITS),
         joint("push", "wrist", "slide", "prismatic", TURNED + LIMITS),
     ]
     return write(folder, *links, *joints)
