@@ -39,6 +39,7 @@ from torchid.problem import Samples, bind_log
 from torchid.problem.base_motion import BaseMotion
 from torchid.problem.chunks import one_thread
 from torchid.problem.samples import oversampling, require_forces
+from torchid.problem.welded_joints import distances_from_welds, warn_of_moving_welds
 from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 
@@ -126,6 +127,7 @@ class LargeLog:
     def _course(self, blocks: LogBlocks, with_unloaded: bool) -> _Course:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
         first, settings = blocks.read(slice(0, min(len(blocks), MOST_SAMPLES))), self.settings
+        self._check_welds(blocks, first)
         rates = settings.cutoff_hz, settings.sample_rate_hz
         timeline = make_timeline(blocks.time, lacks_derivatives(first), *rates, self.sign_width)
         coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
@@ -135,6 +137,13 @@ class LargeLog:
         in_the_air = None if contacts is None or not with_unloaded else _in_the_air(contacts)
         noise = signal_noise(first, timeline, self.motion_noise)
         return _Course(blocks, timeline, coverage, time, kept, in_the_air, noise)
+
+    def _check_welds(self, blocks: LogBlocks, first: Log) -> None:
+        """Warn of joints that move though they are welded, which takes a pass over a log that has any."""
+        if self.robot.welded.keys().isdisjoint(first.joint_names):
+            return
+        logs = (blocks.read(piece, only=("joint_position",)) for piece in self._pieces(blocks, len(blocks)))
+        warn_of_moving_welds(first, self.robot, np.max([distances_from_welds(log, self.robot) for log in logs], axis=0))
 
     def _pieces(self, blocks: LogBlocks, count: int) -> Iterator[slice]:
         """The samples of a log, or of what becomes of them, in parts that fit into memory."""

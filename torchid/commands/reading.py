@@ -27,6 +27,7 @@ from torchid.problem import Samples, bind_log
 from torchid.problem.contact_detection import with_detected_contacts
 from torchid.problem.contact_slip import measure_slip
 from torchid.problem.standing import preprocess_standing
+from torchid.problem.welded_joints import without_welded_joints
 from torchid.problem.zeroing import zero_in_air
 from torchid.sensing import SensorSet
 
@@ -100,7 +101,7 @@ class LogReader:
             bridge_gaps_s=bridge_gaps_s,
             needs_flags=settings.needs_flags,
         )
-        recorded, certain = settle_contacts(read, self.scene)
+        recorded, certain = settle_contacts(without_welded_joints(read, self.scene.robot), self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
         rates, sign_width = (settings.cutoff_hz, settings.sample_rate_hz), self.scene.terms.sign_width

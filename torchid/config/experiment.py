@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
+from pydantic import BeforeValidator, FiniteFloat
 from pydantic.dataclasses import dataclass
 
 from torchid.config.analysis import AnalysisConfig
@@ -35,13 +37,28 @@ from torchid.logs.ros_topics import check_topics
 from torchid.settings import PositiveOrAuto
 
 
+def _at_zero(value: object) -> object:
+    """A list of names as a mapping to positions of 0."""
+    if isinstance(value, list) and value and all(isinstance(name, str) and name for name in value):
+        return dict.fromkeys(value, 0.0)
+    return value
+
+
+WELDS_ACCEPTED = "a list of joints or patterns, or a mapping to positions [rad or m]: {'*finger*': 0.3}"
+Welds = Annotated[dict[str, FiniteFloat], BeforeValidator(_at_zero)]
+
+
 @dataclass(config=STRICT, frozen=True)
 class RobotConfig:
-    """The robot; `base_link` defaults to the URDF's root."""
+    """The robot; `base_link` defaults to the URDF's root.
+
+    `weld`: names or patterns of joints that are held still, at 0 or at the position [rad or m] that a mapping gives.
+    """
 
     urdf: Path
     base_link: str | None = None
     fixed_base: bool = False
+    weld: Welds = dataclasses.field(default_factory=dict)
 
 
 @dataclass(config=STRICT, frozen=True)
@@ -116,6 +133,7 @@ _EXPERIMENT = FileKind(
     accepted={
         "contacts": "a list of mappings: [{frame: l_sole, type: flat}]",
         "contacts.*.frame": "the name of a frame in the URDF",
+        "robot.weld": WELDS_ACCEPTED,
         "sensors": CHOICE_ACCEPTED,
         **{f"{where}.contact_wrenches": WRENCHES_ACCEPTED for where in ("sensors", "analysis.compare.*")},
         **{f"{where}.contact_wrenches.*": COMPONENTS_ACCEPTED for where in ("sensors", "analysis.compare.*")},

@@ -203,7 +203,8 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         found = f"'{config.device}' is not available here"
         raise ConfigError.at_field("device", found, "cpu, cuda, cuda:0, ...") from error
     try:
-        robot = load_robot(config.robot.urdf, config.robot.base_link, config.robot.fixed_base, _ft_joints(config))
+        of = config.robot
+        robot = load_robot(of.urdf, of.base_link, of.fixed_base, _ft_joints(config), of.weld)
     except UnknownNameError as error:
         if error.field != FT_FIELD:
             raise
@@ -213,6 +214,7 @@ def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
         raise ConfigError.at_field("robot", "a bolted base without a joint, which never moves", "a robot that can move")
     if config.logs is not None:
         joints = [body.joint.name for body in robot.bodies if body.joint is not None]
+        joints += robot.welded
         require_joints(config.logs.topics, joints)
         if config.logs.columns is not None:
             require_names(config.logs.columns, {"joint": joints, "contact": robot.links})

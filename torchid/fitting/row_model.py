@@ -67,6 +67,8 @@ class RowModel:
             "actuators.sign_width": tree.sign_width,
             "columns": builder.width,
         }
+        if robot.welded:  # a factor of a robot without stays what it was
+            settings["robot.weld"] = [f"{name} at {position!r}" for name, position in robot.welded.items()]
         settings |= {f"preprocessing.{name}": value for name, value in preprocessing.items()}
         geometry = {
             "T_parent_joint": tree.T_parent_joint,

@@ -40,6 +40,7 @@ from torchid.logs.time_range import log_title
 from torchid.logs.timeline import DROPPED_SAMPLES, JITTER, REACH_PERIODS
 from torchid.problem import Samples
 from torchid.problem.standing import longest_standing
+from torchid.problem.welded_joints import without_welded_joints
 from torchid.robot import Robot
 from torchid.sensing import Contact
 
@@ -113,6 +114,7 @@ def check(
             of a log that has got flags from its torques. base_: motion of the base will follow from the feet that
             stand; forces are compared with the URDF in the longest stretch in which enough of them do.
     """
+    log = without_welded_joints(log, robot)
     contacts = [replace(contact, along_normal=False) for contact in contacts]  # wrenches are what is checked
     results: list[Finding | Skipped] = list(check_magnitudes(log))
     if (blocking := _blocking_finding(results)) is not None:

@@ -306,8 +306,8 @@ def _columns(x: np.ndarray, order: list[int]) -> np.ndarray:
 
 
 def joint_order(log: Log, robot: Robot) -> list[int]:
-    """Columns of the log's joints in the robot's order; InputError unless it has them all and no other."""
-    known = {body.joint.name for body in robot.bodies if body.joint is not None}
+    """Columns of a log's joints in the robot's order; InputError unless it has them all and else welded ones only."""
+    known = {body.joint.name for body in robot.bodies if body.joint is not None} | robot.welded.keys()
     for name in log.joint_names:
         if name not in known:
             raise UnknownNameError(log.source, "joint_names", name, robot.joint_names)

@@ -20,6 +20,7 @@ from torchid.robot import Robot
 from torchid.robot.urdf import parse_xml
 
 _MAX_NUMBER = 1e100  # products and squares stay within the range of float64
+_ROUNDING = 1e-12  # of a body's mass: below it the link that gives it its name has none
 
 
 def parameters_document(
@@ -158,7 +159,8 @@ def _check_number(path: Path, field: str, value: object) -> float:
 def identified_urdf(robot: Robot, phi: Array) -> bytes:
     """The URDF with parameters `phi`, (L, 12).
 
-    The inertia of a body is that of the link with its name; links welded to it have none. Mesh paths do not change.
+    The inertia of a body is that of the link with its name; links welded to it have none. Links beyond a joint that
+    the experiment welds keep the URDF's, and the rest of the body's is written. Mesh paths do not change.
 
     Warns:
         TorchidWarning: inconsistent bodies, or negative friction, which simulators (and `load_robot`) refuse.
@@ -166,15 +168,26 @@ def identified_urdf(robot: Robot, phi: Array) -> bytes:
     tree = parse_xml(robot.path)
     links = {link.get("name"): link for link in tree.getroot().findall("link")}
     joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
+    phi = _without_links_beyond_welds(robot, phi)
     _warn_if_inconsistent(robot, phi)
     for body, values in zip(robot.bodies, phi, strict=True):
         if body.joint is not None and body.joint.kind != "fixed":
             _set_friction(joints[body.joint.name], values)
         if not body.massless or values[parameters.INERTIAL].any():
-            for name in body.links:
+            for name in (link for link in body.links if link not in robot.links_beyond_welds):
                 _set_inertial(links[name], values if name == body.name and values[parameters.MASS] else None)
     etree.indent(tree)
     return etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+
+
+def _without_links_beyond_welds(robot: Robot, phi: Array) -> Array:
+    """Parameters (L, 12) of the bodies without what links beyond welded joints have in the URDF."""
+    rest = phi.copy()
+    for name, inertial in robot.links_beyond_welds.items():
+        rest[robot.links[name][0], parameters.INERTIAL] -= inertial
+    rounding = np.abs(rest[:, parameters.MASS]) <= _ROUNDING * np.abs(phi[:, parameters.MASS])
+    rest[rounding, parameters.INERTIAL] = 0.0
+    return rest
 
 
 def _warn_if_inconsistent(robot: Robot, phi: Array) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,10 +20,12 @@ from torchid.robot.tree import (
     build_chain,
     build_tree,
     joint_geometry,
+    link_parameters,
     link_poses,
     nominal_parameters,
 )
 from torchid.robot.urdf import read_urdf
+from torchid.robot.welds import links_beyond, weld_joints, weld_positions
 
 if TYPE_CHECKING:
     from pytorch_kinematics import Chain
@@ -45,7 +47,10 @@ class Robot:
     """A tree of L bodies in the URDF's depth-first order, moved by n independent joints.
 
     `nominal`, (L, 12), holds the URDF's parameters in the order of `torchid.parameters`. `links[name]` is the index of
-    the body that carries a URDF link and the link's pose in that body's link frame, (4, 4) [m].
+    the body that carries a URDF link and the link's pose in that body's link frame, (4, 4) [m]. `welded[name]` is the
+    position [rad or m] at which a joint of the URDF is held; `links_beyond_welds[name]`, (10,), are the URDF's inertial
+    parameters, in its body's link frame, of a link that such a joint carries.
+    `kind_of_welded` has such joints' types.
     """
 
     path: Path
@@ -55,6 +60,9 @@ class Robot:
     links: dict[str, tuple[int, Array]] = field(repr=False)
     nominal: Array = field(repr=False)
     chain: Chain = field(repr=False)
+    welded: dict[str, float] = field(default_factory=dict)
+    links_beyond_welds: dict[str, Array] = field(default_factory=dict, repr=False)
+    kind_of_welded: dict[str, str] = field(default_factory=dict, repr=False)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -167,7 +175,11 @@ class Robot:
 
 
 def load_robot(
-    path: str | Path, base_link: str | None = None, fixed_base: bool = False, ft_joints: Sequence[str] = ()
+    path: str | Path,
+    base_link: str | None = None,
+    fixed_base: bool = False,
+    ft_joints: Sequence[str] = (),
+    weld: Mapping[str, float] | Sequence[str] = (),
 ) -> Robot:
     """Read a URDF into a `Robot`.
 
@@ -176,9 +188,11 @@ def load_robot(
         base_link: the link that becomes the floating (or bolted) base, by default the root of the URDF.
         fixed_base: True if the base does not move.
         ft_joints: fixed joints with a force/torque sensor: the links beyond form a body of their own.
+        weld: names or patterns of joints that are held, at 0 or at the position [rad or m] that a mapping gives.
 
     Raises:
         UrdfError, UnknownNameError: see `read_urdf` and `build_tree`; also when no body has mass.
+        ConfigError: see `weld_positions`.
 
     Warns:
         MasslessBodyWarning: a body at the end of a limb has no inertia.
@@ -187,8 +201,11 @@ def load_robot(
     path = Path(path)
     with during("reading", path):
         links, joints = read_urdf(path)
-        tree = build_tree(path, links, joints, base_link, ft_joints)
-        nominal = nominal_parameters(path, tree, {link.name: link for link in links})
+    welded = weld_positions(path, joints, weld if isinstance(weld, Mapping) else dict.fromkeys(weld, 0.0))
+    with during("reading", path):
+        tree = build_tree(path, links, weld_joints(joints, welded), base_link, ft_joints)
+        by_name = {link.name: link for link in links}
+        nominal = nominal_parameters(path, tree, by_name)
         massless = ~np.any(nominal[:, parameters.INERTIAL], axis=1)
         if massless.all():
             raise UrdfError(path, "<inertial>", "no link has mass", "at least one link with mass > 0")
@@ -203,7 +220,12 @@ def load_robot(
             for index, (name, joint) in enumerate(zip(tree.names, tree.joints, strict=True))
         )
         _warn_of_massless_ends(path, bodies)
-        return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, build_chain(tree))
+        body_of = {name: body for name, (body, _) in tree.links.items()}
+        beyond = links_beyond(joints, welded, body_of, tree.names)
+        carried = {name: link_parameters(by_name[name], tree.links[name][1]) for name in beyond}
+        kinds = {joint.name: joint.type for joint in joints if joint.name in welded}
+        chain = build_chain(tree)
+        return Robot(path, tree.names[0], fixed_base, bodies, tree.links, nominal, chain, welded, carried, kinds)
 
 
 def _warn_of_massless_ends(path: Path, bodies: tuple[Body, ...]) -> None:

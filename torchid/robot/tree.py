@@ -87,7 +87,7 @@ def build_tree(
     if base_link not in names:
         raise UnknownNameError(path, "robot.base_link", base_link, names)
     _check_welds(path, names, joints, ft_joints)
-    mimics = _resolve_mimics(path, joints)
+    mimics = resolve_mimics(path, joints)
     locked = {name for name, mimic in mimics.items() if not mimic.master}
     neighbours: dict[str, list[tuple[Joint, bool]]] = {name: [] for name in names}
     for joint in joints:  # children before parents, each in the URDF's order
@@ -153,7 +153,7 @@ def _find_root(path: Path, links: list[Link], joints: list[Joint]) -> str:
     return roots[0]
 
 
-def _resolve_mimics(path: Path, joints: list[Joint]) -> dict[str, Mimic]:
+def resolve_mimics(path: Path, joints: Sequence[Joint]) -> dict[str, Mimic]:
     """Mimic relations of moving joints; a chain of them is composed into one relation to its independent joint."""
     by_name = {joint.name: joint for joint in joints}
     resolved = {}
@@ -191,7 +191,8 @@ def _start_body(tree: BodyTree, name: str, joint: BodyJoint | None) -> None:
     tree.joints.append(joint)
 
 
-def _origin(joint: Joint) -> Array:
+def joint_origin(joint: Joint) -> Array:
+    """Pose of a joint's frame in its parent link's, (4, 4) [m]."""
     return np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64)
 
 
@@ -209,8 +210,8 @@ def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None
         kind="fixed" if weld else "prismatic" if joint.type == "prismatic" else "revolute",
         parent=body,
         axis=-axis if reverse else axis,
-        T_parent_joint=T_body_near if reverse else T_body_near @ _origin(joint),
-        T_joint_link=_inverse(_origin(joint)) if reverse else np.eye(4),
+        T_parent_joint=T_body_near if reverse else T_body_near @ joint_origin(joint),
+        T_joint_link=_inverse(joint_origin(joint)) if reverse else np.eye(4),
         mimic=mimic,
         damping=joint.dynamics.damping if joint.dynamics else 0.0,
         friction=joint.dynamics.friction if joint.dynamics else 0.0,
@@ -219,13 +220,14 @@ def _body_joint(tree: BodyTree, joint: Joint, reverse: bool, mimic: Mimic | None
 
 def _locked_pose(joint: Joint, reverse: bool, mimics: dict[str, Mimic]) -> Array:
     """Pose of the next link in the previous one, seen from the base, across a joint that does not move."""
-    T_parent_child = _origin(joint)
+    T_parent_child = joint_origin(joint)
     if joint.name in mimics:
-        T_parent_child = T_parent_child @ _motion(joint, mimics[joint.name].offset)
+        T_parent_child = T_parent_child @ joint_motion(joint, mimics[joint.name].offset)
     return _inverse(T_parent_child) if reverse else T_parent_child
 
 
-def _motion(joint: Joint, position: float) -> Array:
+def joint_motion(joint: Joint, position: float) -> Array:
+    """Pose of the child link in a joint's frame at a position [rad or m], (4, 4)."""
     axis, T = joint.axis / np.linalg.norm(joint.axis), np.eye(4)
     if joint.type == "prismatic":
         T[:3, 3] = position * axis
@@ -246,13 +248,21 @@ def nominal_parameters(path: Path, tree: BodyTree, links: dict[str, Link]) -> Ar
         if inertial is None:
             continue
         _warn_if_unphysical(path, name, inertial)
-        T_link_com = np.eye(4) if inertial.origin is None else inertial.origin
-        at_com = parameters.inertial_vector(inertial.mass, np.zeros(3), inertial.inertia)
-        nominal[body, parameters.INERTIAL] += parameters.change_of_frame(T_body_link @ T_link_com) @ at_com
+        nominal[body, parameters.INERTIAL] += link_parameters(links[name], T_body_link)
     for body, joint in enumerate(tree.joints):
         if joint is not None:
             nominal[body, parameters.FRICTION] = joint.friction, joint.damping
     return nominal
+
+
+def link_parameters(link: Link, T_body_link: Array) -> Array:
+    """Inertial parameters (10,) of a link in the frame of its body."""
+    inertial = link.inertial
+    if inertial is None:
+        return np.zeros(parameters.INERTIAL.stop)
+    T_link_com = np.eye(4) if inertial.origin is None else inertial.origin
+    at_com = parameters.inertial_vector(inertial.mass, np.zeros(3), inertial.inertia)
+    return parameters.change_of_frame(T_body_link @ T_link_com) @ at_com
 
 
 def _warn_if_unphysical(path: Path, link: str, inertial: Inertial) -> None:

@@ -191,6 +191,26 @@ def _check_link(path: Path, link: etree._Element) -> None:
         raise UrdfError(path, field, f"no {', '.join(missing)}", "all six numbers of <inertia> [kg m^2]")
 
 
+def position_limits(path: Path) -> dict[str, tuple[float, float]]:
+    """Lowest and highest position [rad or m] of the joints that have limits, by name.
+
+    Raises:
+        UrdfError: a limit is no decimal number.
+    """
+    limits = {}
+    for joint in parse_xml(path).getroot().findall("joint"):
+        limit = joint.find("limit")
+        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        low, high = (str(limit.get(name, "0")).strip() for name in ("lower", "upper"))
+        if not (_DECIMAL.fullmatch(low) and _DECIMAL.fullmatch(high)):
+            found = f"'{excerpt(low)}' to '{excerpt(high)}'"
+            raise UrdfError(path, f"joint '{joint.get('name')}', <limit>", found, "decimal numbers")
+        if float(low) < float(high):
+            limits[str(joint.get("name"))] = (float(low), float(high))
+    return limits
+
+
 def _check_values(path: Path, links: list[Link], joints: list[Joint]) -> None:
     """Refuse negative masses and friction, and axes that are zero."""
     for link in links:

@@ -1,0 +1,126 @@
+"""Joints that an experiment holds at a position: they become fixed before the tree of bodies is built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+from yourdfpy.urdf import Joint
+
+from torchid.errors import ConfigError, UnknownNameError
+from torchid.robot.tree import joint_motion, joint_origin, resolve_mimics
+from torchid.robot.urdf import MOVING_TYPES, position_limits
+
+WELD_FIELD = "robot.weld"
+
+_ROUNDING = 1e-6  # [rad or m] by which a position may exceed a limit: URDFs carry few digits
+
+
+def weld_positions(path: Path, joints: Sequence[Joint], weld: Mapping[str, float]) -> dict[str, float]:
+    """Position [rad or m] of every joint that is welded, by name, in the URDF's order.
+
+    Args:
+        path: the URDF.
+        joints: its joints.
+        weld: position by name or pattern of joints. Joints that mimic a welded one follow it.
+
+    Raises:
+        UnknownNameError: a name that no joint has.
+        ConfigError: a pattern that matches no joint that moves, two positions for one joint, a position outside of the
+            joint's limits, a mimic joint whose master moves, or no joint left that moves.
+    """
+    if not weld:
+        return {}
+    moving = {joint.name: joint for joint in joints if joint.type in MOVING_TYPES}
+    stated = _stated(joints, moving, weld)
+    mimics = {name: mimic for name, mimic in resolve_mimics(path, joints).items() if mimic.master}
+    for name, (key, _) in stated.items():
+        if name in mimics and mimics[name].master not in stated:
+            found = f"joint '{name}', which follows '{mimics[name].master}', which moves"
+            raise ConfigError.at_field(_field(key), found, "its master too")
+    limits = position_limits(path)
+    for name, (key, position) in stated.items():
+        low, high = limits.get(name, (-np.inf, np.inf))
+        if name not in mimics and not low - _ROUNDING <= position <= high + _ROUNDING:
+            found = f"{position:g}, outside of the limits of joint '{name}'"
+            accepted = f"a position from {low:g} to {high:g}: weld: {{'{name}': {(low + high) / 2:.4g}}}"
+            raise ConfigError.at_field(_field(key), found, accepted)
+    welded = {}
+    for name in moving:
+        mimic = mimics.get(name)
+        if mimic is None and name in stated:
+            welded[name] = stated[name][1]
+        elif mimic is not None and mimic.master in stated:
+            welded[name] = mimic.multiplier * stated[mimic.master][1] + mimic.offset
+    if len(welded) == len(moving):
+        raise ConfigError.at_field(WELD_FIELD, "every joint that moves", "patterns that leave a joint")
+    return welded
+
+
+def _stated(
+    joints: Sequence[Joint], moving: Mapping[str, Joint], weld: Mapping[str, float]
+) -> dict[str, tuple[str, float]]:
+    """Name or pattern and position by name of joint."""
+    names, stated = [joint.name for joint in joints], dict[str, tuple[str, float]]()
+    for key, position in weld.items():
+        pattern = any(sign in key for sign in "*?")
+        matches = [name for name in moving if (fnmatchcase(name, key) if pattern else name == key)]
+        if not matches and pattern:
+            raise ConfigError.at_field(WELD_FIELD, f"'{key}' matches no joint that moves", f"among {_first(moving)}")
+        if not matches:
+            raise UnknownNameError.at_field(WELD_FIELD, key, moving, "a fixed joint" if key in names else "")
+        for name in matches:
+            other, before = stated.setdefault(name, (key, position))
+            if before != position:
+                found = f"{position:g} for joint '{name}', which '{other}' holds at {before:g}"
+                raise ConfigError.at_field(_field(key), found, "one position for a joint")
+    return stated
+
+
+def _field(key: str) -> str:
+    return f"{WELD_FIELD}.{key}"
+
+
+def _first(names: Iterable[str], most: int = 6) -> str:
+    names = list(names)
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
+
+
+def weld_joints(joints: Sequence[Joint], positions: Mapping[str, float]) -> list[Joint]:
+    """The joints, those with a position fixed there."""
+    return [
+        replace(
+            joint, type="fixed", mimic=None, origin=joint_origin(joint) @ joint_motion(joint, positions[joint.name])
+        )
+        if joint.name in positions
+        else joint
+        for joint in joints
+    ]
+
+
+def links_beyond(
+    joints: Sequence[Joint], welded: Iterable[str], body_of: Mapping[str, int], heads: Sequence[str]
+) -> list[str]:
+    """Links that a welded joint separates from the link that gives their body its name.
+
+    Args:
+        joints: of the URDF.
+        welded: names of those that are welded.
+        body_of: number of the body of each link.
+        heads: names of the bodies.
+    """
+    welded = set(welded)
+    near, reached = dict[str, list[str]](), set(heads)
+    for joint in joints:
+        if joint.name not in welded and body_of[joint.parent] == body_of[joint.child]:
+            near.setdefault(joint.parent, []).append(joint.child)
+            near.setdefault(joint.child, []).append(joint.parent)
+    queue = list(heads)
+    while queue:
+        new = [name for name in near.get(queue.pop(), []) if name not in reached]
+        reached.update(new)
+        queue += new
+    return [name for name in body_of if name not in reached]
