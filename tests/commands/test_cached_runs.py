@@ -141,6 +141,7 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
     [
         "robot.fixed_base=true",
         "robot.base_link=front_left_hip_link",
+        "robot.weld=[front_left_hip]",
         "contacts.0.type=flat",
         "contacts.0={type: line, line_axis: x}",
         "contacts.0={type: point, radius: 0.02}",
@@ -150,7 +151,7 @@ def test_every_key_of_preprocessing_that_changes_samples_changes_their_name(demo
     ],
 )
 def test_robot_contacts_and_topics_change_the_name_of_samples(demo: Path, tmp_path: Path, other: str) -> None:
-    assert {x.name for x in fields(RobotConfig)} == {"urdf", "base_link", "fixed_base"}
+    assert {x.name for x in fields(RobotConfig)} == {"urdf", "base_link", "fixed_base", "weld"}
     assert {x.name for x in fields(ContactConfig)} == {"frame", "type", "line_axis", "radius", "normal"}
     document = yaml.safe_load(demo.read_text())
     key, _, value = other.partition("=")
@@ -163,8 +164,7 @@ def test_robot_contacts_and_topics_change_the_name_of_samples(demo: Path, tmp_pa
     shutil.copytree(demo.parent, tmp_path / "demo")
     file = tmp_path / "demo" / "other.yaml"
     file.write_text(yaml.safe_dump(document))
-    base = content(demo)
-    assert content(file, *([other] if key else [])) != base
+    assert content(file, *([other] if key else [])) != content(demo)
 
 
 def test_the_urdf_and_the_code_change_the_name_of_samples(

@@ -17,7 +17,7 @@ from torchid.estimators import Sgd, Trainer
 from torchid.estimators.optimizers import make_optimizer, make_schedule, optimizer_names, schedule_names, step_schedule
 
 REFUSED = {"SparseAdam", "Muon"}  # the latter since torch 2.9
-EPOCHS_OF = {"LBFGS": 3, "ASGD": 25, "Rprop": 40}
+EPOCHS_OF = {"LBFGS": 3, "ASGD": 40, "Rprop": 40}
 SCHEDULES: dict[str, dict[str, Any]] = {
     "ConstantLR": {"total_iters": 3},
     "CosineAnnealingLR": {},
