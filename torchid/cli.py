@@ -231,7 +231,7 @@ def _print_fit(run: Identification) -> None:
         print(fill(f"motion noise  {run.motion_noise}", 100, subsequent_indent=" " * 14))
     if run.validation is not None:
         _print_validation(run.validation)
-    for name, choice in (("ridge", run.ridge), ("sign width", run.sign_width)):
+    for name, choice in (("cutoff", run.cutoff), ("ridge", run.ridge), ("sign width", run.sign_width)):
         if choice is not None:
             print(fill(f"{name:14}{choice}", 100, subsequent_indent=" " * 14))
     least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())

@@ -120,7 +120,7 @@ class Reproduction:
 
         def samples(name: str, of: Condition) -> Samples:
             log = sensor_log(exact[name], of.sensors, self.study.simulation.seed + number, name)
-            log = preprocess(log, self._filter.cutoff_hz, self._filter.sample_rate_hz)
+            log = preprocess(log, self._filter.filter_hz, self._filter.sample_rate_hz)
             return bind_log(log, self._robot, self._contacts)
 
         groups: dict[str, list[Samples]] = {"squats": [], "others": []}

@@ -85,7 +85,7 @@ def check_experiment(path: str | Path, overrides: Sequence[str] = ()) -> list[Ch
         for file in bars.track(files, description="checking"):
             settings = config.preprocessing
             log, _ = settle_contacts(read_log_to_check(file, config.logs, settings), scene)
-            found = check(log, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
+            found = check(log, scene.robot, scene.contacts, settings.filter_hz, settings.derived)
             checked.append(replace(found, rolling=scene.rolling))
     return checked
 
@@ -147,6 +147,11 @@ def stretches_to_check(path: Path, logs: LogsConfig, settings: PreprocessingConf
         LogError: as `read_log_to_check`.
     """
     _require_memory(path, settings)
+    yield from recorded_stretches(path, logs, settings)
+
+
+def recorded_stretches(path: Path, logs: LogsConfig, settings: PreprocessingConfig) -> Iterator[tuple[Log, str]]:
+    """As `stretches_to_check`, of a log of any size."""
     whole = settings.bridge_gaps_s is not None or not settings.needs_flags
     if whole or existing_log_kind(path) in (LogKind.BAG, LogKind.JOINED):
         log = _read_with_gaps(path, logs, settings)

@@ -13,6 +13,7 @@ from rich.progress import Progress
 from torchid import ranks
 from torchid.commands.cached_factors import cached_parts, factors_key
 from torchid.commands.cached_reading import CachedReader, open_reader
+from torchid.commands.chosen_cutoff import with_cutoff
 from torchid.commands.chosen_sign_width import with_sign_width
 from torchid.commands.clock import Clock
 from torchid.commands.folder import RUN, check_free, claim_folder
@@ -36,6 +37,7 @@ from torchid.fitting.sign_width import SignWidthChoice
 from torchid.identifiability.base_parameters import StateReport, require_base, state_reports
 from torchid.identifiability.confounding import TotalMass
 from torchid.identifiability.contributions import Contributions, contributions
+from torchid.logs.cutoff import CutoffChoice
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, LinearProblem, Metrics, RowBuilder, Samples
 from torchid.problem.compressed_log import Block, fold_compressed, merge_blocks
@@ -89,6 +91,7 @@ class _Data:
     blocks: Sequence[Block]
     parts: list[Part]
     reused: list[str]
+    cutoff: CutoffChoice | None
     sign_width: SignWidthChoice | None
 
 
@@ -116,6 +119,8 @@ def _prepare(config: ExperimentConfig, clock: Clock, bars: Progress) -> _Prepare
 
 def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
     """The logs of an experiment, read and compressed."""
+    with clock("cutoff"):
+        experiment, cutoff = with_cutoff(experiment, bars)
     with clock("sign width"):
         experiment, width = with_sign_width(experiment, bars)
     with clock("read"):
@@ -131,7 +136,7 @@ def _data_of_logs(experiment: Experiment, clock: Clock, bars: Progress) -> _Data
         blocks = split_into_folds(logs["train"], builder)
         parts, there = _compressed(experiment, reader, builder, blocks, bars)
     reused = [*_reused(reader), *(["factors"] if there else [])]
-    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, width)
+    return _Data(experiment, logs, [], reader.excluded, states, noise, builder, blocks, parts, reused, cutoff, width)
 
 
 def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _Data:
@@ -147,7 +152,7 @@ def _data_of_factors(experiment: Experiment, clock: Clock, bars: Progress) -> _D
         blocks = fold_compressed([one.log for one in fleet.files], builder)
         parts = merge_blocks(blocks, builder)
     excluded = {one.log.source: one.excluded for one in fleet.files if one.excluded}
-    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), None)
+    same = (fleet.states, fleet.noise, builder, blocks, parts, _reused(reader), None, None)
     return _Data(fleet.experiment, logs, fleet.files, excluded, *same)
 
 
@@ -222,6 +227,7 @@ def _identify(config: ExperimentConfig, resume: bool) -> Identification:
             mass=solved.mass,
             validation=scores.validation,
             ridge=ready.ridge,
+            cutoff=ready.cutoff,
             sign_width=ready.sign_width,
             reused=ready.reused,
         )

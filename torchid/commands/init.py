@@ -300,9 +300,8 @@ def _text(
             note = proposal.notes.get(key, "")
             lines += [f"    # guessed: {note}"] if note else []
             lines += [f"    {line}" for line in _entry(key, value)]
-    if from_feet:
-        lines.append("# nobody recorded these; add cutoff_hz, above the motion and below the noise")
-        lines += _entry("preprocessing", from_feet)
+    lines += [f"# {' and '.join(from_feet)}: nobody recorded them"] if from_feet else []
+    lines += _entry("preprocessing", {"cutoff_hz": "auto"} | from_feet)
     lines += _entry("sensors", _sensors(fields))
     lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
     lines += _entry("output", f"runs/{output.stem}")

@@ -128,7 +128,7 @@ class LargeLog:
         """What of a log must be known before its blocks can be worked on, which takes a pass or two over it."""
         first, settings = blocks.read(slice(0, min(len(blocks), MOST_SAMPLES))), self.settings
         self._check_welds(blocks, first)
-        rates = settings.cutoff_hz, settings.sample_rate_hz
+        rates = settings.filter_hz, settings.sample_rate_hz
         timeline = make_timeline(blocks.time, lacks_derivatives(first), *rates, self.sign_width)
         coverage = {} if timeline is None else self._coverage(blocks, first, timeline)
         time = blocks.time if timeline is None else blocks.time[0] + timeline.output_stamps

@@ -210,7 +210,7 @@ def _findings(scene: Scene) -> Iterator[tuple[str, Finding]]:
         with suppress(InputError):  # larger than memory: it is not checked
             for log, name in stretches_to_check(path, files, settings):
                 flagged, _ = settle_contacts(log, scene)
-                checked = check(flagged, scene.robot, scene.contacts, settings.cutoff_hz, settings.derived)
+                checked = check(flagged, scene.robot, scene.contacts, settings.filter_hz, settings.derived)
                 severe = (one for one in checked.findings if one.severity in SEVERITIES[:2])
                 findings += [(name, one) for one in severe if one.mask(len(checked.log)).mean() > _PART]
                 if any(one.condemns_all for _, one in findings):

@@ -12,7 +12,7 @@ import torch
 from torchid import ranks
 from torchid.commands.large_log import BLOCK_GB, LargeLog
 from torchid.config.logs import require_apart
-from torchid.errors import LogError, warn
+from torchid.errors import ConfigError, LogError, warn
 from torchid.fitting.experiment import Scene
 from torchid.log_checks import Checked, drop_condemned
 from torchid.log_checks.check import check
@@ -46,7 +46,13 @@ class LogReader:
     """
 
     def __init__(self, scene: Scene, folder: Path | None = None) -> None:
-        """Nothing is read yet; without a `folder` it is the one that the output of the scene goes to."""
+        """Nothing is read yet; without a `folder` it is the one that the output of the scene goes to.
+
+        Raises:
+            ConfigError: settings that leave the cutoff to the logs, and nobody has chosen it.
+        """
+        if scene.config.preprocessing.cutoff_hz == "auto":
+            raise ConfigError.at_field("preprocessing.cutoff_hz", "auto, not yet chosen", "a number [Hz] or null")
         self.scene = scene
         self.folder = _folder_beside(scene.config.output) if folder is None else folder
         self.excluded: dict[str, int] = {}
@@ -104,7 +110,7 @@ class LogReader:
         recorded, certain = settle_contacts(without_welded_joints(read, self.scene.robot), self.scene)
         checked = self._checked(recorded)
         clean = recorded if checked is None else checked.repaired
-        rates, sign_width = (settings.cutoff_hz, settings.sample_rate_hz), self.scene.terms.sign_width
+        rates, sign_width = (settings.filter_hz, settings.sample_rate_hz), self.scene.terms.sign_width
         if settings.base_motion is None:
             log = preprocess(clean, *rates, self._stated, sign_width)
         else:
@@ -115,7 +121,7 @@ class LogReader:
             samples = replace(samples, unloaded=None)
         if checked is not None:
             count = len(samples)
-            samples = drop_condemned(samples, checked, settings.cutoff_hz, derived=log is not clean)
+            samples = drop_condemned(samples, checked, settings.filter_hz, derived=log is not clean)
             self.excluded[str(path)] = count - len(samples)
         kept = None if slip is None else np.isin(samples.time.numpy(), slip, invert=True)
         if settings.margin_s is not None:
@@ -151,7 +157,7 @@ class LogReader:
             scene.robot,
             scene.contacts,
             limit,
-            settings.cutoff_hz,
+            settings.filter_hz,
             settings.base_motion is not None,
         )
         slipping = slip.slips.any(axis=1)
@@ -225,7 +231,7 @@ class LogReader:
         settings = self.scene.config.preprocessing
         if not settings.exclude_condemned:
             return None
-        return check(log, self.scene.robot, self.scene.contacts, settings.cutoff_hz, settings.derived)
+        return check(log, self.scene.robot, self.scene.contacts, settings.filter_hz, settings.derived)
 
 
 def settle_contacts(log: Log, scene: Scene) -> tuple[Log, BoolArray]:

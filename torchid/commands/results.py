@@ -26,6 +26,7 @@ from torchid.fitting.sign_width import SignWidthChoice
 from torchid.identifiability.base_parameters import StateReport
 from torchid.identifiability.confounding import ExtraEstimate, TotalMass
 from torchid.identifiability.contributions import Contributions
+from torchid.logs.cutoff import CutoffChoice
 from torchid.logs.time_range import log_title
 from torchid.parameters import PER_BODY, Array
 from torchid.problem import Evaluation, Metrics, Samples
@@ -80,6 +81,7 @@ class Identification:
         mass: the total mass and how well it is known.
         validation: errors on held-out blocks, None where the samples are too few to leave some out.
         ridge: how it was chosen, if it was.
+        cutoff: likewise.
         sign_width: likewise.
         reused: what an earlier run has left in the cache, in words.
     """
@@ -104,6 +106,7 @@ class Identification:
     mass: TotalMass
     validation: CrossValidation | None
     ridge: RidgeChoice | None
+    cutoff: CutoffChoice | None
     sign_width: SignWidthChoice | None
     reused: Sequence[str] = ()
 
@@ -235,6 +238,7 @@ def metrics_document(run: Identification) -> dict[str, object]:
         "solution": _solution_document(estimate),
         "cross_validation": _validation_document(run),
         "ridge_selection": None if run.ridge is None else asdict(run.ridge),
+        "cutoff_selection": None if run.cutoff is None else asdict(run.cutoff),
         "sign_width_selection": None if run.sign_width is None else asdict(run.sign_width),
         "worse_than_nominal": [asdict(one) for one in run.worse],
         "verdict": describe_worse(run.worse),
@@ -346,7 +350,7 @@ def _hyperparameters(config: ExperimentConfig) -> dict[str, str | float | bool]:
         "estimator": estimator.name,
         "ridge": estimator.numeric_ridge,
         "friction": estimator.friction,
-        "cutoff_hz": config.preprocessing.cutoff_hz or 0.0,
+        "cutoff_hz": config.preprocessing.filter_hz or 0.0,
         "margin": 0.0 if estimator.name == "least_squares" else estimator.margin,
         "prior": estimator.prior,
         "consistency": estimator.consistency if descent else estimator.name,

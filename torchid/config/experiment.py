@@ -261,6 +261,7 @@ def _check_factors(config: _Common, logs: LogsConfig) -> None:
     unfit = (
         ("estimator.name", "sgd", config.estimator.name == "sgd", "least_squares or consistent"),
         ("estimator.robust", "set", config.estimator.robust is not None, "null"),
+        ("preprocessing.cutoff_hz", "auto", config.preprocessing.cutoff_hz == "auto", "that which they were made with"),
         ("actuators.sign_width", "auto", config.actuators.sign_width == "auto", "the width that they were made with"),
         (
             "preprocessing.exclude_condemned",

@@ -29,6 +29,7 @@ def _threshold(value: object) -> object:
 class PreprocessingConfig:
     """Zero-phase low-pass [Hz] and resampling [Hz]; None leaves the signals as they are.
 
+    `cutoff_hz`: auto, the one beyond which derived accelerations of the training logs are more noise than motion.
     `bridge_gaps_s`: gaps (NaN) of at most so long [s] are filled before anything else is done; None leaves them.
     `contact_margin_s`: samples that are dropped before and after each change of contact [s], None for none.
     `detect_contacts`: true, or its settings, for contact flags from joint torques (`DetectionConfig`) in the place of
@@ -43,7 +44,7 @@ class PreprocessingConfig:
     `cache_gb`: room [GB] for samples and factors that later runs of `identify` find beside the output; 0 for none.
     """
 
-    cutoff_hz: Positive | None = None
+    cutoff_hz: PositiveOrAuto = None
     sample_rate_hz: Positive | None = None
     bridge_gaps_s: Positive | None = None
     contact_margin_s: NotNegative | None = None
@@ -55,6 +56,11 @@ class PreprocessingConfig:
     exclude_condemned: bool = False
     memory_gb: Positive = 2.0
     cache_gb: NotNegative = 2.0
+
+    @property
+    def filter_hz(self) -> float | None:
+        """The cutoff as a number [Hz], None where there is no filter, or it has not been chosen."""
+        return None if isinstance(self.cutoff_hz, str) else self.cutoff_hz
 
     @property
     def margin_s(self) -> float | None:

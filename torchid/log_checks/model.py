@@ -13,6 +13,7 @@ import torch
 from torchid.errors import TorchidWarning
 from torchid.log_checks.findings import median_step
 from torchid.logs import Log
+from torchid.logs.cutoff import usual_cutoff_hz
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import preprocess
 from torchid.problem import RowBuilder, Samples, bind_log
@@ -26,8 +27,6 @@ MAX_DIFFERENTIATED_SAMPLES, PIECES = 40000, 4
 MAX_TRIAL_DIFFERENTIATED_SAMPLES = 10000
 #: Evenly spread samples that are compared with the model; fewer where many corrected logs are tried.
 COMPARED_SAMPLES, TRIAL_SAMPLES = 800, 150
-#: Default cutoff (robots move below 5 Hz), and its largest share of the sample rate.
-DEFAULT_CUTOFF_HZ, _MAX_CUTOFF_RATE_SHARE = 10.0, 0.2
 #: Independent part of a torque in the projected forces, over the residual, from which on its gain is determined.
 MIN_SIGNAL_RATIO = 1.0
 #: The same in a joint's row, where contact wrenches are known or there are none: a correlation of 0.9.
@@ -109,7 +108,7 @@ def _implausible_gains(gain: FloatArray, determined: BoolArray) -> BoolArray:
 
 def default_cutoff_hz(log: Log) -> float:
     """The cutoff [Hz] where the user gives none."""
-    return min(DEFAULT_CUTOFF_HZ, _MAX_CUTOFF_RATE_SHARE / median_step(log))
+    return usual_cutoff_hz(1.0 / median_step(log))
 
 
 def preprocess_pieces(log: Log, cutoff_hz: float, max_samples: int = MAX_DIFFERENTIATED_SAMPLES) -> list[Log]:

@@ -1,0 +1,78 @@
+"""`preprocessing.cutoff_hz: auto` through the commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from refusals import refusal, refused
+from repository import DEMO
+
+from torchid.cli import main
+from torchid.commands.reading import LogReader
+from torchid.config import load_config
+from torchid.errors import ConfigError
+from torchid.fitting.experiment import set_up
+
+AUTO = ["preprocessing={cutoff_hz: auto, cache_gb: 0}", "sensors.noise={joint_position: 1e-4}"]
+FILE = str(DEMO / "quadruped.yaml")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("runs") / "run"
+    assert main(["identify", FILE, *AUTO, f"output={output}"]) == 0
+    return output
+
+
+def test_a_run_keeps_the_cutoff_for_logs_that_come_later(run: Path) -> None:
+    choice = json.loads((run / "metrics.json").read_text())["cutoff_selection"]
+    assert choice["by_noise"]
+    assert 3.0 < choice["cutoff_hz"] < 20.0
+    assert load_config(run / "config.yaml").preprocessing.cutoff_hz == choice["cutoff_hz"]
+    assert main(["evaluate", str(run), "--log", str(DEMO / "sway_test.npz")]) == 0
+
+
+def test_a_run_with_that_number_gives_the_same_parameters(run: Path, tmp_path: Path) -> None:
+    number = load_config(run / "config.yaml").preprocessing.cutoff_hz
+    settings = [*AUTO, f"preprocessing.cutoff_hz={number}", f"output={tmp_path / 'run'}"]
+    assert main(["identify", FILE, *settings]) == 0
+    found = [json.loads((folder / "parameters.json").read_text()) for folder in (run, tmp_path / "run")]
+    assert found[0] == found[1]
+
+
+def test_a_log_larger_than_memory_gives_the_same_cutoff(run: Path, tmp_path: Path) -> None:
+    settings = [*AUTO, "preprocessing.memory_gb=1e-6", f"output={tmp_path / 'run'}"]
+    assert main(["identify", FILE, *settings]) == 0
+    chosen = [load_config(folder / "config.yaml").preprocessing.cutoff_hz for folder in (run, tmp_path / "run")]
+    assert chosen[0] == chosen[1]
+
+
+def test_factors_are_made_with_a_number_and_fitted_without_auto(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compress", FILE, *AUTO, "--output", str(tmp_path / "factors")]) == 0
+    number = load_config(run / "config.yaml").preprocessing.cutoff_hz
+    settings = [f"logs.train=[{tmp_path / 'factors' / '*.factor'}]", f"output={tmp_path / 'run'}"]
+    capsys.readouterr()
+    text = refusal(["identify", FILE, *AUTO, *settings], tmp_path, capsys)
+    assert "preprocessing.cutoff_hz: auto, but logs.train names factors" in text
+    assert main(["identify", FILE, *AUTO, *settings, f"preprocessing.cutoff_hz={number}"]) == 0
+
+
+def test_logs_are_checked_before_a_cutoff_is_chosen_and_analyzed_with_it(tmp_path: Path) -> None:
+    assert main(["check", FILE, *AUTO]) == 0
+    assert main(["analyze", FILE, *AUTO, f"output={tmp_path / 'run'}"]) == 0
+    (written,) = tmp_path.rglob("config.yaml")
+    assert "auto" not in written.read_text().split("cutoff_hz:")[1].split("\n")[0]
+
+
+def test_no_log_is_read_while_nobody_has_chosen() -> None:
+    scene = set_up(load_config(FILE, AUTO))
+    assert "auto, not yet chosen" in refused(lambda: LogReader(scene), "preprocessing.cutoff_hz", ConfigError)
+
+
+def test_other_words_are_refused() -> None:
+    text = refused(lambda: load_config(FILE, ["preprocessing.cutoff_hz=automatic"]), FILE, ConfigError)
+    assert text.endswith("preprocessing.cutoff_hz: found 'automatic'; accepted: auto, null, or a number greater than 0")

@@ -1,0 +1,133 @@
+"""The cutoff that the noise of a motion asks for."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from motions import value
+from scipy.signal import butter, sosfilt
+from scipy.spatial.transform import Rotation
+
+from torchid.errors import TorchidWarning
+from torchid.logs import Log
+from torchid.logs.cutoff import choose_cutoff
+from torchid.logs.log import FloatArray
+from torchid.logs.preprocess import preprocess
+
+RATE, COUNT = 500.0, 15_000
+TIME = 7.0 + np.arange(COUNT) / RATE
+
+
+def wander(width: int, hertz: float, seed: int) -> FloatArray:
+    """Random motion of some channels whose spectrum falls steeply beyond a frequency."""
+    white = np.random.default_rng(seed).normal(size=(COUNT + 2000, width))
+    smooth = sosfilt(butter(3, hertz, fs=RATE, output="sos"), white, axis=0)[2000:]
+    return np.asarray(smooth / smooth.std(axis=0))
+
+
+def noise(width: int, std: float) -> FloatArray:
+    return std * np.random.default_rng(99).normal(size=(COUNT, width))
+
+
+def encoders(hertz: float, std: float) -> tuple[Log, Log]:
+    """Joint positions as they are, and as encoders with noise read them."""
+    clean = 0.3 * wander(3, hertz, 0)
+    log = Log("wander.npz", TIME, ("a", "b", "c"), clean)
+    return log, replace(log, joint_position=clean + noise(3, std))
+
+
+def turning(hertz: float, std: float, rates: bool) -> tuple[Log, Log]:
+    """A body without joints that turns about all axes: its orientation, or the readings of its gyroscope too."""
+    turn = Rotation.from_rotvec(0.4 * wander(3, hertz, 1))
+    log = Log("turn.npz", TIME, (), np.empty((COUNT, 0)), base_quat_xyzw=turn.as_quat())
+    if not rates:
+        return log, replace(log, base_quat_xyzw=(turn * Rotation.from_rotvec(noise(3, std))).as_quat())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        angular = preprocess(log).base_angular_velocity_base
+    inner = slice(2, -2)
+    log = replace(log.select(inner), base_angular_velocity_base=value(angular))
+    return log, replace(log, base_angular_velocity_base=value(angular) + noise(3, std)[inner])
+
+
+def error(clean: Log, noisy: Log, field: str, cutoff: float) -> float:
+    """Mean square error of derived accelerations."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchidWarning)
+        found, exact = (preprocess(log, hertz) for log, hertz in ((noisy, cutoff), (clean, None)))
+    near = np.searchsorted(exact.time, found.time + 1e-9) - 1
+    difference = value(getattr(found, field)) - value(getattr(exact, field))[near]
+    return float(np.square(difference).sum(axis=1).mean())
+
+
+@pytest.mark.parametrize("hertz", [1.0, 4.0])
+@pytest.mark.parametrize("source", ["joints", "orientation", "gyroscope"])
+def test_derived_accelerations_are_as_near_to_the_true_ones_as_any_cutoff_makes_them(hertz: float, source: str) -> None:
+    if source == "joints":
+        (clean, noisy), field = encoders(hertz, 1e-3), "joint_acceleration"
+    else:
+        rates = source == "gyroscope"
+        (clean, noisy), field = turning(hertz, 0.15 if rates else 1e-3, rates), "base_angular_acceleration_base"
+    choice = choose_cutoff([noisy])
+    assert choice.by_noise
+    assert "more noise than motion" in str(choice)
+    chosen = choice.cutoff_hz
+    assert chosen is not None
+    errors = {cutoff: error(clean, noisy, field, cutoff) for cutoff in chosen * np.geomspace(0.3, 3.0, 11)}
+    assert error(clean, noisy, field, chosen) < 1.15 * min(errors.values())
+    assert min(errors.values()) < 0.5 * max(errors.values()), "it matters"
+
+
+def test_more_noise_asks_for_a_lower_cutoff_and_none_for_the_usual_one() -> None:
+    clean, noisy = encoders(3.0, 1e-3)
+    found = choose_cutoff([noisy]).cutoff_hz
+    stated = [choose_cutoff([noisy], {"joint_position": std}).cutoff_hz for std in (1e-2, 1e-3, 1e-4)]
+    assert stated == sorted(stated, key=lambda x: x or 0.0)
+    assert stated[0] != stated[1] != stated[2]
+    assert found == pytest.approx(stated[1], rel=0.06)
+    none = choose_cutoff([clean])
+    assert (none.cutoff_hz, none.by_noise) == (10.0, False)
+    assert "usual" in str(none)
+    assert choose_cutoff([noisy], {"joint_position": 0.0}) == none
+    assert choose_cutoff([clean], sample_rate_hz=25.0).cutoff_hz == 5.0
+
+
+def test_logs_count_together_by_their_length() -> None:
+    quiet, loud = encoders(3.0, 1e-4)[1], encoders(3.0, 3e-3)[1]
+    low, high = choose_cutoff([loud]).cutoff_hz, choose_cutoff([quiet]).cutoff_hz
+    assert low is not None
+    assert high is not None
+    assert 1.5 * low < high
+    together = choose_cutoff([quiet, loud]).cutoff_hz
+    assert together is not None
+    assert low <= together < high
+    assert choose_cutoff([loud, loud.select(slice(0, 7000))]).cutoff_hz == pytest.approx(low, rel=0.06)
+
+
+def test_uneven_stamps_and_a_motionless_channel_make_no_difference() -> None:
+    clean, noisy = encoders(3.0, 1e-3)
+    still = replace(noisy, joint_names=(*"abcd",), joint_position=np.c_[noisy.joint_position, np.full(COUNT, 0.1)])
+    assert choose_cutoff([still]) == choose_cutoff([noisy])
+    jitter = np.random.default_rng(5).uniform(-0.2, 0.2, COUNT) / RATE
+    moved = np.stack([np.interp(TIME + jitter, TIME, channel) for channel in clean.joint_position.T], axis=1)
+    uneven = replace(clean, time=TIME + jitter, joint_position=moved + noise(3, 1e-3))
+    assert choose_cutoff([uneven], {"joint_position": 1e-3}).cutoff_hz == pytest.approx(
+        choose_cutoff([noisy], {"joint_position": 1e-3}).cutoff_hz, rel=0.13
+    )
+
+
+def test_where_accelerations_were_recorded_nothing_is_filtered() -> None:
+    log = encoders(3.0, 1e-3)[1]
+    rates = {name: np.zeros_like(log.joint_position) for name in ("joint_velocity", "joint_acceleration")}
+    assert choose_cutoff([replace(log, **rates)]).cutoff_hz is None
+    assert "recorded" in str(choose_cutoff([replace(log, **rates)]))
+
+
+def test_the_motion_of_a_base_that_is_worked_out_of_joints_does_not_count() -> None:
+    joints, turn = encoders(1.0, 1e-3)[1], turning(4.0, 1e-3, rates=False)[1]
+    both = replace(joints, base_quat_xyzw=turn.base_quat_xyzw)
+    assert choose_cutoff([both], base_is_derived=True) == choose_cutoff([joints])
+    assert choose_cutoff([both]).cutoff_hz != choose_cutoff([joints]).cutoff_hz

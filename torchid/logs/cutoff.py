@@ -1,0 +1,124 @@
+"""The cutoff of the low-pass filter at which derivatives of a noisy motion are nearest to the true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import welch
+
+from torchid.logs.log import FloatArray, Log
+from torchid.logs.preprocess import lacks_derivatives
+from torchid.logs.quaternion import make_sign_continuous
+from torchid.logs.signal_noise import SignalNoise, signal_noise
+from torchid.logs.timeline import spline_derivatives
+
+_LOWEST_HZ, _STEPS_PER_DECADE = 1.0, 40
+_SEGMENT_S = 8.0  # of the spectra: lines 1/8 Hz apart
+_USUAL_HZ = 10.0  # robots and people move below 5 Hz
+_RATE_SHARE = 0.2  # largest cutoff over the sample rate
+#: What an acceleration is worked out of, the first that was recorded, with the number of derivatives.
+_SOURCES = (
+    (("joint_acceleration", 0), ("joint_velocity", 1), ("joint_position", 2)),
+    (
+        ("imu_angular_acceleration", 0),
+        ("imu_angular_velocity", 1),
+        ("base_angular_acceleration_base", 0),
+        ("base_angular_velocity_base", 1),
+        ("base_quat_xyzw", 2),
+    ),
+    (
+        ("imu_specific_force", 0),
+        ("base_linear_acceleration_world", 0),
+        ("base_linear_velocity_world", 1),
+        ("base_position_world", 2),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class CutoffChoice:
+    """A cutoff, and what it was chosen by.
+
+    Attributes:
+        cutoff_hz: [Hz]; None: nothing is derived, and nothing filtered.
+        by_noise: whether noise of the motion decided; else it is the usual one.
+    """
+
+    cutoff_hz: float | None
+    by_noise: bool
+
+    def __str__(self) -> str:
+        """The cutoff, and what it was chosen by."""
+        if self.cutoff_hz is None:
+            return "none: accelerations were recorded"
+        if self.by_noise:
+            return f"{self.cutoff_hz:g} Hz: beyond it derived accelerations are more noise than motion"
+        return f"{self.cutoff_hz:g} Hz, the usual one: no log shows noise of the motion that would bound it"
+
+
+def usual_cutoff_hz(sample_rate_hz: float) -> float:
+    """The cutoff [Hz] where neither the user nor noise says another."""
+    return min(_USUAL_HZ, _RATE_SHARE * sample_rate_hz)
+
+
+def choose_cutoff(
+    logs: Sequence[Log],
+    stated: Mapping[str, float] | None = None,
+    sample_rate_hz: float | None = None,
+    base_is_derived: bool = False,
+) -> CutoffChoice:
+    """One cutoff for logs, at which the mean square error of their derived accelerations is least.
+
+    A low-pass filter of an acceleration loses the motion beyond its cutoff and keeps the noise up to it. With the
+    spectrum S of the motion's derivative and N of the noise's that is the integral of S beyond plus that of N up to
+    the cutoff, least where both are equal. Joints [rad or m] and the base [rad, m] count together.
+
+    Args:
+        logs: as recorded, or long parts of them.
+        stated: standard deviations of noise in the motion, as `signal_noise` takes them.
+        sample_rate_hz: that the logs are resampled to, None for their own.
+        base_is_derived: whether the motion of the base is worked out of that of the joints.
+    """
+    derived = [log for log in logs if lacks_derivatives(log)]
+    if not derived:
+        return CutoffChoice(None, by_noise=False)
+    slowest = min(1.0 / float(np.median(np.diff(log.time))) for log in derived)
+    slowest = slowest if sample_rate_hz is None else min(slowest, sample_rate_hz)
+    decades = np.log10(max(_RATE_SHARE * slowest / _LOWEST_HZ, 1.0))
+    candidates = _LOWEST_HZ * np.logspace(0.0, decades, 1 + int(_STEPS_PER_DECADE * decades))
+    gain = np.zeros(len(candidates))
+    for log in derived:
+        gain += _gain(log, signal_noise(log, None, stated), candidates, base_is_derived)
+    if not gain.any():
+        return CutoffChoice(float(f"{usual_cutoff_hz(slowest):.2g}"), by_noise=False)
+    return CutoffChoice(float(f"{candidates[np.argmax(gain)]:.2g}"), by_noise=True)
+
+
+def _gain(log: Log, noise: SignalNoise, candidates: FloatArray, base_is_derived: bool) -> FloatArray:
+    """By how much each cutoff (n,) [Hz] lowers the square error of accelerations, times the log's length."""
+    gain = np.zeros(len(candidates))
+    rate = (len(log) - 1) / float(log.time[-1] - log.time[0])
+    for values, std, order in _noisy_sources(log, noise, base_is_derived):
+        even = spline_derivatives(log.time, values, np.linspace(log.time[0], log.time[-1], len(log)), (0,))[0]
+        length = min(len(log), int(np.ceil(_SEGMENT_S * rate)))
+        frequency, power = welch(even, fs=rate, nperseg=length, axis=0, detrend="linear")
+        of_noise = 2.0 * float(np.square(std).sum()) / rate
+        kept = (power.sum(axis=1) - 2.0 * of_noise) * (2.0 * np.pi * frequency) ** (2 * order)
+        gain += np.interp(candidates, frequency, np.cumsum(kept) * frequency[1]) * len(log) / rate
+    return gain
+
+
+def _noisy_sources(log: Log, noise: SignalNoise, base_is_derived: bool) -> Iterator[tuple[FloatArray, FloatArray, int]]:
+    """What accelerations are worked out of: channels (N, c) with noise, its standard deviations, and how often."""
+    for sources in _SOURCES[: 1 if base_is_derived else None]:
+        name, order = next((pair for pair in sources if getattr(log, pair[0]) is not None), ("", 0))
+        std = noise.std.get(name)
+        if std is None or not std.any():
+            continue
+        values: FloatArray = getattr(log, name)
+        if name == "base_quat_xyzw":
+            yield 2.0 * make_sign_continuous(values), std, order  # half angles
+        else:
+            yield values[:, std > 0.0], std[std > 0.0], order
