@@ -28,7 +28,8 @@ from torchid.logs.log import (
     parse_names,
     to_float64,
 )
-from torchid.logs.mapped_fields import MappedArray, map_arrays
+from torchid.logs.mapped_arrays import MappedArray
+from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
 from torchid.logs.tables import read_table, table_blocks, table_size

@@ -9,124 +9,36 @@ from fnmatch import fnmatchcase
 from functools import partial
 from typing import Annotated
 
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, UnknownNameError, excerpt
+from torchid.logs.column_entries import (
+    KEY,
+    STRICT,
+    ColumnEntry,
+    Entry,
+    FlagEntry,
+    Flags,
+    Gains,
+    Name,
+    Names,
+    PdLaw,
+    Torque,
+    TorqueEntry,
+    Wrench,
+    WrenchEntry,
+)
 from torchid.logs.columns import KINDS, component_names, names_field
 from torchid.logs.joint_orders import order_by_name, require_joints_of, robot_with_order
 from torchid.logs.units import quantities_of, unit_factor
-from torchid.settings import Number
 
-KEY = "logs.columns"
-_STRICT = ConfigDict(extra="forbid")
-_Name = Annotated[str, Field(min_length=1)]
-_Names = list[_Name]
-_EVERYTHING = "*"
 #: `{joint}`, `{index}`, `{index:02}`, `{axis}`, `{AXIS}`.
 PLACEHOLDER = re.compile(r"\{([^{}:]*)(?::(0\d))?\}")
 AXES = ("axis", "AXIS")
-_GAINS = ("value", "column", "columns", "order", "first_index")
 
 
-def _for_all(value: object) -> object:
-    return value if isinstance(value, Mapping) else {_EVERYTHING: value}
-
-
-def _column(value: object) -> object:
-    return {"column": value} if isinstance(value, str) else value
-
-
-def _gains(value: object) -> object:
-    if isinstance(value, str):
-        return {"column": value}
-    if isinstance(value, Mapping) and set(value) & set(_GAINS):
-        return value
-    return {"value": value}
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class ColumnEntry:
-    """The columns, or the array, of one field.
-
-    Attributes:
-        column: its name, or a pattern: `{joint}`, `{contact}` or `{sensor}` stands for a name, `{index}` for the number
-            of one in `order` (or of a component), `{axis}` for a component (x, y, z; w, x, y, z; fx to mz), `{AXIS}`
-            for the same in capitals.
-        columns: by name or component, its column, in place of a pattern.
-        order: names, by number; null for a number that is no joint (contact, sensor) of the robot.
-        first_index: number of the first of them.
-        unit: by pattern of a name or component, or one for all; SI units by default.
-        scale: what numbers are multiplied by, likewise: -1 turns a sign.
-    """
-
-    column: _Name | None = None
-    columns: dict[_Name, _Name] = dataclasses.field(default_factory=dict)
-    order: Annotated[list[_Name | None], Field(min_length=1)] | None = None
-    first_index: int = 0
-    unit: Annotated[dict[str, _Name], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
-    scale: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
-
-
-_Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class Gains(ColumnEntry):
-    """Gains [N m/rad, N m s/rad]: `value` by pattern of the joint or one for all, or columns, or an array (n,)."""
-
-    value: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
-
-
-_Gains = Annotated[Gains, BeforeValidator(_gains)]
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class PdLaw:
-    """kp (position - q) + kd (velocity - dq) + feed_forward, with desired values; what is not given is 0."""
-
-    kp: _Gains | None = None
-    kd: _Gains | None = None
-    position: _Entry | None = None
-    velocity: _Entry | None = None
-    feed_forward: _Entry | None = None
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class TorqueEntry(ColumnEntry):
-    """Torques as columns, or of a PD law."""
-
-    pd: PdLaw | None = None
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class FlagEntry(ColumnEntry):
-    """Contact flags as columns.
-
-    Attributes:
-        above: contacts are active where the number is above this, in its unit; without columns that of the contact's
-            force [N].
-        always: contacts that are active throughout, in place of columns.
-    """
-
-    above: Number | None = None
-    always: _Names = dataclasses.field(default_factory=list)
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class WrenchEntry(ColumnEntry):
-    """Wrenches as columns of all components, or forces and moments each for themselves (x, y, z); no moments: NaN."""
-
-    force: _Entry | None = None
-    moment: _Entry | None = None
-
-
-_Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
-_Flags = Annotated[FlagEntry, BeforeValidator(_column)]
-_Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
+@dataclass(config=STRICT, frozen=True, kw_only=True)
 class Columns:
     """What the columns of a table, or the arrays of a file, hold; those with names of the log format need no entry.
 
@@ -142,39 +54,39 @@ class Columns:
         ignore: columns that are not needed; * and ? stand for others.
     """
 
-    time: _Entry | None = None
-    other_times: list[_Entry] = dataclasses.field(default_factory=list)
-    joint_position: _Entry | None = None
-    joint_velocity: _Entry | None = None
-    joint_acceleration: _Entry | None = None
-    joint_torque: _Torque | None = None
-    base_quat_xyzw: _Entry | None = None
-    base_quat_wxyz: _Entry | None = None
-    base_position_world: _Entry | None = None
-    base_linear_velocity_world: _Entry | None = None
-    base_linear_velocity_base: _Entry | None = None
-    base_angular_velocity_base: _Entry | None = None
-    base_angular_velocity_world: _Entry | None = None
-    base_linear_acceleration_world: _Entry | None = None
-    base_linear_acceleration_base: _Entry | None = None
-    base_angular_acceleration_base: _Entry | None = None
-    base_angular_acceleration_world: _Entry | None = None
-    contact_active: _Flags | None = None
-    contact_wrench_local: _Wrench | None = None
-    contact_wrench_world: _Wrench | None = None
-    contact_normal_world: _Entry | None = None
-    contact_force_normal: _Entry | None = None
-    ft_wrench: _Wrench | None = None
-    imu_frame: _Name | None = None
-    imu_specific_force: _Entry | None = None
-    imu_angular_velocity: _Entry | None = None
-    imu_angular_acceleration: _Entry | None = None
-    joint_order: Annotated[list[_Name | None], BeforeValidator(partial(order_by_name, "joint"))] | None = None
-    contact_order: Annotated[list[_Name | None], BeforeValidator(partial(order_by_name, "contact"))] | None = None
-    sensor_order: list[_Name | None] | None = None
-    joint_name: _Name = "{joint}"
-    contact_name: _Name = "{contact}"
-    ignore: _Names = dataclasses.field(default_factory=list)
+    time: Entry | None = None
+    other_times: list[Entry] = dataclasses.field(default_factory=list)
+    joint_position: Entry | None = None
+    joint_velocity: Entry | None = None
+    joint_acceleration: Entry | None = None
+    joint_torque: Torque | None = None
+    base_quat_xyzw: Entry | None = None
+    base_quat_wxyz: Entry | None = None
+    base_position_world: Entry | None = None
+    base_linear_velocity_world: Entry | None = None
+    base_linear_velocity_base: Entry | None = None
+    base_angular_velocity_base: Entry | None = None
+    base_angular_velocity_world: Entry | None = None
+    base_linear_acceleration_world: Entry | None = None
+    base_linear_acceleration_base: Entry | None = None
+    base_angular_acceleration_base: Entry | None = None
+    base_angular_acceleration_world: Entry | None = None
+    contact_active: Flags | None = None
+    contact_wrench_local: Wrench | None = None
+    contact_wrench_world: Wrench | None = None
+    contact_normal_world: Entry | None = None
+    contact_force_normal: Entry | None = None
+    ft_wrench: Wrench | None = None
+    imu_frame: Name | None = None
+    imu_specific_force: Entry | None = None
+    imu_angular_velocity: Entry | None = None
+    imu_angular_acceleration: Entry | None = None
+    joint_order: Annotated[list[Name | None], BeforeValidator(partial(order_by_name, "joint"))] | None = None
+    contact_order: Annotated[list[Name | None], BeforeValidator(partial(order_by_name, "contact"))] | None = None
+    sensor_order: list[Name | None] | None = None
+    joint_name: Name = "{joint}"
+    contact_name: Name = "{contact}"
+    ignore: Names = dataclasses.field(default_factory=list)
 
     @property
     def fields(self) -> tuple[str, ...]:

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from torchid.errors import ConfigError, LogError, excerpt, join_names
-from torchid.logs.column_map import AXES, KEY, PLACEHOLDER, Columns, Part, fits, letters_of, list_parts
+from torchid.logs.column_entries import KEY
+from torchid.logs.column_map import AXES, PLACEHOLDER, Columns, Part, fits, letters_of, list_parts
 from torchid.logs.column_proposals import name_unknown
 from torchid.logs.columns import KINDS
 from torchid.logs.log import CONTACT_READINGS, IMU_FIELDS, UnknownFieldError

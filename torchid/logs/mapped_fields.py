@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt
-from torchid.logs.column_map import KEY, Columns, Gains, Part, PdLaw, check_columns, fits, letters_of
+from torchid.logs.column_entries import KEY, Gains, PdLaw
+from torchid.logs.column_map import Columns, Part, check_columns, fits, letters_of
 from torchid.logs.column_matching import Matched, columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
 from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, SHAPES, VARIANTS, WRENCHES, FloatArray, parse_names
-from torchid.logs.spill import LazyArray
 from torchid.logs.units import unit_factor
 
 Take = Callable[[str], NDArray[Any]]
@@ -364,36 +364,3 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
     native = {name: (name,) for name in matching.others}
     values = _values(matching.matched, matching.names)
     return MappedFields(matching.names, columns, native, values).check()
-
-
-class MappedArray:
-    """A field whose arrays are read where it is sliced."""
-
-    def __init__(self, fields: MappedFields, name: str, arrays: Mapping[str, LazyArray]) -> None:
-        """The field of a name, of open arrays.
-
-        Raises:
-            LogError: arrays that do not fit it.
-        """
-        self._fields, self._name, self._arrays = fields, name, arrays
-        self._constant = fields.constant_sources(name)
-        for source in fields.sources_of(name):
-            if not arrays[source].shape:
-                raise LogError.at_field(f"'{source}'", "a single value", "an array with a row for each sample")
-        sampled = [source for source in fields.sources_of(name) if not self._is_constant(source)]
-        lengths = {source: arrays[source].shape[0] for source in sampled}
-        for source, length in lengths.items():
-            if length != max(lengths.values()):
-                raise LogError.at_field(f"'{source}'", f"{length} samples", f"{max(lengths.values())}, as others have")
-        first = self[slice(0, 1)]
-        self.dtype, self.shape = first.dtype, (max(lengths.values(), default=0), *first.shape[1:])
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """Some rows."""
-        return self._fields.value(self._name, lambda source: self._read(source, rows))
-
-    def _read(self, source: str, rows: slice) -> NDArray[Any]:
-        return np.asarray(self._arrays[source][slice(None) if self._is_constant(source) else rows])
-
-    def _is_constant(self, source: str) -> bool:
-        return source in self._constant and len(self._arrays[source].shape) == 1
