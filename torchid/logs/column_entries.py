@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -16,6 +16,7 @@ STRICT = ConfigDict(extra="forbid")
 Name = Annotated[str, Field(min_length=1)]
 Names = list[Name]
 _EVERYTHING = "*"
+_Three = tuple[Number, Number, Number]
 _GAINS = ("value", "column", "columns", "order", "first_index")
 
 
@@ -104,11 +105,34 @@ class FlagEntry(ColumnEntry):
 
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
+class VectorEntry(ColumnEntry):
+    """Moments or points as columns of their components; `axes`: those that have one, others are 0."""
+
+    axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1)] | None = None
+
+
+Vector = Annotated[VectorEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
 class WrenchEntry(ColumnEntry):
     """Wrenches as columns of all components, or forces and moments each for themselves (x, y, z); no moments: NaN."""
 
     force: Entry | None = None
-    moment: Entry | None = None
+    moment: Vector | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class Plate:
+    """Pose of a force plate, of the axes and the origin that its readings have, in the world.
+
+    Attributes:
+        position: [m], of the origin.
+        rpy_deg: [deg], roll, pitch and yaw of the axes as in a URDF: about the world's x, then y, then z.
+    """
+
+    position: _Three = (0.0, 0.0, 0.0)
+    rpy_deg: _Three = (0.0, 0.0, 0.0)
 
 
 Torque = Annotated[TorqueEntry, BeforeValidator(_column)]

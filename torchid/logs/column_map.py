@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
@@ -24,15 +24,20 @@ from torchid.logs.column_entries import (
     Name,
     Names,
     PdLaw,
+    Plate,
     Torque,
     TorqueEntry,
+    Vector,
     Wrench,
     WrenchEntry,
 )
 from torchid.logs.columns import KINDS, component_names, names_field
 from torchid.logs.joint_orders import order_by_name, require_joints_of, robot_with_order
+from torchid.logs.log import WRENCHES
 from torchid.logs.units import quantities_of, unit_factor
 
+_X = TypeVar("_X")
+_XYZ = ("x", "y", "z")
 #: `{joint}`, `{index}`, `{index:02}`, `{axis}`, `{AXIS}`.
 PLACEHOLDER = re.compile(r"\{([^{}:]*)(?::(0\d))?\}")
 AXES = ("axis", "AXIS")
@@ -51,6 +56,8 @@ class Columns:
             `contact_order`, `sensor_order`: as well.
         joint_name: what the joint that the file calls {joint} is called in the URDF, such as `{joint}_joint`.
         contact_name: as well, of {contact}.
+        plates: by pattern of the contact, pose of the force plate whose axes and origin `contact_wrench_world` and
+            `contact_wrench_point_world` have.
         ignore: columns that are not needed; * and ? stand for others.
     """
 
@@ -74,6 +81,7 @@ class Columns:
     contact_active: Flags | None = None
     contact_wrench_local: Wrench | None = None
     contact_wrench_world: Wrench | None = None
+    contact_wrench_point_world: Vector | None = None
     contact_normal_world: Entry | None = None
     contact_force_normal: Entry | None = None
     ft_wrench: Wrench | None = None
@@ -86,6 +94,7 @@ class Columns:
     sensor_order: list[Name | None] | None = None
     joint_name: Name = "{joint}"
     contact_name: Name = "{contact}"
+    plates: dict[Name, Plate] = dataclasses.field(default_factory=dict)
     ignore: Names = dataclasses.field(default_factory=list)
 
     @property
@@ -110,6 +119,35 @@ def fits(name: str, pattern: str) -> bool:
 def letters_of(pattern: str) -> int:
     """How much a pattern says: of several that a name fits, the one with most letters counts."""
     return len(re.sub(r"[*?]", "", PLACEHOLDER.sub("", pattern)))
+
+
+def values_by_name(key: str, given: Mapping[str, _X], labels: Sequence[str]) -> dict[str, _X]:
+    """Values by name, of values by pattern: that with most letters counts.
+
+    Raises:
+        ConfigError: two that say as much.
+        UnknownNameError: a pattern that no name fits.
+    """
+    out: dict[str, tuple[int, _X]] = {}
+    for pattern, value in given.items():
+        letters, found = letters_of(pattern), [label for label in labels if fits(label, pattern)]
+        if not found and letters:
+            raise UnknownNameError.at_field(key, excerpt(pattern), labels)
+        for label in found:
+            most = out.get(label, (-1, value))
+            if most[0] == letters and most[1] != value:
+                raise ConfigError.at_field(key, f"two values of {label}", "patterns of which one has more letters")
+            out[label] = max(most, (letters, value), key=lambda pair: pair[0])
+    return {label: value for label, (_, value) in out.items()}
+
+
+def values_of_all(key: str, what: str, given: Mapping[str, _X], kind: str, labels: Sequence[str]) -> list[_X]:
+    """Values of all names, of values by pattern; errors as `values_by_name`, and ConfigError for a name without one."""
+    found = values_by_name(key, given, labels)
+    without = [label for label in labels if label not in found]
+    if without:
+        raise ConfigError.at_field(key, f"no {what} of {without[0]}", f"one for every {kind}; * stands for all others")
+    return [found[label] for label in labels]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +189,7 @@ def list_parts(columns: Columns) -> dict[str, Part]:
         if isinstance(entry, WrenchEntry):
             for name, quantity in (("force", "force"), ("moment", "torque")):
                 if (inner := getattr(entry, name)) is not None:
-                    axes: tuple[str, ...] = ("x", "y", "z")
+                    axes = tuple(getattr(inner, "axes", None) or _XYZ)
                     quantities = dict.fromkeys(axes, (quantity,))
                     parts[f"{field}.{name}"] = Part(f"{field}.{name}", inner, names_field(field), axes, quantities)
         if isinstance(entry, TorqueEntry) and entry.pd is not None:
@@ -161,7 +199,7 @@ def list_parts(columns: Columns) -> dict[str, Part]:
 
 def _part(key: str, field: str, entry: ColumnEntry) -> Part:
     """An entry that is like a field of a log."""
-    components = component_names(field)
+    components = tuple(getattr(entry, "axes", None) or component_names(field))
     raw = isinstance(entry, (FlagEntry, Gains))
     quantities = {name: () if raw else quantities_of(field, name) for name in components or ("",)}
     return Part(key, entry, names_field(field), components, quantities)
@@ -197,6 +235,7 @@ def check_columns(columns: Columns) -> None:
     times = [("other_times", entry) for entry in columns.other_times]
     for field, entry in (*((field, getattr(columns, field)) for field in columns.fields), *times):
         _check_given(field, entry)
+    _check_plates(columns)
     for part in (*list_parts(columns).values(), *(_part(name, "time", entry) for name, entry in times)):
         _check_part(part)
 
@@ -239,6 +278,12 @@ def _check_unscaled(field: str, entry: ColumnEntry, given: list[str], beside: st
     if given:
         found = f"{given[0]} beside {beside}, which it says nothing about"
         raise ConfigError.at_field(f"{KEY}.{field}", found, f"{beside} without {given[0]}")
+
+
+def _check_plates(columns: Columns) -> None:
+    if columns.plates and columns.contact_wrench_world is None:
+        accepted = f"an entry of {WRENCHES[1]}, readings along the plates' axes, or no plates"
+        raise ConfigError.at_field(f"{KEY}.plates", f"given without {KEY}.{WRENCHES[1]}", accepted)
 
 
 def _check_law(law: PdLaw) -> None:
