@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from large import SMALL, assert_same, is_on_disk, samples_of
 from motions import value
-from plates import LABORATORIES, walk, write_motion
+from plates import LABORATORIES, PLATES_MAP, centres_of_pressure, plates_csv, walk, write_motion
+from raw_logs import write_arrays
 from refusals import refusal
 from repository import SHARED
+from scipy.spatial.transform import Rotation
 from simulated import BIPED, feet_of
 from trainings import without_figures
 
@@ -21,7 +25,6 @@ from torchid.cli import main
 from torchid.logs import Log, read_log, write_log
 
 MOTION = "motion.npz + plates.csv"
-SMALL = "preprocessing.memory_gb=0.0001"
 
 
 @pytest.fixture(autouse=True)
@@ -99,6 +102,50 @@ def test_a_converted_log_is_fitted_block_by_block_compressed_checked_and_judged(
     capsys.readouterr()
     assert main(["check", log, "--urdf", str(BIPED)]) in (0, 1)
     assert "point" not in capsys.readouterr().out
+
+
+ARRAYS_MAP = """
+contact_order: [l_sole, r_sole]
+contact_wrench_world: {force: grf, moment: {column: free_moment, axes: [z]}}
+contact_wrench_point_world: {column: cop, unit: cm}
+contact_active: {above: 20}
+plates: {"*": {rpy_deg: [0, 0, 30], position: [1, 2, 3]}}
+"""
+
+
+def table(folder: Path) -> Path:
+    """One table of motion and plates."""
+    motion, plates = (write_motion(folder / "motion.csv", walk()), folder / "plates.csv")
+    plates_csv(plates, walk())
+    rows = [both for both in zip(*(x.read_text().splitlines() for x in (motion, plates)), strict=True)]
+    (folder / "both.csv").write_text("\n".join(f"{a},{b.partition(',')[2]}" for a, b in rows) + "\n")
+    return folder / "both.csv"
+
+
+def arrays(folder: Path) -> Path:
+    """One file of arrays, with centres of pressure on plates that are turned and shifted."""
+    with np.load(write_motion(folder / "motion.npz", walk())) as motion:
+        known = dict(motion)
+    points, free = centres_of_pressure(walk())
+    into, force = Rotation.from_euler("z", -30.0, degrees=True), value(walk().contact_wrench_world)[..., :3]
+
+    def turned(vectors: np.ndarray) -> np.ndarray:
+        return into.apply(vectors.reshape(-1, 3)).reshape(vectors.shape)
+
+    known |= {"grf": turned(force), "cop": 100.0 * turned(points - [1.0, 2.0, 3.0]), "free_moment": free[..., None]}
+    return write_arrays(folder / "both.h5", known)
+
+
+@pytest.mark.parametrize(("write", "columns"), [(table, PLATES_MAP), (arrays, ARRAYS_MAP)], ids=["table", "arrays"])
+@pytest.mark.parametrize("cutoff", ["null", "8"])
+def test_a_map_of_plates_is_read_block_by_block_as_a_whole(
+    write: Callable[[Path], Path], columns: str, cutoff: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchid.commands.large_log.SPLINE_BLOCK", 256)
+    file = experiment(tmp_path, write(tmp_path).name, columns)
+    whole, large = (samples_of(file, f"preprocessing.cutoff_hz={cutoff}", *more) for more in ((), (SMALL,)))
+    assert is_on_disk(large)
+    assert_same(large, whole, 1e-10)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
