@@ -13,7 +13,7 @@ import pytest
 import yaml
 from large import SMALL, assert_same, is_on_disk, samples_of
 from motions import value
-from plates import LABORATORIES, PLATES_MAP, centres_of_pressure, plates_csv, walk, write_motion
+from plates import LABORATORIES, PLATES_MAP, centres_of_pressure, opensim_csv, plates_csv, walk, write_motion
 from raw_logs import write_arrays
 from refusals import refusal
 from repository import SHARED
@@ -175,3 +175,22 @@ def test_plates_without_a_pose_in_their_world_are_refused(tmp_path: Path, capsys
     np.savez(tmp_path / "motion.npz", base_linear_velocity_world=velocity, **rest)
     complaint = refusal(["identify", str(experiment(tmp_path, MOTION, text))], tmp_path, capsys)
     assert "contact_wrench_point_world: given without base_position_world" in complaint
+
+
+def test_init_and_check_know_readings_of_plates_by_their_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opensim_csv(tmp_path / "grf.csv", walk())
+    assert main(["check", str(tmp_path / "grf.csv")]) == 2
+    complaint = capsys.readouterr().err
+    assert "'ground_force_vx' and 1 like it (contact_wrench_world?)" in complaint
+    assert "'ground_force_px' and 1 like it (contact_wrench_point_world?)" in complaint
+    for write in (opensim_csv, plates_csv):
+        write(tmp_path / "grf.csv", walk())
+        out = tmp_path / f"{write.__name__}.yaml"
+        assert main(["init", str(BIPED), str(tmp_path / "grf.csv"), "--output", str(out)]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert "may be readings of force plates, without which foot stands on which" in said
+        assert not {"contact_wrench_local", "contact_wrench_world"} & set(
+            yaml.safe_load(out.read_text())["logs"]["columns"]
+        )
