@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from motions import value
-from recordings import Miscalibration, in_world
+from recordings import Miscalibration, in_world, on_plates
 from synthetic import Oracle, load, make_log
 from welded import CONTACTS, SENSORS, STATES, machine
 
@@ -71,7 +71,8 @@ def world(per_log: bool = True, scaled: tuple[str, ...] = (), axes: str = "local
         log = make_log(oracle, contacts, STATES, 120, rng, name)
         found = Miscalibration.random(log, rng, scaled)
         sensors.append(found if per_log or not sensors else sensors[0])
-        logs.append(sensors[-1].read(in_world(oracle, log) if axes == "world" else log))
+        change = {"local": lambda _, log: log, "world": in_world, "plates": on_plates}[axes]
+        logs.append(sensors[-1].read(change(oracle, log)))
     return World(robot, oracle, logs, sensors)
 
 

@@ -83,6 +83,25 @@ def in_world(oracle: Oracle, log: Log) -> Log:
     return replace(log, contact_wrench_local=None, contact_wrench_world=turned)
 
 
+def on_plates(oracle: Oracle, log: Log) -> Log:
+    """The log with its contact wrenches along world axes and about the world's origin, of a base that is anywhere.
+
+    The world of a bolted base without a pose is the base.
+    """
+    turned, q = in_world(oracle, log), states_of(log)[0]
+    base = Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1)))
+    place = np.random.default_rng(4).uniform(-3.0, 3.0, (len(log), 3))
+    if not oracle.base and log.base_quat_xyzw is not None:
+        base = Rotation.from_quat(log.base_quat_xyzw)
+    wrench = value(turned.contact_wrench_world).copy()
+    placed = bool(oracle.base) or log.base_quat_xyzw is not None
+    for k, frame in enumerate(log.contact_names):
+        origin = base.apply(oracle.pose(q, frame)[1]) + placed * place
+        wrench[:, k, 3:] += np.cross(origin, wrench[:, k, :3])
+    known = {"base_position_world": place} if placed else {}
+    return replace(turned, contact_wrench_world=wrench, moments_about_world_origin=True, **known)  # type: ignore[arg-type]
+
+
 @dataclass(frozen=True)
 class Miscalibration:
     """Offsets and scales: a reading y stands for the force s y - o.

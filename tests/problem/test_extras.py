@@ -94,6 +94,12 @@ def test_scales_are_found_beside_offsets_where_some_sensor_is_true_to_scale(case
     assert_recovered(w, fitted(w, sensors_of(w.robot, name), terms), terms)
 
 
+def test_scales_of_plates_are_those_of_what_they_read_about_a_point_of_the_world() -> None:
+    scaled = ("contact_force", "contact_moment")
+    terms, w = ExtraTerms(dict.fromkeys(CHANNELS, "log"), dict.fromkeys(scaled, "log")), world(True, scaled, "plates")
+    assert_recovered(w, fitted(w, sensors_of(w.robot, "full"), terms), terms)
+
+
 def test_where_no_sensor_is_true_to_scale_none_can_be_told_from_the_masses() -> None:
     """All forces twice as large and a robot twice as heavy would read the same."""
     every = dict.fromkeys(CHANNELS, "all")
@@ -106,9 +112,10 @@ def test_where_no_sensor_is_true_to_scale_none_can_be_told_from_the_masses() -> 
         assert x.confounded_with
 
 
+@pytest.mark.parametrize("axes", ["world", "plates"])
 @pytest.mark.parametrize("name", ["contacts", "mixed"])
-def test_offsets_of_plates_that_read_along_world_axes_are_constant_along_these(name: str) -> None:
-    terms, w = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log")), world(axes="world")
+def test_offsets_of_plates_that_read_along_world_axes_are_constant_along_these(name: str, axes: str) -> None:
+    terms, w = ExtraTerms(offsets=dict.fromkeys(CHANNELS, "log")), world(axes=axes)
     found = fitted(w, sensors_of(w.robot, name), terms)
     assert_recovered(w, found, terms)
     if name == "mixed":

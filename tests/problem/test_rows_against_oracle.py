@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 from motions import value
-from recordings import GRAVITY, in_world, states_of, with_imu
+from recordings import GRAVITY, in_world, on_plates, states_of, with_imu
 from scipy.spatial.transform import Rotation
 from synthetic import ANYMAL, DRONE, G1, PANDA, SOLO12, TALOS_FULL, TIAGO, Array, Oracle, load, make_log
 from true_robots import true_parameters
@@ -251,7 +251,7 @@ ANY_BASE: dict[str, Convention] = {
 }
 FREE_BASE: dict[str, Convention] = {
     "IMU": with_base_imu,
-    "IMU, world": lambda r, log: with_base_imu(r, in_world(r.oracle, log), ["base_quat_xyzw"]),
+    "IMU, plates": lambda r, log: with_base_imu(r, on_plates(r.oracle, log), ["base_quat_xyzw"]),
 }
 CONVENTIONS = ANY_BASE | FREE_BASE
 """Axes that contact wrenches are along, names from last to first, and an IMU's readings in place of the base's pose."""

@@ -18,6 +18,7 @@ from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.logs import Columns, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
+from torchid.logs.column_proposals import OF_PLATES, propose_field
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
 from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names, texts_in
 from torchid.logs.name_matching import KnownRobot, within
@@ -211,6 +212,13 @@ def _from_feet(contacts: Sequence[_Contact], fields: set[str]) -> dict[str, obje
     return out
 
 
+def _describe_plates(out: Initiated, proposal: MapProposal) -> None:
+    """What of force plates no file says."""
+    if plates := [name for name in proposal.left_out if propose_field(name) in OF_PLATES]:
+        unknown = "without which foot stands on which and where each lies (docs/logs.md, Force plates)"
+        out.missing.append(f"contact_wrench_world: {join_names(plates)} may be readings of force plates, {unknown}")
+
+
 def _describe(
     out: Initiated, robot: Robot, contacts: Sequence[_Contact], fields: set[str], proposal: MapProposal
 ) -> None:
@@ -229,6 +237,7 @@ def _describe(
             out.missing.append(f"{name}: no {what}s that look like it, of all {len(robot.joint_names)} joints")
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
+    _describe_plates(out, proposal)
     from_feet = _from_feet(contacts, fields)
     if contacts and "contact_active" not in fields:
         instead = "detected from joint torques" if "detect_contacts" in from_feet else "set to touch throughout"

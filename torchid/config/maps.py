@@ -20,6 +20,7 @@ MAPS_ACCEPTED = {
     **{f"logs.columns.{kind}_order": _ORDER for kind in ("joint", "contact")},
     **{f"logs.columns.{key}": "a list of names" for key in ("sensor_order", "ignore")},
     "logs.columns.other_times": "a list of entries like time: [{column: stamp, unit: ms}]",
+    "logs.columns.plates": "poses by contact: {l_foot: {position: [0.3, 0.2, 0], rpy_deg: [180, 0, 90]}}",
     "logs.columns.*": "the name of a column, a pattern such as {joint}_q, or a mapping with column, unit, scale, ...",
     "logs.topics.joint_states": "the name of a topic, or a mapping with topic and joints",
     "logs.topics.low_state": "a mapping with topic and robot, or joints by number of the motor",

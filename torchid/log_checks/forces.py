@@ -220,6 +220,8 @@ def _gain_and_point_findings(
         point = ", ".join(f"{1e3 * x:.0f}" for x in fit.point)
         text = f"forces and moments fit the URDF about a point that lies {point} mm from the contact frames' origins"
         advice = "give moments about the contact frame's origin, or name the sensor's own frame as the contact"
+        if log.moments_about_world_origin:
+            advice = "check the points of the moments, where the plates lie, and the base's position in the same world"
         yield Finding("point", SUSPICIOUS, log.contact_wrench_field, text, advice)
 
 

@@ -157,7 +157,7 @@ def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:
     first = _change(lambda log: {field: np.roll(getattr(log, field), 3, axis=2)})
     yield Mistake(field, "with the moment first", "give the force first, then the moment", first)
     axes = "along the world's axes" if other == WRENCHES[1] else "along the contact frames' axes"
-    moved = _change(lambda log: {other: getattr(log, field), field: None})
+    moved = _change(lambda log: {other: getattr(log, field), field: None, "moments_about_world_origin": False})
     yield Mistake(field, axes, f"call it {other}", moved)
 
 

@@ -19,7 +19,9 @@ from torchid.logs.column_map import Columns
 from torchid.logs.containers import Container, LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.log import (
     NAME_FIELDS,
+    POINTS,
     SHAPES,
+    WRENCHES,
     FloatArray,
     Log,
     check_shape,
@@ -28,7 +30,8 @@ from torchid.logs.log import (
     parse_names,
     to_float64,
 )
-from torchid.logs.mapped_fields import MappedArray, map_arrays
+from torchid.logs.mapped_arrays import MappedArray
+from torchid.logs.mapped_fields import map_arrays
 from torchid.logs.read import build_log, check_fields_given
 from torchid.logs.spill import LazyArray, Spill
 from torchid.logs.tables import read_table, table_blocks, table_size
@@ -146,7 +149,7 @@ class LogBlocks:
         if only is not None:
             raw["joint_position"] = np.zeros((len(raw["time"]), len(self.names["joint_names"])))
         for name, array in self.fields.items():
-            if only is None or name in only:
+            if only is None or name in only or (name == POINTS and WRENCHES[1] in only):
                 with reader_errors_explained(name, _ACCEPTED):
                     raw[name] = np.asarray(array[samples])
         return raw

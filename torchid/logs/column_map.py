@@ -4,129 +4,46 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
-from typing import Annotated
+from typing import Annotated, TypeVar
 
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator
 from pydantic.dataclasses import dataclass
 
 from torchid.errors import ConfigError, UnknownNameError, excerpt
+from torchid.logs.column_entries import (
+    KEY,
+    STRICT,
+    ColumnEntry,
+    Entry,
+    FlagEntry,
+    Flags,
+    Gains,
+    Name,
+    Names,
+    PdLaw,
+    Plate,
+    Torque,
+    TorqueEntry,
+    Vector,
+    Wrench,
+    WrenchEntry,
+)
 from torchid.logs.columns import KINDS, component_names, names_field
 from torchid.logs.joint_orders import order_by_name, require_joints_of, robot_with_order
+from torchid.logs.log import WRENCHES
 from torchid.logs.units import quantities_of, unit_factor
-from torchid.settings import Number
 
-KEY = "logs.columns"
-_STRICT = ConfigDict(extra="forbid")
-_Name = Annotated[str, Field(min_length=1)]
-_Names = list[_Name]
-_EVERYTHING = "*"
+_X = TypeVar("_X")
+_XYZ = ("x", "y", "z")
 #: `{joint}`, `{index}`, `{index:02}`, `{axis}`, `{AXIS}`.
 PLACEHOLDER = re.compile(r"\{([^{}:]*)(?::(0\d))?\}")
 AXES = ("axis", "AXIS")
-_GAINS = ("value", "column", "columns", "order", "first_index")
 
 
-def _for_all(value: object) -> object:
-    return value if isinstance(value, Mapping) else {_EVERYTHING: value}
-
-
-def _column(value: object) -> object:
-    return {"column": value} if isinstance(value, str) else value
-
-
-def _gains(value: object) -> object:
-    if isinstance(value, str):
-        return {"column": value}
-    if isinstance(value, Mapping) and set(value) & set(_GAINS):
-        return value
-    return {"value": value}
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class ColumnEntry:
-    """The columns, or the array, of one field.
-
-    Attributes:
-        column: its name, or a pattern: `{joint}`, `{contact}` or `{sensor}` stands for a name, `{index}` for the number
-            of one in `order` (or of a component), `{axis}` for a component (x, y, z; w, x, y, z; fx to mz), `{AXIS}`
-            for the same in capitals.
-        columns: by name or component, its column, in place of a pattern.
-        order: names, by number; null for a number that is no joint (contact, sensor) of the robot.
-        first_index: number of the first of them.
-        unit: by pattern of a name or component, or one for all; SI units by default.
-        scale: what numbers are multiplied by, likewise: -1 turns a sign.
-    """
-
-    column: _Name | None = None
-    columns: dict[_Name, _Name] = dataclasses.field(default_factory=dict)
-    order: Annotated[list[_Name | None], Field(min_length=1)] | None = None
-    first_index: int = 0
-    unit: Annotated[dict[str, _Name], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
-    scale: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
-
-
-_Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class Gains(ColumnEntry):
-    """Gains [N m/rad, N m s/rad]: `value` by pattern of the joint or one for all, or columns, or an array (n,)."""
-
-    value: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
-
-
-_Gains = Annotated[Gains, BeforeValidator(_gains)]
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class PdLaw:
-    """kp (position - q) + kd (velocity - dq) + feed_forward, with desired values; what is not given is 0."""
-
-    kp: _Gains | None = None
-    kd: _Gains | None = None
-    position: _Entry | None = None
-    velocity: _Entry | None = None
-    feed_forward: _Entry | None = None
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class TorqueEntry(ColumnEntry):
-    """Torques as columns, or of a PD law."""
-
-    pd: PdLaw | None = None
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class FlagEntry(ColumnEntry):
-    """Contact flags as columns.
-
-    Attributes:
-        above: contacts are active where the number is above this, in its unit; without columns that of the contact's
-            force [N].
-        always: contacts that are active throughout, in place of columns.
-    """
-
-    above: Number | None = None
-    always: _Names = dataclasses.field(default_factory=list)
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
-class WrenchEntry(ColumnEntry):
-    """Wrenches as columns of all components, or forces and moments each for themselves (x, y, z); no moments: NaN."""
-
-    force: _Entry | None = None
-    moment: _Entry | None = None
-
-
-_Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
-_Flags = Annotated[FlagEntry, BeforeValidator(_column)]
-_Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]
-
-
-@dataclass(config=_STRICT, frozen=True, kw_only=True)
+@dataclass(config=STRICT, frozen=True, kw_only=True)
 class Columns:
     """What the columns of a table, or the arrays of a file, hold; those with names of the log format need no entry.
 
@@ -139,42 +56,46 @@ class Columns:
             `contact_order`, `sensor_order`: as well.
         joint_name: what the joint that the file calls {joint} is called in the URDF, such as `{joint}_joint`.
         contact_name: as well, of {contact}.
+        plates: by pattern of the contact, pose of the force plate whose axes and origin `contact_wrench_world` and
+            `contact_wrench_point_world` have.
         ignore: columns that are not needed; * and ? stand for others.
     """
 
-    time: _Entry | None = None
-    other_times: list[_Entry] = dataclasses.field(default_factory=list)
-    joint_position: _Entry | None = None
-    joint_velocity: _Entry | None = None
-    joint_acceleration: _Entry | None = None
-    joint_torque: _Torque | None = None
-    base_quat_xyzw: _Entry | None = None
-    base_quat_wxyz: _Entry | None = None
-    base_position_world: _Entry | None = None
-    base_linear_velocity_world: _Entry | None = None
-    base_linear_velocity_base: _Entry | None = None
-    base_angular_velocity_base: _Entry | None = None
-    base_angular_velocity_world: _Entry | None = None
-    base_linear_acceleration_world: _Entry | None = None
-    base_linear_acceleration_base: _Entry | None = None
-    base_angular_acceleration_base: _Entry | None = None
-    base_angular_acceleration_world: _Entry | None = None
-    contact_active: _Flags | None = None
-    contact_wrench_local: _Wrench | None = None
-    contact_wrench_world: _Wrench | None = None
-    contact_normal_world: _Entry | None = None
-    contact_force_normal: _Entry | None = None
-    ft_wrench: _Wrench | None = None
-    imu_frame: _Name | None = None
-    imu_specific_force: _Entry | None = None
-    imu_angular_velocity: _Entry | None = None
-    imu_angular_acceleration: _Entry | None = None
-    joint_order: Annotated[list[_Name | None], BeforeValidator(partial(order_by_name, "joint"))] | None = None
-    contact_order: Annotated[list[_Name | None], BeforeValidator(partial(order_by_name, "contact"))] | None = None
-    sensor_order: list[_Name | None] | None = None
-    joint_name: _Name = "{joint}"
-    contact_name: _Name = "{contact}"
-    ignore: _Names = dataclasses.field(default_factory=list)
+    time: Entry | None = None
+    other_times: list[Entry] = dataclasses.field(default_factory=list)
+    joint_position: Entry | None = None
+    joint_velocity: Entry | None = None
+    joint_acceleration: Entry | None = None
+    joint_torque: Torque | None = None
+    base_quat_xyzw: Entry | None = None
+    base_quat_wxyz: Entry | None = None
+    base_position_world: Entry | None = None
+    base_linear_velocity_world: Entry | None = None
+    base_linear_velocity_base: Entry | None = None
+    base_angular_velocity_base: Entry | None = None
+    base_angular_velocity_world: Entry | None = None
+    base_linear_acceleration_world: Entry | None = None
+    base_linear_acceleration_base: Entry | None = None
+    base_angular_acceleration_base: Entry | None = None
+    base_angular_acceleration_world: Entry | None = None
+    contact_active: Flags | None = None
+    contact_wrench_local: Wrench | None = None
+    contact_wrench_world: Wrench | None = None
+    contact_wrench_point_world: Vector | None = None
+    contact_normal_world: Entry | None = None
+    contact_force_normal: Entry | None = None
+    ft_wrench: Wrench | None = None
+    imu_frame: Name | None = None
+    imu_specific_force: Entry | None = None
+    imu_angular_velocity: Entry | None = None
+    imu_angular_acceleration: Entry | None = None
+    joint_order: Annotated[list[Name | None], BeforeValidator(partial(order_by_name, "joint"))] | None = None
+    contact_order: Annotated[list[Name | None], BeforeValidator(partial(order_by_name, "contact"))] | None = None
+    sensor_order: list[Name | None] | None = None
+    joint_name: Name = "{joint}"
+    contact_name: Name = "{contact}"
+    plates: dict[Name, Plate] = dataclasses.field(default_factory=dict)
+    ignore: Names = dataclasses.field(default_factory=list)
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -198,6 +119,35 @@ def fits(name: str, pattern: str) -> bool:
 def letters_of(pattern: str) -> int:
     """How much a pattern says: of several that a name fits, the one with most letters counts."""
     return len(re.sub(r"[*?]", "", PLACEHOLDER.sub("", pattern)))
+
+
+def values_by_name(key: str, given: Mapping[str, _X], labels: Sequence[str]) -> dict[str, _X]:
+    """Values by name, of values by pattern: that with most letters counts.
+
+    Raises:
+        ConfigError: two that say as much.
+        UnknownNameError: a pattern that no name fits.
+    """
+    out: dict[str, tuple[int, _X]] = {}
+    for pattern, value in given.items():
+        letters, found = letters_of(pattern), [label for label in labels if fits(label, pattern)]
+        if not found and letters:
+            raise UnknownNameError.at_field(key, excerpt(pattern), labels)
+        for label in found:
+            most = out.get(label, (-1, value))
+            if most[0] == letters and most[1] != value:
+                raise ConfigError.at_field(key, f"two values of {label}", "patterns of which one has more letters")
+            out[label] = max(most, (letters, value), key=lambda pair: pair[0])
+    return {label: value for label, (_, value) in out.items()}
+
+
+def values_of_all(key: str, what: str, given: Mapping[str, _X], kind: str, labels: Sequence[str]) -> list[_X]:
+    """Values of all names, of values by pattern; errors as `values_by_name`, and ConfigError for a name without one."""
+    found = values_by_name(key, given, labels)
+    without = [label for label in labels if label not in found]
+    if without:
+        raise ConfigError.at_field(key, f"no {what} of {without[0]}", f"one for every {kind}; * stands for all others")
+    return [found[label] for label in labels]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,7 +189,7 @@ def list_parts(columns: Columns) -> dict[str, Part]:
         if isinstance(entry, WrenchEntry):
             for name, quantity in (("force", "force"), ("moment", "torque")):
                 if (inner := getattr(entry, name)) is not None:
-                    axes: tuple[str, ...] = ("x", "y", "z")
+                    axes = tuple(getattr(inner, "axes", None) or _XYZ)
                     quantities = dict.fromkeys(axes, (quantity,))
                     parts[f"{field}.{name}"] = Part(f"{field}.{name}", inner, names_field(field), axes, quantities)
         if isinstance(entry, TorqueEntry) and entry.pd is not None:
@@ -249,7 +199,7 @@ def list_parts(columns: Columns) -> dict[str, Part]:
 
 def _part(key: str, field: str, entry: ColumnEntry) -> Part:
     """An entry that is like a field of a log."""
-    components = component_names(field)
+    components = tuple(getattr(entry, "axes", None) or component_names(field))
     raw = isinstance(entry, (FlagEntry, Gains))
     quantities = {name: () if raw else quantities_of(field, name) for name in components or ("",)}
     return Part(key, entry, names_field(field), components, quantities)
@@ -285,6 +235,7 @@ def check_columns(columns: Columns) -> None:
     times = [("other_times", entry) for entry in columns.other_times]
     for field, entry in (*((field, getattr(columns, field)) for field in columns.fields), *times):
         _check_given(field, entry)
+    _check_plates(columns)
     for part in (*list_parts(columns).values(), *(_part(name, "time", entry) for name, entry in times)):
         _check_part(part)
 
@@ -327,6 +278,12 @@ def _check_unscaled(field: str, entry: ColumnEntry, given: list[str], beside: st
     if given:
         found = f"{given[0]} beside {beside}, which it says nothing about"
         raise ConfigError.at_field(f"{KEY}.{field}", found, f"{beside} without {given[0]}")
+
+
+def _check_plates(columns: Columns) -> None:
+    if columns.plates and columns.contact_wrench_world is None:
+        accepted = f"an entry of {WRENCHES[1]}, readings along the plates' axes, or no plates"
+        raise ConfigError.at_field(f"{KEY}.plates", f"given without {KEY}.{WRENCHES[1]}", accepted)
 
 
 def _check_law(law: PdLaw) -> None:

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from torchid.errors import ConfigError, LogError, excerpt, join_names
-from torchid.logs.column_map import AXES, KEY, PLACEHOLDER, Columns, Part, fits, letters_of, list_parts
+from torchid.logs.column_entries import KEY
+from torchid.logs.column_map import AXES, PLACEHOLDER, Columns, Part, fits, letters_of, list_parts
 from torchid.logs.column_proposals import name_unknown
 from torchid.logs.columns import KINDS
-from torchid.logs.log import CONTACT_READINGS, IMU_FIELDS, UnknownFieldError
+from torchid.logs.log import CONTACT_READINGS, IMU_FIELDS, WRENCHES, UnknownFieldError
 
 _LISTED = 8
 
@@ -297,7 +298,10 @@ def columns_by_file(columns: Columns, given: Sequence[Sequence[str]], files: Seq
         if not any(name in of_file for of_file in found):
             none = f"no column of it in {join_names(files, _LISTED)}"
             raise LogError.at_field(f"{KEY}.{name}", none, "columns that one of the files has")
-    without: list[dict[str, Any]] = [dict.fromkeys({*columns.fields, "imu_frame"} - of_file) for of_file in found]
+    without: list[dict[str, Any]] = [
+        dict.fromkeys({*columns.fields, "imu_frame"} - of_file) | ({} if WRENCHES[1] in of_file else {"plates": {}})
+        for of_file in found
+    ]
     return [replace(own, **lacking) for own, lacking in zip(maps, without, strict=True)]
 
 

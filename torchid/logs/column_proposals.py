@@ -7,13 +7,17 @@ import re
 from collections.abc import Sequence
 
 from torchid.errors import LogError, excerpt
-from torchid.logs.log import NAME_FIELDS, SHAPES, VARIANTS
+from torchid.logs.log import NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES
 
 _FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 _LISTED, _LONGEST = 12, 60
+#: What force plates read; under which foot each lies, no name of a column says.
+OF_PLATES = (WRENCHES[1], POINTS)
 _BASE = r"\b(base|root|trunk|torso|pelvis|floating base)"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
 _WORDS = (
+    (POINTS, r"\b(cop[xyz]?|ground force p[xyz])\b"),
+    (WRENCHES[1], r"\b(ground (force|torque|moment)s?|force ?plates?|fp)\b"),
     ("base_position_world", rf"{_BASE} (pos|position|xyz)\b"),
     ("base_linear_velocity_world", rf"{_BASE} (lin vel|linear vel|linear velocity|vel|velocity)\b"),
     ("base_angular_velocity_base", rf"{_BASE} (ang vel|angular velocity|omega)\b"),

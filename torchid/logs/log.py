@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 FieldShape = tuple[str | int, ...]
 
-#: Shape of every field that a `Log` holds, in the letters N samples, n joints, C contacts, F force/torque sensors.
+#: Shape of every field of a `Log`, and of `POINTS`: N samples, n joints, C contacts, F force/torque sensors.
 SHAPES: dict[str, FieldShape] = {
     "time": ("N",),
     "joint_names": ("n",),
@@ -39,6 +39,7 @@ SHAPES: dict[str, FieldShape] = {
     "contact_active": ("N", "C"),
     "contact_wrench_local": ("N", "C", 6),
     "contact_wrench_world": ("N", "C", 6),
+    "contact_wrench_point_world": ("N", "C", 3),
     "contact_normal_world": ("N", "C", 3),
     "contact_force_normal": ("N", "C"),
     "ft_names": ("F",),
@@ -64,6 +65,7 @@ REQUIRED = ("time", "joint_names", "joint_position")
 NAME_FIELDS = {"joint_names": "n", "contact_names": "C", "ft_names": "F"}
 WRENCHES = ("contact_wrench_local", "contact_wrench_world")
 NORMALS = "contact_normal_world"
+POINTS = "contact_wrench_point_world"  # of a file alone, see `about_world_origin`
 FLAGS = "contact_active"
 FORCE_NORMAL = "contact_force_normal"
 
@@ -78,6 +80,7 @@ IMU_FIELDS = ("imu_frame", "imu_specific_force", "imu_angular_velocity")
 #: Fields that a field requires.
 REQUIRED_WITH: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("contact_active", *CONTACT_READINGS, NORMALS), ("contact_names", "contact_active")),
+    POINTS: (WRENCHES[1],),
     "ft_wrench": ("ft_names",),
     **dict.fromkeys((*IMU_FIELDS, "imu_angular_acceleration"), IMU_FIELDS),
 }
@@ -111,6 +114,8 @@ class Log:
         contact_wrench_local: (N, C, 6) [N, N m] on the robot at the contact frame's origin, in that frame's axes;
             NaN where not measured.
         contact_wrench_world: as `contact_wrench_local` but in world axes; at most one of the two is given.
+        moments_about_world_origin: whether moments of `contact_wrench_world` are about the world's origin instead of
+            the contact frames' origins.
         contact_normal_world: (N, C, 3) unit vectors away from the ground under a contact that rolls or is read along
             them; any values, NaN too, while it is in the air.
         contact_force_normal: (N, C) [N] on the robot along the ground's normal, as a scalar sensor in a foot or an
@@ -155,6 +160,7 @@ class Log:
     contact_active: BoolArray | None = None
     contact_wrench_local: FloatArray | None = None
     contact_wrench_world: FloatArray | None = None
+    moments_about_world_origin: bool = False
     contact_normal_world: FloatArray | None = None
     contact_force_normal: FloatArray | None = None
     ft_names: tuple[str, ...] = ()
@@ -208,7 +214,8 @@ class Log:
 
     def arrays(self) -> dict[str, FloatArray | BoolArray]:
         """Every array of the file format that is present and has the sample axis first, by field name."""
-        present = {name: getattr(self, name) for name, shape in SHAPES.items() if shape[:1] == ("N",)}
+        of_samples = (name for name, shape in SHAPES.items() if shape[:1] == ("N",) and name != POINTS)
+        present = {name: getattr(self, name) for name in of_samples}
         return {name: array for name, array in present.items() if array is not None}
 
     def select(self, index: slice | NDArray[np.intp] | BoolArray) -> Log:
@@ -301,7 +308,7 @@ def check_finite(name: str, values: FloatArray, *, allow_nan: bool = False, labe
         index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), bad.shape))
         accepted = f"numbers of at most {LARGEST:g}" if np.isfinite(values[index]) else "finite numbers"
         accepted += ", or NaN where nothing was measured" if allow_nan else ""
-        where = describe_element(index, labels, "xyz" if name == NORMALS else WRENCH_COMPONENTS)
+        where = describe_element(index, labels, "xyz" if name in (NORMALS, POINTS) else WRENCH_COMPONENTS)
         raise LogError.at_field(name, f"{values[index]} at {where}", accepted)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchid.logs.column_families import Family, find_families
 from torchid.logs.column_map import PLACEHOLDER
-from torchid.logs.column_proposals import is_desired, propose_field
+from torchid.logs.column_proposals import OF_PLATES, is_desired, propose_field
 from torchid.logs.columns import is_column
 from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, suitable_orders, usual_order
@@ -172,7 +172,7 @@ class _Proposer:
     def _fits(self, family: Family, name: str) -> bool:
         """Whether a family has as many columns as a field."""
         first = self.sample[family.columns[0]]
-        if first is None or not first.ndim:
+        if first is None or not first.ndim or name in OF_PLATES:
             return False
         inner = int(np.prod(first.shape[1:]))
         count = max(inner, len(family.columns)) if inner == 1 or len(family.columns) == 1 else 0

@@ -5,24 +5,24 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchid.errors import ConfigError, LogError, UnknownNameError, excerpt
-from torchid.logs.column_map import KEY, Columns, Gains, Part, PdLaw, check_columns, fits, letters_of
+from torchid.errors import LogError
+from torchid.logs.column_entries import KEY, ColumnEntry, Gains, PdLaw, VectorEntry
+from torchid.logs.column_map import Columns, Part, check_columns, values_by_name, values_of_all
 from torchid.logs.column_matching import Matched, columns_of_file, match_columns
 from torchid.logs.columns import TEXT_COLUMN, TableLayout, is_column, parse_header
-from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, SHAPES, VARIANTS, WRENCHES, FloatArray, parse_names
-from torchid.logs.spill import LazyArray
+from torchid.logs.force_plates import PlatePoses
+from torchid.logs.log import FORCE_NORMAL, NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES, FloatArray, parse_names
 from torchid.logs.units import unit_factor
 
 Take = Callable[[str], NDArray[Any]]
 """The values (N, ...) of a column or an array."""
 
 _PD = "joint_torque.pd"
-X = TypeVar("X")
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,8 @@ class _Values:
                 out = out.reshape(len(out), len(self.of.labels), len(self.of.part.components))
         if self.order is not None:
             out = out[:, self.order]
-        return out if self.factors is None else np.asarray(out * self.factors)
+        out = out if self.factors is None else np.asarray(out * self.factors)
+        return _with_zeros(out, self.of.part.entry)
 
     def _numbers(self, column: str, array: NDArray[Any]) -> FloatArray:
         if array.dtype.kind not in "fiub":
@@ -104,7 +105,8 @@ class MappedFields:
     def fields(self) -> tuple[str, ...]:
         """Fields with samples."""
         own = (name for name in self.native if name not in (*NAME_FIELDS, TEXT_COLUMN))
-        return tuple(dict.fromkeys((*self.columns.fields, *own)))
+        of_plates = (POINTS,) if self.columns.plates else ()
+        return tuple(dict.fromkeys((*self.columns.fields, *own, *of_plates)))
 
     @property
     def given(self) -> tuple[str, ...]:
@@ -145,7 +147,7 @@ class MappedFields:
             return ("joint_position",) * (law.kp is not None) + ("joint_velocity",) * (law.kd is not None)
         if name == "contact_active" and name not in self.native and not self._own(name):
             return ("time",) if self._threshold is None else self._forces
-        return ()
+        return ("time",) if name == POINTS and not self._own(name) else ()
 
     @property
     def _forces(self) -> tuple[str, ...]:
@@ -196,6 +198,11 @@ class MappedFields:
                 return take(name)
             flat = [take(column) for column in self.native[name]]
             return self._layout.field(name, flat)
+        if self.columns.plates and name in (POINTS, WRENCHES[1]):
+            return self._of_plates(name, take)
+        return self._mapped(name, take)
+
+    def _mapped(self, name: str, take: Take) -> NDArray[Any]:
         if name in self._values:
             out = self._values[name].read(take)
             return _flagged(out, self._threshold) if name == "contact_active" else out
@@ -240,6 +247,8 @@ class MappedFields:
         for name in ("kp", "kd"):
             if (gains := getattr(self._law, name, None)) is not None and gains.value:
                 self._stated_gains(name, gains)
+        if self.columns.plates:
+            self._poses()
         return self
 
     def _gains(self, name: str, take: Take) -> FloatArray | None:
@@ -250,25 +259,45 @@ class MappedFields:
 
     def _stated_gains(self, name: str, gains: Gains) -> FloatArray:
         key, joints = f"{KEY}.{_PD}.{name}", self.names["joint_names"]
-        found = _by_label(key, gains.value, joints)
-        without = [joint for joint in joints if joint not in found]
-        if without:
-            raise ConfigError.at_field(key, f"no gain of {without[0]}", "one for every joint; * stands for all others")
-        return np.array([[found[joint] for joint in joints]])
+        return np.array([values_of_all(key, "gain", gains.value, "joint", joints)])
 
     def _active(self, take: Take) -> NDArray[Any]:
         """Flags (N, C) of contacts that always touch, or whose force says whether they do."""
         if self._threshold is None:
-            return np.ones((len(take(self.sources_of("time")[0])), len(self.names["contact_names"])), dtype=np.bool_)
+            return np.ones((self._length(take), len(self.names["contact_names"])), dtype=np.bool_)
         force = self.value(self._forces[0], take)
         with np.errstate(over="ignore"):  # infinite is above any threshold
             return _flagged(force if force.ndim == 2 else np.linalg.norm(force[..., :3], axis=2), self._threshold)
+
+    def _length(self, take: Take) -> int:
+        return len(take(self.sources_of("time")[0]))
+
+    def _of_plates(self, name: str, take: Take) -> FloatArray:
+        """Wrenches, or points that their moments are about, of plates whose poses the map states, in the world."""
+        poses, contacts = self._poses(), len(self.names["contact_names"])
+        if name != POINTS:
+            return poses.wrenches(self._mapped(name, take))
+        known = any(self._own(name))
+        return poses.points(self._mapped(name, take) if known else np.zeros((self._length(take), contacts, 3)))
+
+    def _poses(self) -> PlatePoses:
+        contacts = self.names["contact_names"]
+        return PlatePoses.of(values_of_all(f"{KEY}.plates", "plate", self.columns.plates, "contact", contacts))
 
     def _wrench(self, name: str, take: Take) -> FloatArray:
         """Forces with moments, or with NaN for these, (N, C, 6)."""
         force = self._values[f"{name}.force"].read(take)
         moment = self._values.get(f"{name}.moment")
         return np.concatenate([force, np.full_like(force, np.nan) if moment is None else moment.read(take)], axis=2)
+
+
+def _with_zeros(out: FloatArray, entry: ColumnEntry) -> FloatArray:
+    """Vectors (N, C, 3) of what an entry has of them, (N, C, k)."""
+    if not isinstance(entry, VectorEntry) or entry.axes is None:
+        return out
+    whole = np.zeros((*out.shape[:-1], 3))
+    whole[..., ["xyz".index(axis) for axis in entry.axes]] = out
+    return whole
 
 
 def _n_by(shape: tuple[int, ...]) -> str:
@@ -280,26 +309,6 @@ def _flagged(values: FloatArray, above: float | None) -> FloatArray:
     return values if above is None else np.where(np.isnan(values), np.nan, values > above)
 
 
-def _by_label(key: str, given: Mapping[str, X], labels: Sequence[str]) -> dict[str, X]:
-    """Values by name, of values by pattern: that with most letters counts.
-
-    Raises:
-        ConfigError: two that say as much.
-        UnknownNameError: a pattern that no name fits.
-    """
-    out: dict[str, tuple[int, X]] = {}
-    for pattern, value in given.items():
-        letters, found = letters_of(pattern), [label for label in labels if fits(label, pattern)]
-        if not found and letters:
-            raise UnknownNameError.at_field(key, excerpt(pattern), labels)
-        for label in found:
-            most = out.get(label, (-1, value))
-            if most[0] == letters and most[1] != value:
-                raise ConfigError.at_field(key, f"two values of {label}", "patterns of which one has more letters")
-            out[label] = max(most, (letters, value), key=lambda pair: pair[0])
-    return {label: value for label, (_, value) in out.items()}
-
-
 def _factors(part: Part, names: Sequence[str]) -> FloatArray | None:
     """What the elements of a sample are multiplied by, (n,), (k,) or (n, k); None where that is 1."""
     entry, key = part.entry, f"{KEY}.{part.key}"
@@ -308,7 +317,8 @@ def _factors(part: Part, names: Sequence[str]) -> FloatArray | None:
     of_names, of_components = names if part.kind else ("",), part.components or ("",)
     elements = [(".".join(filter(None, (name, axis))), axis) for name in of_names for axis in of_components]
     labels = [label for label, _ in elements]
-    units, scales = _by_label(f"{key}.unit", entry.unit, labels), _by_label(f"{key}.scale", entry.scale, labels)
+    units = values_by_name(f"{key}.unit", entry.unit, labels)
+    scales = values_by_name(f"{key}.scale", entry.scale, labels)
     out = np.ones(len(elements))
     for index, (label, axis) in enumerate(elements):
         if label in units:
@@ -364,36 +374,3 @@ def map_arrays(columns: Columns, given: Sequence[str], load: Take) -> MappedFiel
     native = {name: (name,) for name in matching.others}
     values = _values(matching.matched, matching.names)
     return MappedFields(matching.names, columns, native, values).check()
-
-
-class MappedArray:
-    """A field whose arrays are read where it is sliced."""
-
-    def __init__(self, fields: MappedFields, name: str, arrays: Mapping[str, LazyArray]) -> None:
-        """The field of a name, of open arrays.
-
-        Raises:
-            LogError: arrays that do not fit it.
-        """
-        self._fields, self._name, self._arrays = fields, name, arrays
-        self._constant = fields.constant_sources(name)
-        for source in fields.sources_of(name):
-            if not arrays[source].shape:
-                raise LogError.at_field(f"'{source}'", "a single value", "an array with a row for each sample")
-        sampled = [source for source in fields.sources_of(name) if not self._is_constant(source)]
-        lengths = {source: arrays[source].shape[0] for source in sampled}
-        for source, length in lengths.items():
-            if length != max(lengths.values()):
-                raise LogError.at_field(f"'{source}'", f"{length} samples", f"{max(lengths.values())}, as others have")
-        first = self[slice(0, 1)]
-        self.dtype, self.shape = first.dtype, (max(lengths.values(), default=0), *first.shape[1:])
-
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
-        """Some rows."""
-        return self._fields.value(self._name, lambda source: self._read(source, rows))
-
-    def _read(self, source: str, rows: slice) -> NDArray[Any]:
-        return np.asarray(self._arrays[source][slice(None) if self._is_constant(source) else rows])
-
-    def _is_constant(self, source: str) -> bool:
-        return source in self._constant and len(self._arrays[source].shape) == 1

@@ -22,6 +22,7 @@ from torchid.logs.containers import (
     reader_errors_explained,
     save_arrays,
 )
+from torchid.logs.force_plates import about_world_origin
 from torchid.logs.gaps import bridge_gaps, refuse_gaps
 from torchid.logs.joined import read_joined
 from torchid.logs.log import (
@@ -31,6 +32,7 @@ from torchid.logs.log import (
     NAME_FIELDS,
     NAN_ALLOWED,
     NORMALS,
+    POINTS,
     REQUIRED,
     REQUIRED_WITH,
     SHAPES,
@@ -107,12 +109,12 @@ def read_log(
                 raw = read_bag(part.file, topics, progress, needs_flags)
             check(raw)
         raw = raw if part.range is None else _cut(raw, part.range)
-        return build_log(bridge_gaps(raw, bridge_gaps_s), allow_gaps)
+        return build_log(bridge_gaps(about_world_origin(raw), bridge_gaps_s), allow_gaps)
 
 
 def build_log(raw: dict[str, NDArray[Any]], allow_gaps: bool = False) -> Log:
     """The log of the fields of a file, in canonical frames and orders; LogError for invalid fields."""
-    return _to_canonical(_check_values(raw, allow_gaps))
+    return _to_canonical(_check_values(about_world_origin(raw), allow_gaps))
 
 
 def _cut(raw: dict[str, NDArray[Any]], range_: TimeRange) -> dict[str, NDArray[Any]]:
@@ -144,7 +146,7 @@ def _read_one(bridge_gaps_s: float | None, path: Path, columns: Columns | None) 
         raw = read_table(path, columns)
     else:
         raw = _read_arrays(path, columns, _check_known)
-    return bridge_gaps(raw, bridge_gaps_s if "time" in raw else None)
+    return bridge_gaps(about_world_origin(raw), bridge_gaps_s) if "time" in raw else raw
 
 
 def _read_arrays(
@@ -222,6 +224,7 @@ def _check_values(raw: dict[str, NDArray[Any]], allow_gaps: bool) -> dict[str, A
 
 def _to_canonical(fields: dict[str, Any]) -> Log:
     """The log with the variants of the file converted to canonical order and frames."""
+    fields["moments_about_world_origin"] = fields.pop(POINTS, None) is not None
     if "base_quat_wxyz" in fields:
         fields["base_quat_xyzw"] = np.roll(fields.pop("base_quat_wxyz"), -1, axis=1)
     if "base_quat_xyzw" in fields:
@@ -251,6 +254,8 @@ def write_log(log: Log, path: str | os.PathLike[str]) -> None:
     for name, names in log.names.items():
         if names or name == "joint_names":
             arrays[name] = np.array(names, dtype=np.str_)
+    if log.moments_about_world_origin:
+        arrays[POINTS] = np.zeros((len(log), len(log.contact_names), 3))
     if log.imu_frame:
         arrays["imu_frame"] = np.array(log.imu_frame)
     with about_file(os.fspath(path)):

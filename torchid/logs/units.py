@@ -60,6 +60,8 @@ def quantities_of(field: str, component: str = "") -> tuple[str, ...]:
         return ("time",)
     if field in _OF_JOINTS:
         return _OF_JOINTS[field]
+    if field == "contact_wrench_point_world":
+        return ("length",)
     if field == "contact_force_normal":
         return ("force",)
     if component in WRENCH_COMPONENTS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +12,12 @@ from torch import Tensor
 
 from torchid.errors import LogError, UnknownNameError
 from torchid.logs import Log
+from torchid.logs.log import POINTS
 from torchid.parameters import Array
 from torchid.regressor import motion_from_state
 from torchid.regressor.kinematics import GRAVITY_WORLD, rotation_matrix
 from torchid.robot import Robot
+from torchid.sensing import Contact
 
 _POSE_FIELDS = (
     "base_quat_xyzw",
@@ -39,12 +41,14 @@ class BaseMotion:
         quat_xyzw: (N, 4), rotates base to world.
         specific_force: (N, 3), acceleration of the base origin minus gravity [m/s^2].
         angular_velocity, angular_acceleration: (N, 3) [rad/s, rad/s^2].
+        position: (N, 3) [m], of the origin in the world; for wrenches about the world's origin alone.
     """
 
     quat_xyzw: Tensor | None = None
     specific_force: Tensor | None = None
     angular_velocity: Tensor | None = None
     angular_acceleration: Tensor | None = None
+    position: Tensor | None = None
 
     @classmethod
     def from_coordinates(cls, q: Tensor, v: Tensor, a: Tensor, fixed_base: bool = False) -> BaseMotion:
@@ -108,6 +112,26 @@ def base_motion(log: Log, robot: Robot) -> BaseMotion:
     _, omega, alpha, acceleration = (torch.from_numpy(getattr(log, name)) for name in _POSE_FIELDS)
     force = acceleration - acceleration.new_tensor(GRAVITY_WORLD)
     return BaseMotion(quat, (rotation_matrix(quat).mT @ force[..., None])[..., 0], omega, alpha)
+
+
+def position_for_moments(log: Log, robot: Robot, contacts: Sequence[Contact]) -> Tensor | None:
+    """Position of the base in the world, (N, 3) [m], where moments of contacts are about the world's origin; else None.
+
+    A bolted base of which no pose was recorded is the world.
+
+    Raises:
+        LogError: it was not recorded.
+    """
+    has_moments = any(max(contact.components) >= 3 and not contact.along_normal for contact in contacts)
+    if not log.moments_about_world_origin or not has_moments:
+        return None
+    if log.base_position_world is not None:
+        return torch.from_numpy(log.base_position_world)
+    if robot.fixed_base and log.base_quat_xyzw is None:
+        return torch.zeros(len(log), 3, dtype=torch.float64)
+    found = "given without base_position_world, by which moments are moved to the contact frames"
+    accepted = "base_position_world and the base's orientation in the same world, or moments about the frames' origins"
+    raise LogError(log.source, POINTS, found, accepted)
 
 
 def _links_on_base(robot: Robot) -> list[str]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchid.problem.contact_state import ContactStateLayout
 from torchid.problem.extras import Extra
+from torchid.problem.recorded_wrenches import FramePoses
 from torchid.problem.samples import Samples
 from torchid.regressor.tree import KinematicTree
 
@@ -40,7 +41,7 @@ def extra_columns(
     tree: KinematicTree,
     measured: Tensor,
     W: Tensor,
-    rotations: dict[int, Tensor],
+    poses: dict[int, FramePoses],
 ) -> Iterator[Tensor]:
     """Columns of extra parameters in coupled rows, (r, B) each.
 
@@ -51,7 +52,7 @@ def extra_columns(
         tree: of the robot.
         measured: (B, k_m, base rows + coupled joints), rows of the contact Jacobian of the measured components.
         W: (B, base rows + coupled joints, r), the basis.
-        rotations: by contact, (B, 3, 3) from its frame to the recorded axes where these are the world's; none of a
+        poses: by contact, of its frame in the world where wrenches were recorded along the world's axes; none of a
             contact that is read along the ground's normal.
     """
     projected = (measured @ W).permute(1, 2, 0)  # rows per unit of each measured component
@@ -64,9 +65,10 @@ def extra_columns(
                 column = column + row.T * dof_extra_column(extra, dof, samples, tree)
         for contact, axis in extra.contacts:
             reading = contact_extra_column(extra, samples, contact, axis)
-            vector = range(3) if axis < 3 else range(3, 6)
-            for k in vector if contact in rotations else [axis]:
+            own = poses.get(contact)
+            unit = None if own is None else own.of_unit(axis)
+            for k in [axis] if own is None else own.reached(axis):
                 if (contact, k) in components:
-                    along = rotations[contact][:, axis % 3, k % 3] * reading if contact in rotations else reading
+                    along = reading if unit is None else unit[:, k] * reading
                     column = column + projected[components.index((contact, k))] * along
         yield column

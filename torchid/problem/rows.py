@@ -20,6 +20,7 @@ from torchid.problem.contact_state import (
 )
 from torchid.problem.extra_columns import dof_extra_column, extra_columns
 from torchid.problem.extras import ExtraTerms, list_extras
+from torchid.problem.recorded_wrenches import FramePoses
 from torchid.problem.row_blocks import RowBlock, multiply_wrenches, turn_rows
 from torchid.problem.samples import Samples
 from torchid.problem.wrench_rows import wrenches_at_ground
@@ -250,13 +251,11 @@ class RowBuilder(nn.Module):
         wrench = samples.wrench[:, contact]
         if not samples.wrench_in_world or self.contacts[contact].along_normal:
             return wrench
-        return (self._rotation(contact, kinematics).mT @ wrench.unflatten(1, (2, 3)).mT).mT.flatten(1)
+        return self._frame_poses(contact, samples, kinematics).in_frame(wrench)
 
-    def _rotation(self, contact: int, kinematics: ChunkKinematics) -> Tensor:
-        """Rotation contact frame to world, (B, 3, 3), or to a bolted base whose orientation is unknown."""
-        body, _ = self.frames[contact]
-        rotation = kinematics.states.rotation[:, :, body].permute(2, 0, 1) @ self._layouts.frame_rotation(contact)
-        return rotation if kinematics.rotation_world_base is None else kinematics.rotation_world_base @ rotation
+    def _frame_poses(self, contact: int, samples: Samples, kinematics: ChunkKinematics) -> FramePoses:
+        axes, origin = self._layouts.frame_rotation(contact), self._layouts.frame_origin(contact)
+        return FramePoses.of(samples, kinematics, self.frames[contact][0], axes, origin)
 
     def recorded_torque(self, samples: Samples) -> Tensor:
         """Recorded joint torques and wrenches in limbs, (B, n + 6 F) [N m, N], NaN where not recorded."""
@@ -318,9 +317,9 @@ class RowBuilder(nn.Module):
         extras = [self.extras[column - self.columns.count] for column in block.extras]
         touching = {contact for extra in extras for contact, _ in extra.contacts}
         turned = touching.difference(self._layouts.along_normal) if part.samples.wrench_in_world else ()
-        rotations = {k: self._rotation(k, part.dynamics) for k in turned}
+        poses = {k: self._frame_poses(k, part.samples, part.dynamics) for k in turned}
         basis = W.permute(2, 0, 1)
-        columns = extra_columns(extras, part.samples, layout, self.tree, part.measured, basis, rotations)
+        columns = extra_columns(extras, part.samples, layout, self.tree, part.measured, basis, poses)
         return torch.stack(list(columns))
 
     def _project(

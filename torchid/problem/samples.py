@@ -16,7 +16,7 @@ from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
 from torchid.parameters import WRENCH_COMPONENTS
-from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose
+from torchid.problem.base_motion import BaseMotion, base_motion, imu_pose, position_for_moments
 from torchid.problem.extras import recorded_components
 from torchid.problem.motion_noise import MotionNoise, bind_motion_noise
 from torchid.regressor import Motion
@@ -40,6 +40,7 @@ class Samples:
         torque: (N, n + 6 F) [N m, N, N m] by the robot's `dof_names`: joint torques, then wrenches of sensors in limbs;
             NaN where not measured, or None.
         wrench: (N, C, 6), NaN where not measured, or None; along world axes if `wrench_in_world`, else the frames'.
+            Moments are about the frames' origins, or about the world's if `base.position` is known.
             Of a contact that is read along the ground's normal the force along it, in place of fz, is all.
         active: (N, C) bool.
         oversampling: samples per independent sample of the sensors' noise, above 1 in a filtered log: half the sample
@@ -181,13 +182,16 @@ def bind_log(log: Log, robot: Robot, contacts: Sequence[Contact], required: Sens
     """
     order = joint_order(log, robot)
     position, velocity, acceleration = (_joints(log, name, order) for name in _JOINT_FIELDS)
-    base = base_motion(log, robot)
+    base = replace(base_motion(log, robot), position=position_for_moments(log, robot, contacts))
     chosen, active = _contacts(log, robot, contacts)
     if log.contact_wrench_world is not None and contacts and base.quat_xyzw is None and not robot.fixed_base:
         accepted = "base_quat_wxyz or base_quat_xyzw beside the IMU, or contact_wrench_local"
         raise LogError(log.source, "contact_wrench_world", "given without the base's orientation", accepted)
     normals = _contact_normals(log, robot, contacts, base, chosen, active)
     wrench = _wrenches(log, contacts, chosen)
+    if wrench is not None and base.position is not None:  # whatever is not known of a force is not of a moment either
+        lost = np.isnan(wrench[..., :3]).any(axis=2, keepdims=True) & (np.arange(6) >= 3)
+        wrench = np.where(lost, np.nan, wrench) if lost.any() else wrench
     unloaded = unloaded_readings(log) if contacts else None
     imu = imu_pose(log, robot) if log.imu_frame and not robot.fixed_base else None
     samples = Samples(

@@ -1,0 +1,196 @@
+"""Recordings of force plates through the commands: the fit is that of wrenches at the feet."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from large import SMALL, assert_same, is_on_disk, samples_of
+from motions import value
+from plates import LABORATORIES, PLATES_MAP, centres_of_pressure, opensim_csv, plates_csv, walk, write_motion
+from raw_logs import write_arrays
+from refusals import refusal
+from repository import SHARED
+from scipy.spatial.transform import Rotation
+from simulated import BIPED, feet_of
+from trainings import without_figures
+
+from torchid.cli import main
+from torchid.logs import Log, read_log, write_log
+
+MOTION = "motion.npz + plates.csv"
+
+
+@pytest.fixture(autouse=True)
+def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_figures(monkeypatch)
+
+
+def experiment(folder: Path, log: str, columns: str | None = None, **preprocessing: Any) -> Path:
+    """An experiment file that fits all sensors to one part of a log and tests on the other."""
+    settings = {
+        "robot": {"urdf": str(BIPED)},
+        "contacts": [{"frame": "l_sole", "type": "flat"}, {"frame": "r_sole", "type": "flat"}],
+        "logs": {"train": [f"{log}[0:2]"], "test": [f"{log}[2:]"]}
+        | ({"columns": yaml.safe_load(columns)} if columns else {}),
+        "sensors": "full",
+        "estimator": {"name": "least_squares", "ridge": 1e-3},
+        "preprocessing": preprocessing,
+        "output": str(folder / "run"),
+    }
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(settings, sort_keys=False))
+    return folder / "experiment.yaml"
+
+
+def identified(file: Path, *overrides: str) -> tuple[np.ndarray, dict[str, float]]:
+    """Every identified parameter, and errors on the test log."""
+    assert main(["identify", str(file), "overwrite=true", *overrides]) == 0
+    run = file.parent / "run"
+    bodies = json.loads((run / "parameters.json").read_text())["bodies"]
+    test = json.loads((run / "metrics.json").read_text())["test"]
+    errors = {name: x for name, x in test.items() if isinstance(x, float)}
+    return np.array([x for body in bodies for x in body["identified"].values()]), errors
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, dict[str, float]]:
+    """What wrenches at the soles give."""
+    folder = tmp_path_factory.mktemp("soles")
+    write_log(walk(), folder / "walk.npz")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        without_figures(monkeypatch)
+        return identified(experiment(folder, "walk.npz"))
+
+
+def recorded(folder: Path, laboratory: str, log: Log) -> str:
+    """Files of a motion and of plates, and the map of these."""
+    write, text = LABORATORIES[laboratory]
+    write_motion(folder / "motion.npz", log)
+    write(folder / "plates.csv", log)
+    return text
+
+
+@pytest.mark.parametrize("laboratory", LABORATORIES)
+def test_a_fit_to_plates_is_that_to_wrenches_at_the_soles(
+    laboratory: str, tmp_path: Path, expected: tuple[np.ndarray, dict[str, float]]
+) -> None:
+    text = recorded(tmp_path, laboratory, walk())
+    parameters, errors = identified(experiment(tmp_path, MOTION, text))
+    assert np.abs(parameters - expected[0]).max() < 1e-9 * np.abs(expected[0]).max()
+    assert errors == pytest.approx(expected[1], rel=1e-9)
+
+
+def test_a_converted_log_is_fitted_block_by_block_compressed_checked_and_judged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: tuple[np.ndarray, dict[str, float]]
+) -> None:
+    text = recorded(tmp_path, "plates", walk())
+    file, log = experiment(tmp_path, "walk.parquet", text), str(tmp_path / "walk.parquet")
+    assert main(["convert", str(tmp_path / MOTION), log, "--columns", str(file)]) == 0
+    parameters, _ = identified(file, SMALL)
+    assert np.abs(parameters - expected[0]).max() < 1e-9 * np.abs(expected[0]).max()
+    assert main(["compress", str(file), "--output", str(tmp_path / "factors")]) == 0
+    factor = str(tmp_path / "factors" / "walk[0:2].factor")
+    of_factor, _ = identified(file, f"logs.train=['{factor}']")
+    assert np.abs(of_factor - parameters).max() < 1e-9 * np.abs(parameters).max()
+    assert main(["evaluate", str(tmp_path / "run"), "--log", f"{log}[2:]"]) == 0
+    capsys.readouterr()
+    assert main(["check", log, "--urdf", str(BIPED)]) in (0, 1)
+    assert "point" not in capsys.readouterr().out
+
+
+ARRAYS_MAP = """
+contact_order: [l_sole, r_sole]
+contact_wrench_world: {force: grf, moment: {column: free_moment, axes: [z]}}
+contact_wrench_point_world: {column: cop, unit: cm}
+contact_active: {above: 20}
+plates: {"*": {rpy_deg: [0, 0, 30], position: [1, 2, 3]}}
+"""
+
+
+def table(folder: Path) -> Path:
+    """One table of motion and plates."""
+    motion, plates = (write_motion(folder / "motion.csv", walk()), folder / "plates.csv")
+    plates_csv(plates, walk())
+    rows = [both for both in zip(*(x.read_text().splitlines() for x in (motion, plates)), strict=True)]
+    (folder / "both.csv").write_text("\n".join(f"{a},{b.partition(',')[2]}" for a, b in rows) + "\n")
+    return folder / "both.csv"
+
+
+def arrays(folder: Path) -> Path:
+    """One file of arrays, with centres of pressure on plates that are turned and shifted."""
+    with np.load(write_motion(folder / "motion.npz", walk())) as motion:
+        known = dict(motion)
+    points, free = centres_of_pressure(walk())
+    into, force = Rotation.from_euler("z", -30.0, degrees=True), value(walk().contact_wrench_world)[..., :3]
+
+    def turned(vectors: np.ndarray) -> np.ndarray:
+        return into.apply(vectors.reshape(-1, 3)).reshape(vectors.shape)
+
+    known |= {"grf": turned(force), "cop": 100.0 * turned(points - [1.0, 2.0, 3.0]), "free_moment": free[..., None]}
+    return write_arrays(folder / "both.h5", known)
+
+
+@pytest.mark.parametrize(("write", "columns"), [(table, PLATES_MAP), (arrays, ARRAYS_MAP)], ids=["table", "arrays"])
+@pytest.mark.parametrize("cutoff", ["null", "8"])
+def test_a_map_of_plates_is_read_block_by_block_as_a_whole(
+    write: Callable[[Path], Path], columns: str, cutoff: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchid.commands.large_log.SPLINE_BLOCK", 256)
+    file = experiment(tmp_path, write(tmp_path).name, columns)
+    whole, large = (samples_of(file, f"preprocessing.cutoff_hz={cutoff}", *more) for more in ((), (SMALL,)))
+    assert is_on_disk(large)
+    assert_same(large, whole, 1e-10)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded logs (../shared/data) are not here")
+@pytest.mark.parametrize("off", [0.0, 0.1])
+def test_a_plate_that_lies_elsewhere_is_noticed(off: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A person on two plates, said to be 10 cm from where they are."""
+    urdf, log = SHARED / "human_squats" / "human.urdf", read_log(SHARED / "human_squats" / "squats1.npz")
+    wrench = value(log.contact_wrench_world)
+    moments = wrench[..., 3:] + np.cross(feet_of(log, urdf)[0] - [off, 0.0, 0.0], wrench[..., :3])
+    turned = np.concatenate([wrench[..., :3], moments], axis=2)
+    write_log(replace(log, contact_wrench_world=turned, moments_about_world_origin=True), tmp_path / "walk.npz")
+    main(["check", str(tmp_path / "walk.npz"), "--urdf", str(urdf)])
+    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert ("contact_wrench_world, point" in out) == bool(off)
+    assert ("check the points of" in out) == bool(off)
+
+
+def test_plates_without_a_pose_in_their_world_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = recorded(tmp_path, "OpenSim", walk())
+    file = experiment(tmp_path, MOTION, text, base_motion="contacts")
+    assert "contact_wrench_world: given, but preprocessing.base_motion: contacts knows no" in refusal(
+        ["identify", str(file)], tmp_path, capsys
+    )
+    with np.load(tmp_path / "motion.npz") as arrays:
+        rest = {name: x for name, x in arrays.items() if name != "base_position_world"}
+    velocity = np.gradient(value(walk().base_position_world), walk().time, axis=0)
+    np.savez(tmp_path / "motion.npz", base_linear_velocity_world=velocity, **rest)
+    complaint = refusal(["identify", str(experiment(tmp_path, MOTION, text))], tmp_path, capsys)
+    assert "contact_wrench_point_world: given without base_position_world" in complaint
+
+
+def test_init_and_check_know_readings_of_plates_by_their_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opensim_csv(tmp_path / "grf.csv", walk())
+    assert main(["check", str(tmp_path / "grf.csv")]) == 2
+    complaint = capsys.readouterr().err
+    assert "'ground_force_vx' and 1 like it (contact_wrench_world?)" in complaint
+    assert "'ground_force_px' and 1 like it (contact_wrench_point_world?)" in complaint
+    for write in (opensim_csv, plates_csv):
+        write(tmp_path / "grf.csv", walk())
+        out = tmp_path / f"{write.__name__}.yaml"
+        assert main(["init", str(BIPED), str(tmp_path / "grf.csv"), "--output", str(out)]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert "may be readings of force plates, without which foot stands on which" in said
+        assert not {"contact_wrench_local", "contact_wrench_world"} & set(
+            yaml.safe_load(out.read_text())["logs"]["columns"]
+        )

@@ -1,0 +1,140 @@
+"""Entries of a map of columns: where one field of a log is, or what it is computed from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from torchid.settings import Number
+
+KEY = "logs.columns"
+STRICT = ConfigDict(extra="forbid")
+Name = Annotated[str, Field(min_length=1)]
+Names = list[Name]
+_EVERYTHING = "*"
+_Three = tuple[Number, Number, Number]
+_GAINS = ("value", "column", "columns", "order", "first_index")
+
+
+def _for_all(value: object) -> object:
+    return value if isinstance(value, Mapping) else {_EVERYTHING: value}
+
+
+def _column(value: object) -> object:
+    return {"column": value} if isinstance(value, str) else value
+
+
+def _gains(value: object) -> object:
+    if isinstance(value, str):
+        return {"column": value}
+    if isinstance(value, Mapping) and set(value) & set(_GAINS):
+        return value
+    return {"value": value}
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class ColumnEntry:
+    """The columns, or the array, of one field.
+
+    Attributes:
+        column: its name, or a pattern: `{joint}`, `{contact}` or `{sensor}` stands for a name, `{index}` for the number
+            of one in `order` (or of a component), `{axis}` for a component (x, y, z; w, x, y, z; fx to mz), `{AXIS}`
+            for the same in capitals.
+        columns: by name or component, its column, in place of a pattern.
+        order: names, by number; null for a number that is no joint (contact, sensor) of the robot.
+        first_index: number of the first of them.
+        unit: by pattern of a name or component, or one for all; SI units by default.
+        scale: what numbers are multiplied by, likewise: -1 turns a sign.
+    """
+
+    column: Name | None = None
+    columns: dict[Name, Name] = dataclasses.field(default_factory=dict)
+    order: Annotated[list[Name | None], Field(min_length=1)] | None = None
+    first_index: int = 0
+    unit: Annotated[dict[str, Name], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+    scale: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+
+
+Entry = Annotated[ColumnEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class Gains(ColumnEntry):
+    """Gains [N m/rad, N m s/rad]: `value` by pattern of the joint or one for all, or columns, or an array (n,)."""
+
+    value: Annotated[dict[str, Number], BeforeValidator(_for_all)] = dataclasses.field(default_factory=dict)
+
+
+GainsEntry = Annotated[Gains, BeforeValidator(_gains)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class PdLaw:
+    """kp (position - q) + kd (velocity - dq) + feed_forward, with desired values; what is not given is 0."""
+
+    kp: GainsEntry | None = None
+    kd: GainsEntry | None = None
+    position: Entry | None = None
+    velocity: Entry | None = None
+    feed_forward: Entry | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class TorqueEntry(ColumnEntry):
+    """Torques as columns, or of a PD law."""
+
+    pd: PdLaw | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class FlagEntry(ColumnEntry):
+    """Contact flags as columns.
+
+    Attributes:
+        above: contacts are active where the number is above this, in its unit; without columns that of the contact's
+            force [N].
+        always: contacts that are active throughout, in place of columns.
+    """
+
+    above: Number | None = None
+    always: Names = dataclasses.field(default_factory=list)
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class VectorEntry(ColumnEntry):
+    """Moments or points as columns of their components; `axes`: those that have one, others are 0."""
+
+    axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1)] | None = None
+
+
+Vector = Annotated[VectorEntry, BeforeValidator(_column)]
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class WrenchEntry(ColumnEntry):
+    """Wrenches as columns of all components, or forces and moments each for themselves (x, y, z); no moments: NaN."""
+
+    force: Entry | None = None
+    moment: Vector | None = None
+
+
+@dataclass(config=STRICT, frozen=True, kw_only=True)
+class Plate:
+    """Pose of a force plate, of the axes and the origin that its readings have, in the world.
+
+    Attributes:
+        position: [m], of the origin.
+        rpy_deg: [deg], roll, pitch and yaw of the axes as in a URDF: about the world's x, then y, then z.
+    """
+
+    position: _Three = (0.0, 0.0, 0.0)
+    rpy_deg: _Three = (0.0, 0.0, 0.0)
+
+
+Torque = Annotated[TorqueEntry, BeforeValidator(_column)]
+Flags = Annotated[FlagEntry, BeforeValidator(_column)]
+Wrench = Annotated[WrenchEntry, BeforeValidator(_column)]
