@@ -7,7 +7,6 @@ import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
-from math import isfinite
 from textwrap import fill
 from typing import TYPE_CHECKING
 
@@ -18,13 +17,7 @@ from torchid.ranks import is_launched_first, share_work
 from torchid.staging import interrupts_deferred
 
 if TYPE_CHECKING:
-    from torchid.commands import Identification
     from torchid.commands.analyze import ScenarioAnalysis
-    from torchid.fitting.cross_validation import CrossValidation
-    from torchid.fitting.misfit import Misfit
-    from torchid.fitting.noise import NoiseSummary
-    from torchid.identifiability.confounding import TotalMass
-    from torchid.problem.metrics import WorseThanNominal
 
 _IDENTIFY = "fit the parameters of an experiment file and write a run folder"
 _COMPRESS = "compress the training logs of an experiment file to small files of factors, which identify fits too"
@@ -76,6 +69,9 @@ def _parser() -> argparse.ArgumentParser:
     identify = commands.add_parser("identify", help=_IDENTIFY, description=_IDENTIFY)
     identify.add_argument("file", help="experiment file (YAML)")
     identify.add_argument("overrides", nargs="*", default=[], help="key.subkey=value, for example estimator.ridge=0.01")
+    amount = identify.add_mutually_exclusive_group()
+    amount.add_argument("--verbose", "-v", action="store_true", help="print all tables, not the answer alone")
+    amount.add_argument("--quiet", "-q", action="store_true", help="print nothing but warnings and errors")
     identify.add_argument("--resume", action="store_true", help="continue an interrupted training (sgd)")
     identify.set_defaults(command=_identify)
     compress = commands.add_parser("compress", help=_COMPRESS, description=_COMPRESS)
@@ -149,129 +145,12 @@ def _identify(options: argparse.Namespace) -> None:
     with _importing():
         from torchid.commands.identify import identify
         from torchid.config import load_config
-        from torchid.estimators import Estimate
-        from torchid.report.tables import (
-            contribution_table,
-            error_tables,
-            extra_table,
-            print_tables,
-            state_table,
-            verdict_counts_table,
-            verdict_table,
-            violation_table,
-        )
+        from torchid.terminal.answer import print_answer
+        from torchid.terminal.details import print_details
 
     run = identify(load_config(options.file, options.overrides), options.resume)
-    estimate, robot = run.estimate, run.experiment.robot
-    if run.worse:
-        _print_headline(run.worse)
-    if not run.misfit.explained:
-        _print_misfit(run.misfit)
-    print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
-    if 0 < run.evaluated["train"] < run.samples:
-        print(f"train         errors of forces of {run.evaluated['train']} of {run.samples} samples, evenly spaced")
-    print_tables(
-        contribution_table(run.contributions),
-        verdict_table(robot.body_names, estimate.verdict),
-        verdict_counts_table(run.by_state, estimate),
-    )
-    _print_noise(run.noise)
-    if run.extras:
-        print_tables(extra_table(run.extras))
-    if run.violations:
-        print_tables(violation_table(run.violations_by_name()))
-        if type(estimate) is Estimate:
-            print("estimator.name=consistent finds the best parameters that break none of them")
-    _print_fit(run)
-    timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
-    print(fill(f"time          {run.samples} samples: {timed}", 100, subsequent_indent=" " * 14))
-    if run.reused:
-        print(f"from cache    {', '.join(run.reused)}")
-    print(f"written to    {run.experiment.config.output}")
-
-
-def _print_headline(worse: list[WorseThanNominal]) -> None:
-    from torchid.problem.metrics import ADVICE, describe_worse
-
-    for line in (
-        f"WORSE THAN URDF: {describe_worse(worse)}",
-        f"{ADVICE}; the results are written all the same, status 0",
-    ):
-        print(fill(line, 100, subsequent_indent="  "))
-
-
-def _print_misfit(misfit: Misfit) -> None:
-    print(fill(f"NOT EXPLAINED: the model does not explain these forces: {misfit}", 100, subsequent_indent="  "))
-    if misfit.error_growth is not None and misfit.error_growth > 1.0:
-        advice = "look for friction, compliance or contacts that the model lacks, and for wrong sensors (torchid check)"
-        growth = f"standard errors are {misfit.error_growth:.2g} times (median) what noise alone would make of them"
-        print(fill(f"  {growth}; {advice}", 100, subsequent_indent="  "))
-
-
-def _print_noise(noise: NoiseSummary) -> None:
-    from torchid.report.tables import noise_advice, noise_table, print_tables
-
-    print_tables(noise_table([asdict(group) for group in noise.groups]))
-    if noise.suggested:
-        print(noise_advice(noise.suggested))
-
-
-def _print_fit(run: Identification) -> None:
-    """Print the key figures, one per line."""
-    from torchid.commands.training import body_eigenvalues
-    from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, SgdEstimate
-
-    estimate, robot = run.estimate, run.experiment.robot
-    _print_rolling(run.experiment.rolling)
-    identified = f"{estimate.rank} independent combinations of {int(estimate.phi.size)} identified"
-    print(f"parameters    {identified}\ncondition     {estimate.condition_number:.3g}")
-    rest = "" if run.misfit.expected is None else f"; {run.misfit.expected:.3g} are left by noise alone"
-    print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise{rest}")
-    if run.motion_noise.combinations:
-        print(fill(f"motion noise  {run.motion_noise}", 100, subsequent_indent=" " * 14))
-    if run.validation is not None:
-        _print_validation(run.validation)
-    for name, choice in (("cutoff", run.cutoff), ("ridge", run.ridge), ("sign width", run.sign_width)):
-        if choice is not None:
-            print(fill(f"{name:14}{choice}", 100, subsequent_indent=" " * 14))
-    least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
-    print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
-    if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
-        print(f"objective     {100.0 * estimate.relative_increase:.3g} % above the least without conditions")
-    if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
-        print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
-    if isinstance(estimate, SgdEstimate):
-        print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
-    print(f"total mass    {_mass_text(run.mass)} (URDF: {run.mass.nominal:.3f} kg)")
-    if run.robust is not None:
-        kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
-        print(f"robust        {run.robust.loss}, {kept}, {run.robust.passes} passes")
-    if robot.massless:
-        print(fill(f"left out      massless: {', '.join(robot.massless)}", 100, subsequent_indent=" " * 14))
-
-
-def _print_validation(validation: CrossValidation) -> None:
-    from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
-
-    identified, nominal = validation.identified.rms, validation.nominal.rms
-    texts = (describe_errors(group, identified.get(group), nominal.get(group)) for group in DECISIVE_GROUPS)
-    text = f"held out      each of {validation.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
-    print(fill(text, 100, subsequent_indent=" " * 14))
-
-
-def _print_rolling(rolling: str) -> None:
-    if rolling:
-        print(fill(f"rolling       {rolling}", 100, subsequent_indent=" " * 14))
-
-
-def _mass_text(mass: TotalMass) -> str:
-    """The total mass with its standard error, or the reason why it is not determined."""
-    if mass.determined:
-        return f"{mass.value:.3f} ± {mass.standard_error:.2g} kg"
-    if not mass.separable:
-        return "not determined: confounded with offsets"
-    known = f", standard error {mass.standard_error:.2g} kg" if isfinite(mass.standard_error) else ""
-    return f"not determined by the data{known}"
+    if not options.quiet:
+        (print_details if options.verbose else print_answer)(run)
 
 
 def _compress(options: argparse.Namespace) -> None:
@@ -279,12 +158,13 @@ def _compress(options: argparse.Namespace) -> None:
         from torchid.commands.compress import compress
         from torchid.config import load_config
         from torchid.report.tables import compression_table, print_tables, state_table
+        from torchid.terminal.lines import print_noise, print_rolling
 
     done = compress(load_config(options.file, options.overrides), options.output)
     print_tables(state_table([asdict(state) for state in done.states]))
-    _print_noise(done.noise)
+    print_noise(done.noise)
     print_tables(compression_table([asdict(file) for file in done.files]))
-    _print_rolling(done.rolling)
+    print_rolling(done.rolling)
     print(f"written to    {done.output}")
 
 
@@ -304,9 +184,10 @@ def _analyze(options: argparse.Namespace) -> None:
         from torchid.config import load_analysis
         from torchid.report.analysis import accuracy_table, confounded_lines
         from torchid.report.tables import print_tables
+        from torchid.terminal.lines import print_rolling
 
     analysis = analyze(load_analysis(options.file, options.overrides))
-    _print_rolling(analysis.scene.rolling)
+    print_rolling(analysis.scene.rolling)
     for scenario in analysis.scenarios:
         _print_scenario(scenario)
     if analysis.accuracies:
@@ -326,12 +207,13 @@ def _print_scenario(scenario: ScenarioAnalysis) -> None:
         sets_table,
     )
     from torchid.report.tables import print_tables
+    from torchid.terminal.lines import print_labelled
 
     plan, base = scenario.plan, scenario.base
     print(f"Scenario {scenario.name}")
     print_tables(branch_table(plan), *([sets_table(plan.parts)] if plan.parts else []))
     proof = "no cheaper set exists" if plan.proven else "whether a cheaper set exists is not proven"
-    print(fill(f"chosen        {join_names(plan.chosen)}", 100, subsequent_indent=" " * 14))
+    print_labelled("chosen", join_names(plan.chosen))
     print(f"cost          {plan.cost:g}; {proof}")
     named = {"Chosen sensors": plan.observability}
     if scenario.proposed is not None and scenario.proposed is not plan.observability:
@@ -353,6 +235,7 @@ def _check(options: argparse.Namespace) -> int:
         from torchid.commands.check import check_files, check_outputs, write_check_outputs
         from torchid.report.log_checks import finding_table, log_heading, skipped_checks_text
         from torchid.report.tables import print_tables
+        from torchid.terminal.lines import print_labelled, print_rolling
 
     inputs = (options.file, options.urdf, options.topics, options.columns)
     check_outputs(options.json, options.figure, options.overwrite, inputs)
@@ -360,14 +243,14 @@ def _check(options: argparse.Namespace) -> int:
     checked = check_files(options.file, options.overrides, **robot, topics=options.topics, columns=options.columns)
     write_check_outputs(checked, options.json, options.figure)
     if checked:
-        _print_rolling(checked[0].rolling)
+        print_rolling(checked[0].rolling)
     for log in checked:
         print(log_heading(log))
         if log.findings:
             print_tables(finding_table(log.findings))
         if skipped := skipped_checks_text(log):
-            print(fill(f"not checked   {skipped}", 100, subsequent_indent=" " * 14))
-        print(fill(f"verdict       {log.verdict}", 100, subsequent_indent=" " * 14))
+            print_labelled("not checked", skipped)
+        print_labelled("verdict", log.verdict)
         print()
     return 0 if all(log.usable for log in checked) else 1
 
@@ -392,9 +275,10 @@ def _simulate(options: argparse.Namespace) -> None:
         from torchid.commands.simulate import simulate, simulated_balls
         from torchid.config import load_simulation
         from torchid.report.tables import print_tables, stability_table
+        from torchid.terminal.lines import print_rolling
 
     config = load_simulation(options.file, options.overrides)
     stabilities = simulate(config)
-    _print_rolling(simulated_balls(config))
+    print_rolling(simulated_balls(config))
     print_tables(stability_table({name: asdict(stability) for name, stability in stabilities.items()}))
     print(f"written to    {config.output}")

@@ -75,7 +75,7 @@ def keys_in(folder: Path) -> set[str]:
 def test_a_run_from_the_cache_has_the_results_of_one_without_to_the_last_bit(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    line = ["identify", str(demo), *ESTIMATORS[name]]
+    line = ["identify", "--verbose", str(demo), *ESTIMATORS[name]]
     assert main([*line, f"output={tmp_path / 'without'}", NONE]) == 0
     assert not (tmp_path / FOLDER).exists()
     expected = results(tmp_path / "without")
@@ -242,7 +242,7 @@ def test_a_log_with_other_content_is_read_whatever_its_size_and_time_say(
     assert (log.stat().st_size, log.stat().st_mtime_ns) == (state.st_size, state.st_mtime_ns)
     capsys.readouterr()
     for name, more in (("after", ()), ("without", (NONE,))):
-        assert main(["identify", str(file), f"output={tmp_path / name}", *more]) == 0
+        assert main(["identify", "-v", str(file), f"output={tmp_path / name}", *more]) == 0
     assert "from cache    samples of 1 log\n" in capsys.readouterr().out
     assert results(tmp_path / "after") == results(tmp_path / "without") != results(tmp_path / "before")
 
@@ -329,7 +329,7 @@ def test_a_run_with_damaged_entries_says_so_and_has_the_same_results(
     lines = [line for line in capsys.readouterr().err.splitlines() if "a damaged entry of the cache" in line]
     assert len(lines) == 3, "two logs and the factors"
     assert results(tmp_path / "second") == results(tmp_path / "first")
-    assert main(["identify", str(demo), f"output={tmp_path / 'third'}"]) == 0
+    assert main(["identify", "-v", str(demo), f"output={tmp_path / 'third'}"]) == 0
     assert "from cache    samples of 2 logs, factors" in capsys.readouterr().out
 
 

@@ -138,7 +138,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_of_factors_says_what_it_can(fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "run"
-    assert main(["identify", str(fleet / "experiment.yaml"), f"output={output}"]) == 0
+    assert main(["identify", "--verbose", str(fleet / "experiment.yaml"), f"output={output}"]) == 0
     printed = capsys.readouterr().out
     assert "What each log and contact state adds" in printed
     assert {path.name.split(".")[0] for path in output.glob("*.png")} == {

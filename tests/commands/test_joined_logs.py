@@ -48,7 +48,7 @@ def identified(out: str, train: list[Any], test: list[Any], *overrides: str) -> 
     given = [f"logs.{name}={json.dumps(of)}" for name, of in (("train", train), ("test", test))]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
-        assert main(["identify", "quadruped.yaml", f"output={out}", *given, *overrides]) == 0
+        assert main(["identify", "-v", "quadruped.yaml", f"output={out}", *given, *overrides]) == 0
     found: dict[str, Any] = json.loads(Path(out, "metrics.json").read_text())
     return found
 

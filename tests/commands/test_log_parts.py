@@ -84,7 +84,7 @@ def identified(demo: Path, out: Path, logs: dict[str, list[Any]], *overrides: st
     given = [f"logs.{name}={json.dumps(entries)}" for name, entries in logs.items()]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
-        assert main(["identify", str(demo / "quadruped.yaml"), f"output={out}", *given, *overrides]) == 0
+        assert main(["identify", "-v", str(demo / "quadruped.yaml"), f"output={out}", *given, *overrides]) == 0
     found: dict[str, Any] = json.loads((out / "metrics.json").read_text())
     return found
 

@@ -43,7 +43,7 @@ def identified(demo: Path, out: Path, *overrides: str) -> tuple[dict[str, Any], 
     more = (f"logs.train=[{demo / 'noisy.npz'}]", "preprocessing.cache_gb=0", *overrides)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TorchidWarning)
-        assert main(["identify", str(demo / "quadruped.yaml"), f"output={out}", *more]) == 0
+        assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={out}", *more]) == 0
     return json.loads((out / "metrics.json").read_text()), json.loads((out / "parameters.json").read_text())
 
 

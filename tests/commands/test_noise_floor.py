@@ -24,7 +24,7 @@ def floors(run: Path) -> dict[str, dict[str, float]]:
 @UNPHYSICAL
 def test_a_run_gives_the_noise_beside_its_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     demo, run = shortened_demo(tmp_path / "demo", 400), tmp_path / "run"
-    assert main(["identify", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
+    assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
     found, printed = floors(run), capsys.readouterr().out
     assert 0.06 < found["test"]["joint_torque"] < 0.08  # 0.1 N m and 0.5 N at 0.3 m, of which the filter leaves 0.38
     assert found["train"]["projected_residual"] == pytest.approx(0.38, abs=0.01)
@@ -43,7 +43,7 @@ def test_noise_that_residuals_show_is_no_measure_of_them(tmp_path: Path, capsys:
     stated = "noise: {joint_torque: 0.1, contact_force: 0.5, contact_moment: 0.05}"
     assert stated in text
     (demo / "quadruped.yaml").write_text(text.replace(stated, "noise: {}"))
-    assert main(["identify", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
+    assert main(["identify", "--verbose", str(demo / "quadruped.yaml"), f"output={run}"]) == 0
     assert floors(run) == {"train": {}, "test": {}}
     assert main(["evaluate", str(run), "--log", str(demo / "sway_test.npz")]) == 0
     assert "noise of readings" not in capsys.readouterr().out

@@ -29,7 +29,7 @@ def test_a_run_says_how_its_robust_fit_went_and_whether_it_settled(
     tampered: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tampered.parent / "run"
-    assert main(["identify", str(tampered), f"output={output}", "estimator.robust={loss: tukey, passes: 1}"]) == 0
+    assert main(["identify", "-v", str(tampered), f"output={output}", "estimator.robust={loss: tukey, passes: 1}"]) == 0
     printed = capsys.readouterr()
     assert "of the weight kept, 1 passes" in printed.out
     assert "NumericalWarning: " in printed.err

@@ -36,7 +36,7 @@ def test_the_scale_of_a_type_of_motors_is_found_and_a_new_log_predicted_with_it(
     file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = file.parent / "run"
-    assert main(["identify", str(file)]) == 0
+    assert main(["identify", "--verbose", str(file)]) == 0
     (scale,) = document(run, "parameters")["extras"]
     assert (scale["label"], scale["log"], scale["told_apart"]) == ("scale of *_hip,*_thigh", None, True)
     assert scale["value"] == pytest.approx(HIP_SCALE - 1.0, rel=EXACT)

@@ -170,7 +170,7 @@ def test_the_number_of_scored_samples_is_stated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(Scorer.__init__, "__defaults__", (500,))
-    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={tmp_path / 'run'}"]) == 0
+    assert main(["identify", "--verbose", str(DEMO / "quadruped.yaml"), f"output={tmp_path / 'run'}"]) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     evaluated = metrics["evaluated_samples"]
     assert 400 < evaluated["train"] <= 500 < metrics["samples"]

@@ -40,7 +40,13 @@ def test_friction_that_the_model_lacks_is_said_before_all_else(
     told = {}
     for fitted in ("true", "false"):
         run = tmp_path / fitted
-        command = ["identify", str(DEMO / "quadruped.yaml"), f"output={run}", f"estimator.friction={fitted}"]
+        command = [
+            "identify",
+            "--verbose",
+            str(DEMO / "quadruped.yaml"),
+            f"output={run}",
+            f"estimator.friction={fitted}",
+        ]
         assert main([*command, "preprocessing.cache_gb=0"]) == 0
         told[fitted] = json.loads((run / "metrics.json").read_text()), capsys.readouterr().out
     good, lacking = told["true"][0]["misfit"], told["false"][0]["misfit"]

@@ -187,6 +187,15 @@ class TotalMass:
         """Whether the data determine it: a 95 % interval no wider than the URDF's mass on either side."""
         return self.separable and 2.0 * self.standard_error <= self.nominal
 
+    def __str__(self) -> str:
+        """The total mass with its standard error, or the reason why it is not determined."""
+        if self.determined:
+            return f"{self.value:.3f} ± {self.standard_error:.2g} kg"
+        if not self.separable:
+            return "not determined: confounded with offsets"
+        known = f", standard error {self.standard_error:.2g} kg" if np.isfinite(self.standard_error) else ""
+        return f"not determined by the data{known}"
+
 
 def total_mass(
     assembly: Assembly, estimate: Estimate, rank_tolerance: float = RANK_TOLERANCE, block_error: float = 0.0

@@ -27,6 +27,9 @@ from torchid.parameters import PARAMETERS, PER_BODY
 from torchid.problem import Metrics
 from torchid.problem.metrics import ERROR_GROUPS
 
+WIDTH = 100
+"""Columns of what is printed, at most."""
+
 MARKS = {IDENTIFIED: "*", PRIOR: "p", COMBINED: "+", UNOBSERVABLE: ".", FIXED: ""}
 
 
@@ -47,14 +50,20 @@ def terminal_console(stderr: bool = False) -> Console:
 def print_tables(*tables: Table) -> None:
     """Print to standard output, at most 100 columns wide; a file or pipe gets the full 100."""
     console = terminal_console()
-    console.width = min(console.width, 100) if console.is_terminal else 100
+    console.width = terminal_width()
     for table in tables:
         console.print(table)
 
 
-def table_text(table: Table) -> str:
-    """A table as plain text, 100 columns wide."""
-    console = PlainConsole(width=100, file=io.StringIO(), force_terminal=False)
+def terminal_width() -> int:
+    """Columns to print in: those of the terminal, at most 100; a file or pipe gets the full 100."""
+    console = terminal_console()
+    return min(console.width, WIDTH) if console.is_terminal else WIDTH
+
+
+def table_text(table: Table, width: int = WIDTH) -> str:
+    """A table as plain text, so many columns wide."""
+    console = PlainConsole(width=width, file=io.StringIO(), force_terminal=False)
     with console.capture() as captured:
         console.print(table)
     return captured.get()
@@ -140,7 +149,7 @@ def noise_advice(suggested: Mapping[str, Any]) -> str:
         return f"{x:g}" if isinstance(x, float) else "[" + ", ".join(f"{value:g}" for value in x) + "]"
 
     keys = ", ".join(f"{key}: {text(x)}" for key, x in suggested.items())
-    return f"noise         stated values contradict the residuals: state sensors.noise {{{keys}}}, or none of these"
+    return f"stated values contradict the residuals: state sensors.noise {{{keys}}}, or none of these"
 
 
 def marks_legend() -> str:

@@ -1,0 +1,149 @@
+"""What `torchid identify` says on one screen."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from repository import DEMO
+
+from torchid.cli import main
+from torchid.commands import Identification
+from torchid.commands.identify import identify
+from torchid.config import load_config
+from torchid.estimators.least_squares import COMBINED, IDENTIFIED
+from torchid.parameters import PER_BODY
+from torchid.problem.metrics import DECISIVE_GROUPS, WorseThanNominal
+from torchid.terminal.answer import LINES, answer_lines
+
+UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
+WIDTHS = (60, 80, 100, 120)
+
+
+def run_demo(folder: Path, *settings: str) -> Identification:
+    more = [*settings, f"output={folder / 'run'}", "preprocessing.cache_gb=0"]
+    return identify(load_config(DEMO / "quadruped.yaml", more), False)
+
+
+@pytest.fixture(scope="module")
+def consistent(tmp_path_factory: pytest.TempPathFactory) -> Identification:
+    settings = ("estimator.name=consistent", "estimator.ridge=auto")
+    return run_demo(tmp_path_factory.mktemp("consistent"), *settings)
+
+
+@pytest.fixture(scope="module")
+def free(tmp_path_factory: pytest.TempPathFactory) -> Identification:
+    with pytest.warns(match="identified.urdf"):
+        return run_demo(tmp_path_factory.mktemp("free"), "logs.test=[]", "estimator.friction=false")
+
+
+def text(run: Identification, width: int = 100) -> str:
+    return "\n".join(answer_lines(run, width))
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_it_fits_on_a_screen_of_any_width(consistent: Identification, free: Identification, width: int) -> None:
+    for run in (consistent, free):
+        lines = answer_lines(run, width)
+        assert len(lines) <= LINES
+        paths = [line for line in lines if "written to" in line or str(run.experiment.config.output.name) in line]
+        assert max(len(line) for line in lines if line not in paths) <= width
+
+
+def test_the_errors_on_unseen_motion_come_first_with_the_noise(consistent: Identification) -> None:
+    said = text(consistent)
+    assert said.startswith("Much better than the URDF on unseen motion (sway_test.npz)")
+    pair = consistent.metrics["test"]
+    for group in DECISIVE_GROUPS:
+        numbers = (pair.nominal.rms[group], pair.identified.rms[group], pair.identified.noise[group])
+        assert all(x is not None for x in numbers)
+        assert " ".join(f"{x:.4g}" for x in numbers) in " ".join(said.split())
+    assert "total mass" in said
+    assert f"{consistent.mass.value:.3f} ± " in said
+    assert str(consistent.experiment.config.output) in " ".join(said.split("\n")[-1:])
+
+
+def test_without_test_logs_blocks_left_out_are_judged_and_the_text_says_so(free: Identification) -> None:
+    first = text(free).split("rms error of")[0].replace("\n", " ")
+    assert "blocks of the training logs, each left out of the fit (5)" in first
+    assert "but the model does not explain these forces" in first
+    assert free.validation is not None
+    assert f"{free.validation.identified.rms['joint_torque']:.4g}" in text(free)
+
+
+def test_bodies_that_cannot_exist_are_counted_with_what_to_do(consistent: Identification, free: Identification) -> None:
+    bodies = {violation.body for violation in free.violations}
+    assert len(bodies) > 2
+    assert f"{len(bodies)} of 13 cannot exist, and simulators refuse them; estimator.name=consistent" in text(free)
+    assert "all 13 can exist, and simulators take them" in text(consistent)
+    assert "cannot exist" not in text(consistent)
+
+
+def test_what_needs_attention_is_named_with_what_to_do(free: Identification) -> None:
+    (line,) = [line for line in text(free, 400).splitlines() if line.startswith("attention     friction, ")]
+    assert "most in joint_torque" in line
+    worse = replace(free)
+    worse.__dict__["worse"] = [WorseThanNominal("test logs", "joint_torque", 1.0, 2.0)]
+    said = text(worse, 400)
+    assert said.startswith("WORSE THAN URDF: the identified parameters predict worse than the URDF's, on test logs")
+    assert said.index("attention     do not use them") < said.index("attention     friction, ")
+
+
+def test_the_bodies_that_changed_most_are_listed_in_the_robots_order(consistent: Identification) -> None:
+    lines = answer_lines(consistent, 120)
+    start = next(k for k, line in enumerate(lines) if line.startswith("body "))
+    robot, phi = consistent.experiment.robot, consistent.phi
+    rows = [line for line in lines[start + 1 :] if line.split()[0] in robot.body_names]
+    names = [row.split()[0] for row in rows]
+    assert len(names) >= 4
+    assert names == [name for name in robot.body_names if name in names]
+    moved = np.abs(phi[:, 0] - robot.nominal[:, 0])
+    chosen = [robot.body_names.index(name) for name in names]
+    assert moved[chosen].min() >= np.delete(moved, chosen).max()
+    verdict = consistent.estimate.verdict.reshape(-1, PER_BODY)
+    errors = consistent.estimate.standard_error.reshape(-1, PER_BODY)
+    for row, body in zip(rows, chosen, strict=True):
+        assert verdict[body, 0] == COMBINED
+        assert re.search(rf"{phi[body, 0]:.3f} \+ +{robot.nominal[body, 0]:.3f}", row)
+        known = [k for k in (10, 11) if verdict[body, k] == IDENTIFIED]
+        for k in known:
+            value, error = next(
+                (float(x), float(e))
+                for x, e in re.findall(r"([\d.]+) ± ([\d.]+)", row)
+                if abs(float(x) - phi[body, k]) < errors[body, k]
+            )
+            assert value == pytest.approx(phi[body, k], abs=0.5 * errors[body, k])
+            assert error == pytest.approx(errors[body, k], rel=0.1)
+    assert f"and {13 - len(rows)} bodies that changed less" in "\n".join(lines)
+    assert "+ known only in sums with other bodies" in lines
+
+
+def test_names_are_never_broken_however_narrow_the_terminal(consistent: Identification) -> None:
+    for width in WIDTHS:
+        lines = answer_lines(consistent, width)
+        start = next(k for k, line in enumerate(lines) if line.startswith("body "))
+        for line in lines[start + 1 : start + 4]:
+            assert line.split()[0] in consistent.experiment.robot.body_names
+
+
+@pytest.mark.filterwarnings(UNPHYSICAL)
+def test_all_tables_are_printed_when_asked_for_and_nothing_when_asked_to_be_quiet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    printed = {}
+    for option in ("--quiet", "--verbose", "-q", "-v", None):
+        command = ["identify", str(DEMO / "quadruped.yaml"), f"output={tmp_path / str(option)}", "logs.test=[]"]
+        assert main([*command, *([] if option is None else [option])]) == 0
+        printed[option] = capsys.readouterr().out
+    assert printed["--quiet"] == printed["-q"] == ""
+    assert len(printed[None].splitlines()) <= LINES
+    assert printed[None].splitlines()[-1] == f"written to    {tmp_path / 'None'}"
+    for title in ("Contact states", "What each log", "Parameters:", "Noise that weights the rows", "condition     "):
+        assert title in printed["--verbose"]
+        assert title in printed["-v"]
+        assert title not in printed[None]
+    with pytest.raises(SystemExit):
+        main(["identify", str(DEMO / "quadruped.yaml"), "-q", "-v"])

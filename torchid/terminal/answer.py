@@ -1,0 +1,239 @@
+"""The answer of a run on one screen: did it work, what is the model, what needs attention."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from textwrap import shorten, wrap
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from torchid.commands.results import Identification
+from torchid.estimators import Estimate
+from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
+from torchid.fitting.calibration import list_confounded
+from torchid.logs.time_range import log_title
+from torchid.parameters import PARAMETERS, PER_BODY, Array
+from torchid.problem import Metrics
+from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, describe_worse
+from torchid.report.tables import noise_advice, table_text, terminal_width
+from torchid.robot import Robot
+from torchid.terminal.lines import LABEL
+
+LINES = 20
+"""At most so many."""
+
+_MOST_ATTENTION, _ATTENTION_LINES = 2, 2
+_FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
+#: By the least and the largest error of a group of rows, as shares of the URDF's.
+_VERDICTS = {
+    (0.5, 0.5): "Much better than the URDF",
+    (0.95, 0.95): "Better than the URDF",
+    (0.95, np.inf): "Better than the URDF in part",
+}
+_NO_BETTER = "No better than the URDF"
+_AT_THE_FLOOR = 1.3  # times the error that noise of the readings leaves
+_MASS, _CENTER = PARAMETERS.index("m"), slice(PARAMETERS.index("mcx"), PARAMETERS.index("mcz") + 1)
+_COULOMB, _VISCOUS = PARAMETERS.index("fc"), PARAMETERS.index("fv")
+_LEGEND = {COMBINED: "+ known only in sums with other bodies", PRIOR: "p mostly the URDF's", UNOBSERVABLE: ". unseen"}
+_MARKS = {IDENTIFIED: " ", COMBINED: "+", PRIOR: "p", UNOBSERVABLE: ".", FIXED: "="}
+
+
+def print_answer(run: Identification) -> None:
+    """Print it for the terminal's width."""
+    print("\n".join(answer_lines(run, terminal_width())))
+
+
+def answer_lines(run: Identification, width: int) -> list[str]:
+    """The answer, in lines that are not wider than so many columns.
+
+    Args:
+        run: a finished one.
+        width: of the terminal.
+    """
+    judged = _judged(run)
+    lines = [*wrap(_headline(run, judged), width), *_error_lines(judged, width), ""]
+    lines += _labelled("total mass", f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)", width)
+    lines += _labelled("bodies", _bodies_text(run), width)
+    attention = list(_attention(run))
+    for one in attention[:_MOST_ATTENTION]:
+        lines += _labelled("attention", one, width)
+    if len(attention) > _MOST_ATTENTION:
+        lines += _labelled("", f"and {len(attention) - _MOST_ATTENTION} more: --verbose", width)
+    end = [f"{'written to':{LABEL}}{run.experiment.config.output}"]
+    bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
+    return [*lines, *(["", *bodies] if bodies else []), *end]
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """Errors of the URDF's and of the identified parameters, on motion of which `text` says where it is from."""
+
+    text: str
+    unseen: bool
+    nominal: Metrics
+    identified: Metrics
+
+    def errors(self) -> Iterator[tuple[str, float, float, float | None]]:
+        """Groups of rows with both errors, and what noise of the readings leaves."""
+        for group in DECISIVE_GROUPS:
+            before, after = self.nominal.rms.get(group), self.identified.rms.get(group)
+            if before is not None and after is not None:
+                yield group, before, after, self.identified.noise.get(group)
+
+
+def _judged(run: Identification) -> _Judged:
+    if "test" in run.metrics:
+        names = [log_title(path) for path in run.experiment.config.logs.test]
+        text = f"unseen motion ({shorten(', '.join(names), 40, placeholder=' ...')})"
+        return _Judged(text, True, run.metrics["test"].nominal, run.metrics["test"].identified)
+    if run.validation is not None:
+        text = f"blocks of the training logs, each left out of the fit ({run.validation.folds})"
+        return _Judged(text, True, run.validation.nominal, run.validation.identified)
+    return _Judged("the training logs themselves", False, run.metrics["train"].nominal, run.metrics["train"].identified)
+
+
+def _headline(run: Identification, judged: _Judged) -> str:
+    if run.worse:
+        return f"WORSE THAN URDF: {describe_worse(run.worse)}"
+    ratios = [after / before if before else 1.0 for _, before, after, _ in judged.errors()]
+    if not ratios:
+        return f"Nothing to compare with the URDF on {judged.text}"
+    least, most = min(ratios), max(ratios)
+    shares = f"{_percent(least)} to {_percent(most)} %" if most > 1.1 * least else f"{_percent(most)} %"
+    verdict = next((text for limits, text in _VERDICTS.items() if least < limits[0] and most < limits[1]), _NO_BETTER)
+    known = [after / floor for _, _, after, floor in judged.errors() if floor]
+    floor = ", as near as the sensors' noise allows" if known and max(known) < _AT_THE_FLOOR else ""
+    if not run.misfit.explained:
+        floor = ", but the model does not explain these forces"
+    return f"{verdict} on {judged.text}: errors of {shares} of the URDF's{floor}"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f}" if share >= 0.1 else f"{100.0 * share:.2g}"
+
+
+def _error_lines(judged: _Judged, width: int) -> list[str]:
+    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    table.add_column("rms error of", no_wrap=True)
+    for heading in ("URDF", "identified", "noise alone"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for group, before, after, floor in judged.errors():
+        cells = (f"{before:.4g}", f"{after:.4g}", "-" if floor is None else f"{floor:.4g}")
+        table.add_row(Text(ERROR_GROUPS[group]), *cells)
+    return _lines(table, width) if table.row_count else []
+
+
+def _bodies_text(run: Identification) -> str:
+    names, robot = [], run.experiment.robot
+    for one in run.violations:
+        if one.body is not None and robot.body_names[one.body] not in names:
+            names.append(robot.body_names[one.body])
+    count = len(robot.body_names)
+    if not run.violations:
+        return f"all {count} can exist, and simulators take them"
+    which = f"{len(names)} of {count}" if names else "all together"
+    advice = "; estimator.name=consistent finds the best that can" if type(run.estimate) is Estimate else ""
+    return f"{which} cannot exist, and simulators refuse them{advice}"
+
+
+def _attention(run: Identification) -> Iterator[str]:
+    """What the user should look at, the most urgent first."""
+    if run.worse:
+        yield ADVICE
+    if not run.misfit.explained:
+        yield f"friction, compliance or contacts that the model lacks, or a wrong sensor: {run.misfit}; torchid check"
+    if not run.mass.determined and not run.experiment.robot.fixed_base:
+        yield "these data do not determine the total mass; weigh the robot: estimator.total_mass"
+    for one in list_confounded(run.extras):
+        yield str(one)
+    if run.noise.suggested:
+        yield f"noise: {noise_advice(run.noise.suggested)}"
+
+
+def _labelled(label: str, text: str, width: int) -> list[str]:
+    lines = wrap(text, width - LABEL) or [""]
+    if len(lines) > _ATTENTION_LINES:
+        lines = [*lines[: _ATTENTION_LINES - 1], f"{lines[_ATTENTION_LINES - 1][: width - LABEL - 4]} ..."]
+    return [f"{name:{LABEL}}{line}" for name, line in zip((label, *[""] * len(lines)), lines, strict=False)]
+
+
+def _lines(table: Table, width: int) -> list[str]:
+    return [line.rstrip() for line in table_text(table, width).splitlines()]
+
+
+# --------------------------------------------------------------------------------------------------------- the bodies
+
+
+def _body_lines(robot: Robot, estimate: Estimate, room: int, width: int) -> list[str]:
+    """A table of the bodies that changed most, with as many columns as fit, in so many lines."""
+    free = [k for k, row in enumerate(estimate.verdict.reshape(-1, PER_BODY)) if (row != FIXED).any()]
+    if room < _FEWEST_LINES:
+        return []
+    most = room - 2  # heading, legend
+    shown = sorted(_most_changed(robot, estimate, free)[: most if len(free) <= most else most - 1])
+    columns = [column for column in _columns(robot, estimate, shown) if any(cell.strip() for cell in column[1])]
+    names = [robot.body_names[k] for k in shown]
+    while True:
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+        table.add_column("body", no_wrap=True)
+        for heading, _ in columns:
+            table.add_column(Text(heading), justify="right", no_wrap=True)
+        for name, *cells in zip(names, *(cells for _, cells in columns), strict=True):
+            table.add_row(Text(name), *(Text(cell) for cell in cells))
+        lines = _lines(table, 10 * width)
+        if max(map(len, lines)) <= width or len(columns) == 1:
+            break
+        columns.pop()
+    if len(free) > len(shown):
+        lines.append(f"and {len(free) - len(shown)} bodies that changed less: parameters.json, --verbose")
+    marks = {mark for _, cells in columns for cell in cells for mark in (cell[-1:],)}
+    legend = "; ".join(text for verdict, text in _LEGEND.items() if _MARKS[verdict] in marks)
+    return [*(line[:width] for line in lines), *([shorten(legend, width, placeholder=" ...")] if legend else [])]
+
+
+def _most_changed(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[int]:
+    """The bodies whose mass moved by the largest share of the robot's, or else friction by that of its own."""
+    phi, nominal = estimate.phi.reshape(-1, PER_BODY), robot.nominal
+    moved = np.abs(phi - nominal)
+    return sorted(bodies, key=lambda k: (-moved[k, _MASS], -moved[k, _COULOMB], k))
+
+
+def _columns(robot: Robot, estimate: Estimate, bodies: Sequence[int]) -> list[tuple[str, list[str]]]:
+    """Headings and cells, the most important first."""
+    phi, error = (x.reshape(-1, PER_BODY) for x in (estimate.phi, estimate.standard_error))
+    verdict, nominal = estimate.verdict.reshape(-1, PER_BODY), robot.nominal
+
+    def cells(parameter: int) -> list[str]:
+        return [_cell(*(x[k, parameter] for x in (phi, error, verdict))) for k in bodies]
+
+    joints = [robot.bodies[k].joint for k in bodies]
+    kinds = {joint.kind for joint in joints if joint is not None}
+    force = "N m" if "prismatic" not in kinds else "N m, N"
+    moved = [_center_moved(nominal[k], phi[k], verdict[k]) for k in bodies]
+    return [
+        ("mass [kg]", cells(_MASS)),
+        ("URDF [kg]", [f"{nominal[k, _MASS]:.3f}" for k in bodies]),
+        (f"Coulomb [{force}]", cells(_COULOMB)),
+        ("centre moved [mm]", moved),
+        ("viscous", cells(_VISCOUS)),
+    ]
+
+
+def _cell(value: float, error: float, verdict: str) -> str:
+    if verdict == FIXED:
+        return ""
+    known = verdict == IDENTIFIED and np.isfinite(error) and error > 0.0
+    digits = min(max(1 - int(np.floor(np.log10(error))), 0), 5) if known else 3
+    text = f"{value:.{digits}f} ± {error:.{digits}f}" if known else f"{value:.{digits}f}"
+    return f"{text} {_MARKS[verdict]}"
+
+
+def _center_moved(nominal: Array, phi: Array, verdict: np.ndarray) -> str:
+    """Distance between both centres of mass."""
+    if (verdict[_CENTER] == FIXED).all() or min(nominal[_MASS], phi[_MASS]) <= 0.0:
+        return ""
+    distance = np.linalg.norm(phi[_CENTER] / phi[_MASS] - nominal[_CENTER] / nominal[_MASS])
+    return f"{1e3 * distance:.0f} {_MARKS[COMBINED] if (verdict[_CENTER] == COMBINED).any() else ' '}"

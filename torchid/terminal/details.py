@@ -1,0 +1,110 @@
+"""All that a run says of a fit."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from textwrap import fill
+
+from torchid.commands.results import Identification
+from torchid.commands.training import body_eigenvalues
+from torchid.estimators import ConsistentEstimate, ConstrainedEstimate, Estimate, SgdEstimate
+from torchid.fitting.cross_validation import CrossValidation
+from torchid.fitting.misfit import Misfit
+from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, WorseThanNominal, describe_errors, describe_worse
+from torchid.report.tables import (
+    WIDTH,
+    contribution_table,
+    error_tables,
+    extra_table,
+    print_tables,
+    state_table,
+    verdict_counts_table,
+    verdict_table,
+    violation_table,
+)
+from torchid.terminal.lines import print_labelled, print_noise, print_rolling
+
+
+def print_details(run: Identification) -> None:
+    """Print all tables, and the key figures one per line."""
+    estimate, robot = run.estimate, run.experiment.robot
+    if run.worse:
+        _print_worse(run.worse)
+    if not run.misfit.explained:
+        _print_misfit(run.misfit)
+    print_tables(state_table([asdict(state) for state in run.states]), *error_tables(run.metrics))
+    if 0 < run.evaluated["train"] < run.samples:
+        count = f"{run.evaluated['train']} of {run.samples} samples, evenly spaced"
+        print_labelled("train", f"errors of forces of {count}")
+    print_tables(
+        contribution_table(run.contributions),
+        verdict_table(robot.body_names, estimate.verdict),
+        verdict_counts_table(run.by_state, estimate),
+    )
+    print_noise(run.noise)
+    if run.extras:
+        print_tables(extra_table(run.extras))
+    if run.violations:
+        print_tables(violation_table(run.violations_by_name()))
+        if type(estimate) is Estimate:
+            print("estimator.name=consistent finds the best parameters that break none of them")
+    _print_fit(run)
+    timed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in run.seconds.items())
+    print_labelled("time", f"{run.samples} samples: {timed}")
+    if run.reused:
+        print_labelled("from cache", ", ".join(run.reused))
+    print(f"written to    {run.experiment.config.output}")
+
+
+def _print_worse(worse: list[WorseThanNominal]) -> None:
+    for line in (
+        f"WORSE THAN URDF: {describe_worse(worse)}",
+        f"{ADVICE}; the results are written all the same, status 0",
+    ):
+        print(fill(line, WIDTH, subsequent_indent="  "))
+
+
+def _print_misfit(misfit: Misfit) -> None:
+    print(fill(f"NOT EXPLAINED: the model does not explain these forces: {misfit}", WIDTH, subsequent_indent="  "))
+    if misfit.error_growth is not None and misfit.error_growth > 1.0:
+        advice = "look for friction, compliance or contacts that the model lacks, and for wrong sensors (torchid check)"
+        growth = f"standard errors are {misfit.error_growth:.2g} times (median) what noise alone would make of them"
+        print(fill(f"  {growth}; {advice}", WIDTH, subsequent_indent="  "))
+
+
+def _print_fit(run: Identification) -> None:
+    """Print the key figures, one per line."""
+    estimate, robot = run.estimate, run.experiment.robot
+    print_rolling(run.experiment.rolling)
+    print(f"parameters    {estimate.rank} independent combinations of {int(estimate.phi.size)} identified")
+    print(f"condition     {estimate.condition_number:.3g}")
+    rest = "" if run.misfit.expected is None else f"; {run.misfit.expected:.3g} are left by noise alone"
+    print(f"residual      {estimate.residual_std:.3g} standard deviations of that noise{rest}")
+    if run.motion_noise.combinations:
+        print_labelled("motion noise", str(run.motion_noise))
+    if run.validation is not None:
+        _print_validation(run.validation)
+    for name, choice in (("cutoff", run.cutoff), ("ridge", run.ridge), ("sign width", run.sign_width)):
+        if choice is not None:
+            print_labelled(name, str(choice))
+    least, body = min((value, name) for name, value in body_eigenvalues(robot, estimate.phi).items())
+    print(f"consistency   smallest eigenvalue of a scaled pseudo-inertia {least:.3g}, {body}")
+    if isinstance(estimate, ConstrainedEstimate) and estimate.relative_increase is not None:
+        print(f"objective     {100.0 * estimate.relative_increase:.3g} % above the least without conditions")
+    if isinstance(estimate, ConsistentEstimate) and estimate.certified_gap is not None:
+        print(f"certified     objective within {estimate.certified_gap:.1g} of the other method's")
+    if isinstance(estimate, SgdEstimate):
+        print(f"training      {estimate.epochs} epochs, parameters of epoch {estimate.best_epoch}")
+    print(f"total mass    {run.mass} (URDF: {run.mass.nominal:.3f} kg)")
+    if run.robust is not None:
+        kept = f"{100 * run.robust.mean_weight:.3g} % of the weight kept"
+        print(f"robust        {run.robust.loss}, {kept}, {run.robust.passes} passes")
+    if robot.massless:
+        print_labelled("left out", f"massless: {', '.join(robot.massless)}")
+
+
+def _print_validation(validation: CrossValidation) -> None:
+    identified, nominal = validation.identified.rms, validation.nominal.rms
+    texts = (describe_errors(group, identified.get(group), nominal.get(group)) for group in DECISIVE_GROUPS)
+    text = f"each of {validation.folds} blocks, against URDF: {'; '.join(filter(None, texts))}"
+    print_labelled("held out", text)

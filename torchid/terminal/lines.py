@@ -1,0 +1,30 @@
+"""Lines with a label, and what several commands print."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from textwrap import fill
+
+from torchid.fitting.noise import NoiseSummary
+from torchid.report.tables import WIDTH, noise_advice, noise_table, print_tables
+
+LABEL = 14
+"""Columns of the words before what they are about."""
+
+
+def print_labelled(label: str, text: str) -> None:
+    """Print what a word is about, broken into lines below each other."""
+    print(fill(f"{label:{LABEL}}{text}", WIDTH, subsequent_indent=" " * LABEL))
+
+
+def print_rolling(rolling: str) -> None:
+    """Print which feet roll on which radius, if any do."""
+    if rolling:
+        print_labelled("rolling", rolling)
+
+
+def print_noise(noise: NoiseSummary) -> None:
+    """Print the noise that rows were weighed with, and what should be stated where residuals contradict it."""
+    print_tables(noise_table([asdict(group) for group in noise.groups]))
+    if noise.suggested:
+        print_labelled("noise", noise_advice(noise.suggested))
