@@ -95,7 +95,7 @@ def test_a_velocity_that_is_half_again_too_large_is_suspicious() -> None:
 
 def test_velocities_in_radians_betray_positions_in_degrees() -> None:
     slow = scaled(flying(), "joint_position", 180.0 / np.pi)
-    assert "joint_position is in degrees" in only(check(slow), "unit or sign", "joint_velocity").found
+    assert "joint_position is in deg" in only(check(slow), "unit or sign", "joint_velocity").found
 
 
 def test_a_velocity_of_the_wrong_sign_is_named_by_joint() -> None:
