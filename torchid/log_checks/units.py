@@ -44,7 +44,7 @@ def describe_units(found: dict[str, tuple[str, ...]]) -> str:
 
 def advise_units(found: dict[str, tuple[str, ...]]) -> str:
     """What to write in a map of columns: 'logs.columns.time.unit: ms'."""
-    return " or ".join(f"logs.columns.{of}.unit: {unit}" for of, units in found.items() for unit in units)
+    return " or ".join(f"logs.columns.{of}.unit: {' or '.join(units)}" for of, units in found.items())
 
 
 def other_units(quantity: str) -> dict[str, float]:
