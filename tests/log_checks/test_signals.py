@@ -82,7 +82,7 @@ def test_ratio_correlation_and_delay_of_a_derivative_are_measured(order: int) ->
 def test_a_derivative_in_degrees_or_millimetres_is_named(field: str) -> None:
     linear = field.startswith("base_linear")
     checked = check(scaled(flying(), field, 1e3 if linear else 180.0 / np.pi))
-    assert f"it is in {'mm' if linear else 'degrees'}" in only(checked, "unit or sign", field).found
+    assert f"{field} is in {'mm' if linear else 'deg'}/s" in only(checked, "unit or sign", field).found
     assert not checked.usable
 
 

@@ -177,8 +177,11 @@ def _derivative_findings(
     """Findings about one derivative and its channels."""
     follows = np.abs(comparison.correlation) >= MIN_CORRELATION  # NaN compares false
     lost = ~follows & np.isfinite(comparison.correlation)
+    compared = comparison.ratio[follows]
+    alike = bool((np.abs(compared / np.median(compared) - 1.0) < UNIT_TOLERANCE).all()) if len(compared) else False
     meanings = [
-        _meaning(ratio, name, base, order) if ok else None for ratio, ok in zip(comparison.ratio, follows, strict=True)
+        _meaning(ratio, name, base, order if alike else None) if ok else None
+        for ratio, ok in zip(comparison.ratio, follows, strict=True)
     ]
     named = np.array([meaning is not None for meaning in meanings], bool)
     for meaning in dict.fromkeys(meaning for meaning in meanings if meaning is not None):
@@ -204,8 +207,8 @@ def _derivative_findings(
         yield _finding("derivative", SUSPICIOUS, name, channels, lost, text, advice)
 
 
-def _meaning(ratio: float, name: str, base: str, order: int) -> tuple[str, str] | None:
-    """Cause of a ratio of a derivative, and what to do; None where none is known."""
+def _meaning(ratio: float, name: str, base: str, order: int | None) -> tuple[str, str] | None:
+    """Cause of a ratio of a derivative, and what to do; None where none is known. `order`: None if time is no cause."""
     if abs(ratio + 1.0) < UNIT_TOLERANCE:
         return "the sign is reversed", "convert it, or leave the field out"
     units = units_of_derivative_ratio(ratio, name, base, order)

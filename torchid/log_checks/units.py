@@ -25,14 +25,21 @@ def units_of_ratio(ratio: float, quantities: tuple[str, ...], tolerance: float =
     return tuple(sorted((unit for unit in away if away[unit] < tolerance), key=away.__getitem__))
 
 
-def units_of_derivative_ratio(ratio: float, field: str, base: str, order: int) -> dict[str, tuple[str, ...]]:
-    """Units of `field`, of its `base` or of time in which it would be `ratio` times the derivative; by field."""
+def units_of_derivative_ratio(ratio: float, field: str, base: str, order: int | None) -> dict[str, tuple[str, ...]]:
+    """Units of `field`, of its `base` or of time in which it would be `ratio` times the derivative; by field.
+
+    Args:
+        ratio: of the recorded to the true derivative.
+        field: of a log.
+        base: that it is a derivative of.
+        order: of the derivative; None where time is no cause, as it is that of all channels.
+    """
     if ratio <= 0.0:
         return {}
     found = {
         field: units_of_ratio(ratio, quantities_of(field)),
         base: units_of_ratio(1.0 / ratio, quantities_of(base)),
-        "time": units_of_ratio(ratio ** (1.0 / order), ("time",)),
+        "time": units_of_ratio(ratio ** (1.0 / order), ("time",)) if order else (),
     }
     return {of: units for of, units in found.items() if units}
 
