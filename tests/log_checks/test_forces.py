@@ -109,8 +109,8 @@ def misnamed(log: Log) -> Log:
 @pytest.mark.parametrize(
     ("mistake", "field", "text"),
     [
-        (lambda log: scaled(log, "joint_torque", 1e3), "joint_torque", "in mN m"),
-        (lambda log: scaled(log, "joint_torque", 1e-3), "joint_torque", "in kN m"),
+        (lambda log: scaled(log, "joint_torque", 1e3), "joint_torque", "in Nmm or mNm"),
+        (lambda log: scaled(log, "joint_torque", 1e-3), "joint_torque", "in kNm"),
         (lambda log: scaled(log, "joint_torque", -1.0), "joint_torque", "all reversed"),
         (lambda log: scaled(log, "contact_wrench_local", 1e-3), "contact_wrench_local", "in kN"),
         (lambda log: scaled(log, "contact_wrench_local", 1.0 / 9.81), "contact_wrench_local", "in kg"),

@@ -82,7 +82,7 @@ def test_ratio_correlation_and_delay_of_a_derivative_are_measured(order: int) ->
 def test_a_derivative_in_degrees_or_millimetres_is_named(field: str) -> None:
     linear = field.startswith("base_linear")
     checked = check(scaled(flying(), field, 1e3 if linear else 180.0 / np.pi))
-    assert f"it is in {'mm' if linear else 'degrees'}" in only(checked, "unit or sign", field).found
+    assert f"{field} is in {'mm' if linear else 'deg'}/s" in only(checked, "unit or sign", field).found
     assert not checked.usable
 
 
@@ -95,7 +95,7 @@ def test_a_velocity_that_is_half_again_too_large_is_suspicious() -> None:
 
 def test_velocities_in_radians_betray_positions_in_degrees() -> None:
     slow = scaled(flying(), "joint_position", 180.0 / np.pi)
-    assert "joint_position is in degrees" in only(check(slow), "unit or sign", "joint_velocity").found
+    assert "joint_position is in deg" in only(check(slow), "unit or sign", "joint_velocity").found
 
 
 def test_a_velocity_of_the_wrong_sign_is_named_by_joint() -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from torchid.errors import join_names
 from torchid.log_checks.motion import MAX_ANGLE_RAD
+from torchid.log_checks.units import advise_units, other_units
 from torchid.log_checks.weight import GRAVITY
 from torchid.logs import Log
 from torchid.logs.log import WRENCHES
@@ -126,8 +127,9 @@ def possible_mistakes(log: Log) -> Iterator[Mistake]:
     if log.joint_torque is not None:
         reverse = "reverse them; a base that hangs upside down looks the same (give base_quat)"
         yield Mistake("joint_torque", "all reversed", reverse, _multiply("joint_torque", -1.0))
-        yield Mistake("joint_torque", "in mN m", "divide by 1000", _multiply("joint_torque", 1e-3))
-        yield Mistake("joint_torque", "in kN m", "multiply by 1000", _multiply("joint_torque", 1e3))
+        yield from _unit_mistakes("joint_torque", "torque")
+    if log.base_position_world is not None:
+        yield from _unit_mistakes("base_position_world", "length")
     for field, other in (WRENCHES, WRENCHES[::-1]):
         if getattr(log, field) is not None:
             yield from _wrench_mistakes(field, other)
@@ -145,6 +147,12 @@ def _order_mistakes(log: Log) -> Iterator[Mistake]:
         yield Mistake("contact_names", text, advice, _rename("contact_names", permuted))
         flags = _reorder(("contact_active",), order)
         yield Mistake("contact_active", text, "give the flags in the order of contact_names", flags)
+
+
+def _unit_mistakes(field: str, quantity: str) -> Iterator[Mistake]:
+    for units, factor in other_units(quantity).items():
+        advice = f"{advise_units({field: tuple(units.split(' or '))})}; without a map multiply by {factor:.4g}"
+        yield Mistake(field, f"in {units}", advice, _multiply(field, factor))
 
 
 def _wrench_mistakes(field: str, other: str) -> Iterator[Mistake]:

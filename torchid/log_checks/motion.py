@@ -9,6 +9,7 @@ import numpy as np
 
 from torchid.errors import join_names
 from torchid.log_checks.findings import CONDEMNED, SUSPICIOUS, Finding, Skipped, channel_names
+from torchid.log_checks.units import UNIT_TOLERANCE, advise_units, describe_units, units_of_derivative_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.preprocess import DERIVATIVE_CHAINS
@@ -150,12 +151,6 @@ MAX_RATIO_ERROR = 0.15
 MIN_CORRELATION = 0.9
 #: Misfit above which other frames and orders are tried, and the share of it that the right one may leave.
 MAX_MISFIT, MAX_RESIDUAL_SHARE = 0.15, 0.3
-#: Ratios with a known cause, and their tolerance.
-ANGLE_RATIOS = {-1.0: "the sign is reversed", 180.0 / np.pi: "it is in degrees", np.pi / 180.0: "{base} is in degrees"}
-LENGTH_RATIOS = {-1.0: "the sign is reversed", 1e3: "it is in mm", 1e-3: "{base} is in mm"}
-_RATIO_TOLERANCE = 0.15
-#: Ratio of every derivative if time is in minutes: 5 % from that of degrees.
-MINUTES_RATIO = 1.0 / 60.0
 _TINY = 1e-300
 _DERIVATIVE_CHECK = "velocities and accelerations against positions"
 
@@ -172,24 +167,27 @@ def check_derivatives(log: Log) -> Iterator[Finding | Skipped]:
                 yield Skipped(_DERIVATIVE_CHECK, f"{name}: the log is too short")
             else:
                 findings = list(_frame_findings(log, name, base, high - low, comparison))
-                yield from findings or _derivative_findings(comparison, name, base, channel_names(log, name))
+                channels = channel_names(log, name)
+                yield from findings or _derivative_findings(comparison, name, base, channels, high - low)
 
 
-def _derivative_findings(comparison: Comparison, name: str, base: str, channels: tuple[str, ...]) -> Iterator[Finding]:
+def _derivative_findings(
+    comparison: Comparison, name: str, base: str, channels: tuple[str, ...], order: int = 1
+) -> Iterator[Finding]:
     """Findings about one derivative and its channels."""
     follows = np.abs(comparison.correlation) >= MIN_CORRELATION  # NaN compares false
     lost = ~follows & np.isfinite(comparison.correlation)
-    meanings = {
-        **(LENGTH_RATIOS if name.startswith("base_linear") else ANGLE_RATIOS),
-        MINUTES_RATIO: "time is in minutes",
-    }
-    away = np.array([np.abs(comparison.ratio / ratio - 1.0) for ratio in meanings])  # (meanings, c)
-    named = follows & (away.min(axis=0) < _RATIO_TOLERANCE)
-    for number, meaning in enumerate(meanings.values()):
-        mask = named & (away.argmin(axis=0) == number)
-        if mask.any():
-            text = f"{comparison.ratio[mask][0]:.4g} times the derivative of {base}: {meaning.format(base=base)}"
-            yield _finding("unit or sign", CONDEMNED, name, channels, mask, text, "convert it, or leave the field out")
+    compared = comparison.ratio[follows]
+    alike = bool((np.abs(compared / np.median(compared) - 1.0) < UNIT_TOLERANCE).all()) if len(compared) else False
+    meanings = [
+        _meaning(ratio, name, base, order if alike else None) if ok else None
+        for ratio, ok in zip(comparison.ratio, follows, strict=True)
+    ]
+    named = np.array([meaning is not None for meaning in meanings], bool)
+    for meaning in dict.fromkeys(meaning for meaning in meanings if meaning is not None):
+        mask = np.array([other == meaning for other in meanings])
+        text = f"{comparison.ratio[mask][0]:.4g} times the derivative of {base}: {meaning[0]}"
+        yield _finding("unit or sign", CONDEMNED, name, channels, mask, text, meaning[1])
     off = follows & ~named & (np.abs(comparison.ratio - 1.0) > MAX_RATIO_ERROR)
     if off.any():
         worst = int(np.argmax(np.abs(np.log(np.where(off, np.abs(comparison.ratio), 1.0) + _TINY))))
@@ -209,11 +207,21 @@ def _derivative_findings(comparison: Comparison, name: str, base: str, channels:
         yield _finding("derivative", SUSPICIOUS, name, channels, lost, text, advice)
 
 
+def _meaning(ratio: float, name: str, base: str, order: int | None) -> tuple[str, str] | None:
+    """Cause of a ratio of a derivative, and what to do; None where none is known. `order`: None if time is no cause."""
+    if abs(ratio + 1.0) < UNIT_TOLERANCE:
+        return "the sign is reversed", "convert it, or leave the field out"
+    units = units_of_derivative_ratio(ratio, name, base, order)
+    if not units:
+        return None
+    return describe_units(units), f"{advise_units(units)}; without a map convert it, or leave the field out"
+
+
 def _frame_findings(log: Log, name: str, base: str, order: int, comparison: Comparison) -> Iterator[Finding]:
     """Findings about a vector of the base that is in the other frame, or that contains gravity."""
     if (
         name == "base_linear_acceleration_world"
-        and abs(abs(comparison.excess[2] / GRAVITY_WORLD[2]) - 1.0) < _RATIO_TOLERANCE
+        and abs(abs(comparison.excess[2] / GRAVITY_WORLD[2]) - 1.0) < UNIT_TOLERANCE
     ):
         text = (
             f"{comparison.excess[2]:+.2f} m/s^2 along z on average beyond the derivative of {base}: it contains gravity"

@@ -8,6 +8,7 @@ import numpy as np
 
 from torchid.log_checks.findings import CONDEMNED, NOTE, SUSPICIOUS, Finding, Skipped, median_step, widen_mask
 from torchid.log_checks.model import link_poses
+from torchid.log_checks.units import advise_units, units_of_ratio
 from torchid.logs import Log
 from torchid.logs.log import BoolArray, FloatArray
 from torchid.logs.quaternion import rotate_to_world
@@ -17,9 +18,6 @@ from torchid.robot import Robot
 GRAVITY = -GRAVITY_WORLD[2]
 #: Relative error of the carried mass that is noted, and that no CAD model has.
 MIN_NOTED_MASS_ERROR, MAX_MASS_ERROR = 0.02, 0.2
-#: Reading of 1 N in other units, and the tolerance of the URDF's mass.
-FORCE_UNIT_FACTORS = {"kN": 1e-3, "kg": 1.0 / GRAVITY, "lbf": 0.22481, "g": 1e3 / GRAVITY, "mN": 1e3}
-_UNIT_TOLERANCE = 0.15
 #: Rest that the check needs, or else the length of log over which it averages: a change of speed of 1 m/s between its
 #: ends is then 2 % of gravity.
 _MIN_REST_S, _MIN_AVERAGING_S = 0.5, 5.0
@@ -27,6 +25,8 @@ _MIN_REST_S, _MIN_AVERAGING_S = 0.5, 5.0
 _MAX_POSE_SAMPLES = 4000
 #: Relative error of an accelerometer at rest: a good one is within 0.5 %.
 _MAX_ACCELEROMETER_ERROR = 0.02
+#: Deviation of its reading from gravity in another unit.
+_ACCELEROMETER_UNIT_TOLERANCE = 0.1
 #: Angle between gravity by the accelerometer and by the orientation of the base.
 _MAX_TILT_DEG = 5.0
 _WEIGHT_CHECK, _ACCELEROMETER_CHECK = "weight at rest", "accelerometer at rest"
@@ -66,11 +66,10 @@ def _weight_findings(carried: float, when: str, field: str, robot: Robot | None)
     nominal = float(robot.nominal[:, 0].sum())
     ratio = mass / nominal
     text = f"contacts carry {mass:.4g} kg {when}, the URDF weighs {nominal:.4g} kg ({100 * (ratio - 1):+.2g} %)"
-    for unit, size in FORCE_UNIT_FACTORS.items():
-        if abs(ratio / size - 1.0) < _UNIT_TOLERANCE:
-            text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {unit}?"
-            yield Finding("unit", CONDEMNED, field, text, "convert forces to N and moments to N m")
-            return
+    if units := units_of_ratio(ratio, ("force",)):
+        text = f"contacts carry {ratio:.3g} of the weight {when}: forces in {' or '.join(units)}?"
+        yield Finding("unit", CONDEMNED, field, text, "convert forces to N and moments to N m")
+        return
     if abs(ratio - 1.0) > MAX_MASS_ERROR:
         advice = "check for an unmeasured contact, a payload, an offset or gain of a sensor"
         yield Finding("weight", SUSPICIOUS, field, text, advice)
@@ -118,7 +117,9 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
     still = _find_rest(log)
     rests = still.sum() >= 10
     if not rests:
-        yield Skipped(_ACCELEROMETER_CHECK, f"the robot never rests for {_MIN_REST_S:g} s")
+        yield _accelerometer_unit_in_motion(log) or Skipped(
+            _ACCELEROMETER_CHECK, f"the robot never rests for {_MIN_REST_S:g} s"
+        )
         if log.base_quat_xyzw is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
             return
         yield from _tilt_findings(log, robot, np.ones(len(log), bool), "on average")
@@ -126,15 +127,39 @@ def check_accelerometer(log: Log, robot: Robot | None) -> Iterator[Finding | Ski
     mean = log.imu_specific_force[still].mean(axis=0)
     size = float(np.linalg.norm(mean))
     name, text = "imu_specific_force", f"{size:.4g} m/s^2 at rest"
-    if abs(size - 1.0) < 0.1:
-        yield Finding("unit", CONDEMNED, name, f"{text}: in units of g", f"multiply by {GRAVITY}")
+    if units := units_of_ratio(size / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE):
+        yield _accelerometer_unit_finding(f"{size:.4g} at rest", units)
     elif size < 0.1 * GRAVITY:
         advice = "give the reading of the accelerometer: acceleration minus gravity, upward at rest"
         yield Finding("gravity", CONDEMNED, name, f"{text}: gravity has been taken out", advice)
     elif abs(size / GRAVITY - 1.0) > _MAX_ACCELEROMETER_ERROR:
         yield Finding("gravity", SUSPICIOUS, name, f"{text}, gravity is {GRAVITY}", "calibrate the accelerometer")
-    if size > 0.5 * GRAVITY or abs(size - 1.0) < 0.1:
+    if units or size > 0.5 * GRAVITY:
         yield from _tilt_findings(log, robot, still, "at rest")
+
+
+def _accelerometer_unit_in_motion(log: Log) -> Finding | None:
+    """Finding about the unit of an accelerometer that never rests, by its mean and by its median size, over a long log.
+
+    Both are gravity's for a base that hardly turns and falls; of one without gravity, the mean is nearly zero.
+    """
+    if log.imu_specific_force is None or log.time[-1] - log.time[0] < _MIN_AVERAGING_S:
+        return None
+    sizes = (
+        float(np.linalg.norm(log.imu_specific_force.mean(axis=0))),
+        float(np.median(np.linalg.norm(log.imu_specific_force, axis=1))),
+    )
+    by_mean, by_size = (
+        units_of_ratio(size / GRAVITY, ("acceleration",), _ACCELEROMETER_UNIT_TOLERANCE) for size in sizes
+    )
+    units = tuple(unit for unit in by_size if unit in by_mean)
+    return _accelerometer_unit_finding(f"{sizes[1]:.4g} in the median", units) if units else None
+
+
+def _accelerometer_unit_finding(text: str, units: tuple[str, ...]) -> Finding:
+    field = "imu_specific_force"
+    advice = f"{advise_units({field: units})}; without a map convert it to m/s^2"
+    return Finding("unit", CONDEMNED, field, f"{text}: in {' or '.join(units)}", advice)
 
 
 def _tilt_findings(log: Log, robot: Robot | None, still: BoolArray, when: str) -> Iterator[Finding | Skipped]:
