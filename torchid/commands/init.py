@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
+from torchid.robot.urdf import position_limits
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
@@ -35,6 +37,7 @@ _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "cont
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
+_WELDED = "joints that the log lacks, held still; one that moves needs columns"
 _LINE = 118
 
 
@@ -222,6 +225,8 @@ def _describe(
         out.guessed.append("contacts: from names of links; point where there is a ball or more than two of them")
     if _is_fixed(contacts, fields):
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
+    if proposal.lacking:
+        out.guessed.append(f"robot.weld: {_WELDED}: {join_names(proposal.lacking)}")
     if proposal.left_out:
         out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
     for name in ("time", "joint_position"):
@@ -284,9 +289,11 @@ def _text(
         proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
         proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
     own = {"urdf": _relative(Path(urdf), output)} | ({"fixed_base": True} if _is_fixed(contacts, fields) else {})
+    own |= {"weld": weld} if (weld := _weld(robot, proposal)) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]
     lines += _entry("robot", own)
+    lines += [f"  # guessed: weld: {_WELDED}"] if weld else []
     if contacts:
         lines.append("contacts:  # guessed: from names of links")
         lines += [f"  - {_flow({'frame': contact.frame, 'type': contact.type})}" for contact in contacts]
@@ -307,6 +314,14 @@ def _text(
     lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
     lines += _entry("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
+
+
+def _weld(robot: Robot, proposal: MapProposal) -> list[str] | dict[str, float]:
+    """Joints that a log lacks, each at 0, or at the middle of its range if that is elsewhere."""
+    limits = position_limits(robot.path)
+    ranges = {name: limits.get(name, (-math.inf, math.inf)) for name in proposal.lacking}
+    at = {name: 0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.4g}") for name, (low, high) in ranges.items()}
+    return at if any(at.values()) else list(at)
 
 
 def _relative(path: Path, output: Path) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchid.errors import excerpt
 from torchid.logs.column_families import Family, find_families
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_desired, propose_field
@@ -20,7 +21,7 @@ from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, suitable_orders, usu
 from torchid.logs.log import SHAPES, VARIANTS
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, match_names
 from torchid.logs.tables import sample_table
-from torchid.logs.units import UNITS
+from torchid.logs.units import UNITS, quantities_of, quantities_with, unit_factor
 
 Columns = Mapping[str, NDArray[Any] | None]
 """Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
@@ -48,6 +49,7 @@ class MapProposal:
         left_out: columns that it ignores.
         key: columns or topics.
         fields: of the log, that a map of topics gives.
+        lacking: joints of the robot without columns, if most have some.
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
@@ -55,6 +57,7 @@ class MapProposal:
     fields: set[str] = field(default_factory=set)
     notes: dict[str, str] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
+    lacking: list[str] = field(default_factory=list)
 
 
 def read_sample(path: Path) -> Columns:
@@ -108,16 +111,22 @@ class _Proposer:
         self.out = MapProposal()
         stated = stated_names(sample, "joint_names")
         self.names_stated = bool(stated) and set(stated) <= set(self.joints)
+        self.named_joints = set(stated) if self.names_stated else set[str]()
+        self.joint_suffix = ""
+        self.factors: dict[str, float] = {}  # of units that columns state, by field
 
     def propose(self, foreign: Sequence[str]) -> MapProposal:
         numeric = [name for name in foreign if self._is_numeric(name)]
         families, more = find_families(numeric, self.robot)
         self.out.columns |= {f"{kind}_name": pattern for kind, pattern in more.items()}
+        self.joint_suffix = more.get("joint", "").removeprefix("{joint}")
+        self.named_joints = self.named_joints or self._most_named(families)
+        self.out.lacking = [name for name in self.joints if self.named_joints and name not in self.named_joints]
         used: list[Family] = [one for one in families if self._place(one)]
         if "joint_torque" not in {*self.given, *self.out.columns}:
             used += self._place_law([one for one in families if one not in used])
         if set(wrench := self.out.columns.get("contact_wrench_local", {})) == {"moment"}:  # of no use without forces
-            used = [one for one in used if one.entry != wrench["moment"]]
+            used = [one for one in used if not one.entry.items() <= wrench["moment"].items()]
             del self.out.columns["contact_wrench_local"]
         taken = {column for one in used for column in one.columns}
         self.out.left_out = [name for name in foreign if name not in taken]
@@ -155,8 +164,21 @@ class _Proposer:
         if name == "contact_active":
             self._add_threshold(family, entry)
         self._add_order(family, name)
+        self._add_stated_unit(family, entry, name, quantities_of(name))
         self.out.columns[name] = entry
         return True
+
+    def _joints_of(self, family: Family) -> set[str]:
+        """Joints of the robot that a family names."""
+        if "{joint}" not in family.pattern:
+            return set()
+        return set(family.by_name) or {f"{name}{self.joint_suffix}" for name in family.names if name}
+
+    def _most_named(self, families: Sequence[Family]) -> set[str]:
+        """Joints that a family of positions names, if more than half of them; none where it names fewer."""
+        of_positions = [self._joints_of(one) for one in families if self._field(one) == "joint_position"]
+        most = max(of_positions, key=len, default=set())
+        return most if 2 * len(most) > len(self.joints) else set()
 
     def _field(self, family: Family) -> str:
         """The field that a family probably is."""
@@ -181,17 +203,24 @@ class _Proposer:
         if ("{contact}" if name.startswith("joint_") else "{joint}") in family.pattern:
             return False
         if name.startswith("joint_"):
-            named = {x for x in family.names if x}
-            slots = {MOTORS[JOINT_ORDERS[name].message] for name in suitable_orders(self.joints)}
-            whole = (len(named) or count) in (len(self.joints), *(() if named else slots))
-            enough = count >= len(self.joints) if family.numbers else whole
-            return enough and len(self.joints) > 0 and not any(family.axes)
+            return self._fits_joints(family, count)
         if name.startswith("contact_wrench"):
             return count == 6 * len(self.feet)
         if name.startswith("contact_"):
             return count == len(self.feet) > 0 and not any(family.axes)
         axes = "".join(sorted(family.axes)).lower()
         return count == (4 if "quat" in name else 3) and (not axes or axes == ("wxyz" if "quat" in name else "xyz"))
+
+    def _fits_joints(self, family: Family, count: int) -> bool:
+        """Whether a family has a column for each joint, or for each that positions are there of."""
+        named = self._joints_of(family)
+        slots = {MOTORS[JOINT_ORDERS[name].message] for name in suitable_orders(self.joints)}
+        if named:
+            whole = named == (self.named_joints or set(self.joints))
+        else:
+            whole = count in (len(self.joints), *slots, *([len(self.named_joints)] if self.names_stated else []))
+        enough = count >= len(self.joints) if family.numbers else whole
+        return enough and len(self.joints) > 0 and not any(family.axes)
 
     def _place_force(self, family: Family) -> bool:
         """Whether a family is the forces or the moments of contacts."""
@@ -203,6 +232,8 @@ class _Proposer:
                 del self.out.columns["contact_wrench_local"]
             return False
         wrench[part] = family.entry
+        quantity = "torque" if part == "moment" else "force"
+        self._add_stated_unit(family, wrench[part], f"contact_wrench_local.{part}", (quantity,))
         self.out.notes["contact_wrench_local"] = "taken to act on the robot, along the axes of the contact frames"
         self._add_order(family, "contact_wrench_local")
         return True
@@ -216,7 +247,9 @@ class _Proposer:
             gain, what = _GAINS.search(words), propose_field(family.words, desired=True)
             key = gain[1].lower() if gain else _LAW.get(what, "")
             if key and key not in law and (gain or self._fits(family, what)):
-                law[key] = family.entry if family.by_name else family.pattern
+                law[key] = family.entry
+                if not gain:
+                    self._add_stated_unit(family, law[key], f"joint_torque.pd.{key}", quantities_of(what))
                 used.append(family)
         if "kp" not in law or "position" not in law:
             return []
@@ -264,18 +297,30 @@ class _Proposer:
 
     # ------------------------------------------------------------------------------------------------------ units
 
+    def _add_stated_unit(self, family: Family, entry: dict[str, Any], key: str, quantities: tuple[str, ...]) -> None:
+        """The unit in the names of columns, for the field that they are; a note where it is none of that field."""
+        if not family.unit or not quantities:
+            return
+        if not set(quantities) & set(quantities_with(family.unit)):
+            known = " or ".join(quantities)
+            self.out.notes[key] = f"unit '{excerpt(family.unit)}' of its columns is none of {known}; give it as unit"
+            return
+        self.factors[key] = unit_factor(key, family.unit, quantities)
+        if self.factors[key] != 1.0:
+            entry["unit"] = family.unit
+
     def _add_units(self) -> None:
-        """Units other than SI, where the numbers say so."""
+        """Units other than SI that columns do not state, where the numbers say so."""
         time = self._values("time")
         if time is None or len(time) < 3:
             return
         step = float(np.median(np.diff(time[:, 0])))
         unit = next((u for u in ("s", "ms", "us", "ns") if _STEP[0] <= step * UNITS["time"][u] <= _STEP[1]), "s")
         self._set_unit("time", unit, f"from steps of {step:.3g}")
-        seconds = time[:, 0] * UNITS["time"][unit]
+        seconds = time[:, 0] * self.factors.get("time", UNITS["time"][unit])
         position, velocity = self._values("joint_position"), self._values("joint_velocity")
-        factor = 1.0
-        if position is not None and np.nanpercentile(np.abs(position), 98) > _TURNED:
+        factor, is_stated = self.factors.get("joint_position", 1.0), "joint_position" in self.factors
+        if position is not None and not is_stated and np.nanpercentile(np.abs(position), 98) > _TURNED:
             self._set_unit("joint_position", "deg", f"from values up to {np.nanmax(np.abs(position)):.3g}")
             factor = UNITS["angle"]["deg"]
         if position is not None and velocity is not None and position.shape == velocity.shape:
@@ -298,7 +343,9 @@ class _Proposer:
 
     def _set_unit(self, name: str, unit: str, why: str) -> None:
         entry = self.out.columns.get(name)
-        if isinstance(entry, dict) and {"column", "columns"} & set(entry) and unit != _si(name):
+        if name in self.factors or unit == _si(name):
+            return
+        if isinstance(entry, dict) and {"column", "columns"} & set(entry):
             entry["unit"] = unit
             self.out.notes[name] = f"{unit}, {why}"
 
