@@ -19,8 +19,9 @@ from torchid.config.preprocessing import PreprocessingConfig
 from torchid.errors import ConfigError, InputError, LogError, about_file, excerpt, format_count, join_names
 from torchid.logs import Columns, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
+from torchid.logs.column_samples import read_sample, stated_names, texts_in
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
-from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names, texts_in
+from torchid.logs.map_proposals import MapProposal, propose_map
 from torchid.logs.name_matching import KnownRobot, within
 from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
@@ -38,6 +39,7 @@ _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
 _WELDED = "joints that the log lacks, held still; one that moves needs columns"
+_OTHER_FILE = "; if another file has it: torchid init URDF 'FILE + FILE@SECONDS', docs/logs.md"
 _LINE = 118
 
 
@@ -74,7 +76,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
 
     Args:
         urdf: of the robot.
-        log: a table or arrays, in the log format or not, or a bag.
+        log: a table or arrays, in the log format or not, several of these as one log, or a bag.
         output: the file; nothing that is there is replaced.
 
     Raises:
@@ -85,14 +87,12 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
         raise ConfigError("command line", "--output", f"'{target}'", "a file name that ends in .yaml or .yml")
     if os.path.lexists(target):
         raise ConfigError(target, "--output", "exists", "a new file: torchid init replaces none")
-    check_free_file(target, "--output", False, [urdf, path])
-    file = split_range(path).file
-    kind = existing_log_kind(file)
-    if kind is LogKind.JOINED:
-        raise ConfigError("command line", "LOG", f"several files, '{excerpt(str(log))}'", "one of them at a time")
-    is_bag = kind is LogKind.BAG
+    part = split_range(path)
+    files = [file.path for file in part.files]
+    check_free_file(target, "--output", False, [urdf, *files])
+    is_bag = existing_log_kind(part.file) is LogKind.BAG
     robot = load_robot(urdf)
-    contacts, fields, proposal = _of_bag(file, robot) if is_bag else _of_columns(file, robot)
+    contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = Initiated(target)
     text = _text(robot, urdf, path, target, contacts, fields, proposal)
     _describe(out, robot, contacts, fields, proposal)
@@ -102,15 +102,18 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     return out
 
 
-def _of_columns(file: Path, robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
-    """Contacts, fields and a map of a table or arrays."""
-    size = memory_needed(file, PreprocessingConfig().memory_gb)
-    if size > PreprocessingConfig().memory_gb:
-        accepted = "a log of a part of the recording, whose map holds for all of it"
-        raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
-    sample = read_sample(file)
+def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
+    """Contacts, fields and a map of a table or arrays, or of several that are one log."""
+    samples, size = [], 0.0
+    for file in files:
+        size = memory_needed(file, PreprocessingConfig().memory_gb, size)
+        if size > PreprocessingConfig().memory_gb:
+            accepted = "a log of a part of the recording, whose map holds for all of it"
+            raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
+        samples.append(read_sample(file))
+    sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
-    proposal = propose_map(sample, _known(robot, contacts))
+    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else ())
     fields = _fields_of(sample, proposal)
     _add_imu_frame(robot, fields, proposal)
     return contacts, fields, proposal
@@ -231,7 +234,8 @@ def _describe(
         out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
     for name in ("time", "joint_position"):
         if name not in fields:
-            out.missing.append(f"{name}: no {what}s that look like it, of all {len(robot.joint_names)} joints")
+            of_joints = f", of most of {len(robot.joint_names)} joints" * (name != "time")
+            out.missing.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
     from_feet = _from_feet(contacts, fields)
@@ -288,7 +292,9 @@ def _text(
         always = [contact.frame for contact in contacts]
         proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
         proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
-    own = {"urdf": _relative(Path(urdf), output)} | ({"fixed_base": True} if _is_fixed(contacts, fields) else {})
+    own: dict[str, object] = {"urdf": _relative(Path(urdf), output)} | (
+        {"fixed_base": True} if _is_fixed(contacts, fields) else {}
+    )
     own |= {"weld": weld} if (weld := _weld(robot, proposal)) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]

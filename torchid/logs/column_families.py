@@ -13,8 +13,9 @@ from torchid.logs.units import split_unit
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
-    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-z])([wxyz])$",
+    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$",
 )
+_BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Family:
     @property
     def unit(self) -> str:
         """What the columns say of their unit, "" if nothing."""
-        return split_unit(self.pattern)[1]
+        return split_unit(_BEHIND.sub("", self.pattern))[1] or split_unit(self.pattern)[1]
 
     @property
     def entry(self) -> dict[str, object]:

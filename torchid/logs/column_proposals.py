@@ -12,7 +12,7 @@ from torchid.logs.units import quantities_with, split_unit
 
 _FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 _LISTED, _LONGEST = 12, 60
-_BASE = r"\b(base|root|trunk|torso|pelvis|floating base)"
+_BASE = r"\b(base|root|trunk|torso|pelvis|body|floating base)"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
 _WORDS = (
     ("base_position_world", rf"{_BASE} (pos|position|xyz)\b"),

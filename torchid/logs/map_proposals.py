@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,16 +14,12 @@ from torchid.errors import excerpt
 from torchid.logs.column_families import Family, find_families
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.column_proposals import is_desired, propose_field
+from torchid.logs.column_samples import Columns, stated_names
 from torchid.logs.columns import is_column
-from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
 from torchid.logs.joint_orders import JOINT_ORDERS, MOTORS, suitable_orders, usual_order
 from torchid.logs.log import SHAPES, VARIANTS
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, match_names
-from torchid.logs.tables import sample_table
 from torchid.logs.units import UNITS, quantities_of, quantities_with, unit_factor
-
-Columns = Mapping[str, NDArray[Any] | None]
-"""Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
 
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
 _FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
@@ -35,7 +30,7 @@ _STEP = (2e-4, 0.2)  # [s]: of recordings
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
 _LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
 _FAR = 60.0  # [m]: no base is recorded as far away
-_NAMES = 300  # elements of a list of names
+_TOUCH = 0.05  # of the robot's weight, what a contact bears at least
 _SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
 
 
@@ -60,52 +55,24 @@ class MapProposal:
     lacking: list[str] = field(default_factory=list)
 
 
-def read_sample(path: Path) -> Columns:
-    """The columns of a table or the arrays of a file, with some of the rows of tables.
-
-    Raises:
-        LogError: it cannot be read, or is a bag.
-    """
-    if existing_log_kind(path) is LogKind.TABLE:
-        return sample_table(path)
-    out: dict[str, NDArray[Any] | None] = {}
-    with open_container(path) as container:
-        for name in container.declared_bytes():
-            with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
-                array = container.load(name)
-            is_list = array.ndim == 1 and len(array) <= _NAMES
-            out[name] = array if array.dtype.kind in "fiub" or is_list else None
-    return out
-
-
-def stated_names(sample: Columns, field: str) -> list[str]:
-    """Names of joints, contacts or sensors that a file of arrays states."""
-    stated = sample.get(field)
-    names = [] if stated is None else np.ravel(stated).tolist()
-    return [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names]
-
-
-def texts_in(sample: Columns) -> list[str]:
-    """Names of columns and arrays, and all that lists of names in them have."""
-    listed = [name for name, x in sample.items() if x is not None and x.dtype.kind not in "fiub"]
-    return [*sample, *(text for name in listed for text in stated_names(sample, name))]
-
-
-def propose_map(sample: Columns, robot: KnownRobot) -> MapProposal:
+def propose_map(sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]] = ()) -> MapProposal:
     """Sort foreign columns into fields of a log by what they are called and what is in them.
 
     Args:
         sample: from `read_sample`.
         robot: whose log it is.
+        files: columns of each of several files that are one log, whose stamps may differ in name.
     """
     native = [name for name in sample if is_column(name) or name in (*SHAPES, *VARIANTS)]
     foreign = [name for name in sample if name not in native]
-    return _Proposer(sample, native, robot).propose(foreign)
+    return _Proposer(sample, native, robot, files).propose(foreign)
 
 
 class _Proposer:
-    def __init__(self, sample: Columns, native: Sequence[str], robot: KnownRobot) -> None:
-        self.sample, self.native, self.robot = sample, native, robot
+    def __init__(
+        self, sample: Columns, native: Sequence[str], robot: KnownRobot, files: Sequence[Collection[str]]
+    ) -> None:
+        self.sample, self.native, self.robot, self.files = sample, native, robot, files
         self.joints, self.feet = robot.joints, robot.feet
         self.given = {name.partition(".")[0] for name in native}
         self.out = MapProposal()
@@ -128,6 +95,9 @@ class _Proposer:
         if set(wrench := self.out.columns.get("contact_wrench_local", {})) == {"moment"}:  # of no use without forces
             used = [one for one in used if not one.entry.items() <= wrench["moment"].items()]
             del self.out.columns["contact_wrench_local"]
+        if "contact_wrench_local" in self.out.columns and "contact_active" not in {*self.given, *self.out.columns}:
+            self.out.columns["contact_active"] = {"above": float(f"{_TOUCH * self.robot.weight:.2g}")}
+            self.out.notes["contact_active"] = f"above {_TOUCH:.0%} of the URDF's weight [N], by the wrenches"
         taken = {column for one in used for column in one.columns}
         self.out.left_out = [name for name in foreign if name not in taken]
         ignored = {_anything(one.pattern) for one in families if one not in used}
@@ -152,6 +122,8 @@ class _Proposer:
         name = self._field(family)
         if name == "contact_wrench_local" and len(family.axes) == 3:
             return self._place_force(family)
+        if name == "time" and name in self.out.columns:
+            return self._place_other_time(family)
         if not name or name in self.given or name in self.out.columns or not self._fits(family, name):
             return False
         entry: dict[str, Any] = family.entry
@@ -166,6 +138,18 @@ class _Proposer:
         self._add_order(family, name)
         self._add_stated_unit(family, entry, name, quantities_of(name))
         self.out.columns[name] = entry
+        return True
+
+    def _place_other_time(self, family: Family) -> bool:
+        """Whether a family is the stamps of a file that has none yet."""
+        others = self.out.columns.get("other_times", [])
+        known = [entry["column"] for entry in (self.out.columns["time"], *others)]
+        ours = [given for given in self.files if family.columns[0] in given]
+        if not ours or any(column in given for given in ours for column in known) or not self._fits(family, "time"):
+            return False
+        entry: dict[str, Any] = family.entry
+        self._add_stated_unit(family, entry, "other_times", ("time",))
+        self.out.columns["other_times"] = [*others, entry]
         return True
 
     def _joints_of(self, family: Family) -> set[str]:
@@ -183,6 +167,8 @@ class _Proposer:
     def _field(self, family: Family) -> str:
         """The field that a family probably is."""
         name, axes = propose_field(family.words), len(family.axes) == 3
+        if not name and "time" in quantities_with(family.unit) and self._increases(family.columns[0]):
+            return "time"
         of_foot = "{contact}" in family.pattern or _FOOT.search(family.words) is not None
         of_force = name == "contact_force_normal" or _FORCE.search(family.pattern) or _MOMENT.search(family.pattern)
         if axes and of_foot and of_force:
@@ -190,6 +176,10 @@ class _Proposer:
         if name == "contact_force_normal" or (not name and of_foot):
             return "contact_active"  # as a threshold: what it is in newtons nobody knows
         return "base_position_world" if name == "joint_position" and axes and not any(family.names) else name
+
+    def _increases(self, column: str) -> bool:
+        values = self.sample[column]
+        return values is not None and values.ndim == 1 and len(values) > 2 and bool((np.diff(values) > 0).all())
 
     def _fits(self, family: Family, name: str) -> bool:
         """Whether a family has as many columns as a field."""
@@ -323,9 +313,9 @@ class _Proposer:
         if position is not None and not is_stated and np.nanpercentile(np.abs(position), 98) > _TURNED:
             self._set_unit("joint_position", "deg", f"from values up to {np.nanmax(np.abs(position)):.3g}")
             factor = UNITS["angle"]["deg"]
-        if position is not None and velocity is not None and position.shape == velocity.shape:
-            slope = factor * np.gradient(position, seconds, axis=0)
-            self._add_speed_unit(float(np.sqrt(np.nanmean(velocity**2) / max(np.nanmean(slope**2), 1e-12))))
+        both = None if position is None or velocity is None or self.files else (position, velocity)
+        if both is not None and both[0].shape == both[1].shape:  # not of several files, whose stamps may differ
+            self._add_speed_unit(both[1], factor * np.gradient(both[0], seconds, axis=0))
         for name, is_it, unit, why in (
             ("joint_torque", lambda x: _rms(x) > _LEVER * self.robot.weight, "N mm", "as they are too large for N m"),
             ("base_position_world", lambda x: np.nanmax(np.abs(x)) > _FAR, "mm", "as it is too far away for m"),
@@ -336,7 +326,8 @@ class _Proposer:
             if values is not None and is_it(values):
                 self._set_unit(name, unit, why)
 
-    def _add_speed_unit(self, ratio: float) -> None:
+    def _add_speed_unit(self, velocity: NDArray[np.float64], slope: NDArray[np.float64]) -> None:
+        ratio = float(np.sqrt(np.nanmean(velocity**2) / max(np.nanmean(slope**2), 1e-12)))
         units = {unit: 1.0 / UNITS["angular velocity"][unit] for unit in ("rad/s", "deg/s", "rpm", "rev/s")}
         unit = min(units, key=lambda unit: abs(np.log(max(ratio, 1e-9) / units[unit])))
         self._set_unit("joint_velocity", unit, f"as they are {ratio:.3g} times the slope of the positions")

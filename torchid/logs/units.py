@@ -39,8 +39,9 @@ _OF_JOINTS = {
     "joint_torque": ("torque", "force"),
 }
 _SPELLINGS = {
-    "°": "deg", "µ": "u", "μ": "u", "²": "2", "⁻": "-", "kgf": "kg", "degrees": "deg", "degree": "deg", "radians": "rad",
-    "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "seconds": "s", "sec": "s", "dps": "deg/s",
+    "°": "deg", "µ": "u", "μ": "u", "²": "2", "⁻": "-", "kgf": "kg", "degrees": "deg", "degree": "deg",
+    "radians": "rad", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "seconds": "s", "sec": "s",
+    "dps": "deg/s",
 }  # fmt: skip
 _MARKS = re.compile(r"[ ·.*^]")
 _POWERS = {"s-1": "/s", "s-2": "/s2", "/s/s": "/s2", "N-m": "Nm", "nm": "Nm"}
