@@ -110,7 +110,8 @@ def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], se
         if size > PreprocessingConfig().memory_gb:
             accepted = "a log of a part of the recording, whose map holds for all of it"
             raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
-        samples.append(read_sample(file))
+        with about_file(file):
+            samples.append(read_sample(file))
     sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
     proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else ())
@@ -232,10 +233,7 @@ def _describe(
         out.guessed.append(f"robot.weld: {_WELDED}: {join_names(proposal.lacking)}")
     if proposal.left_out:
         out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
-    for name in ("time", "joint_position"):
-        if name not in fields:
-            of_joints = f", of most of {len(robot.joint_names)} joints" * (name != "time")
-            out.missing.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
+    out.missing += _missing_columns(robot, fields, proposal)
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
     from_feet = _from_feet(contacts, fields)
@@ -245,6 +243,20 @@ def _describe(
     if _lacks_base_motion(contacts, fields):
         instead = "; taken from the feet that stand" if "base_motion" in from_feet else ""
         out.missing.append(f"motion of the base: neither its pose nor an IMU{instead}")
+
+
+def _missing_columns(robot: Robot, fields: set[str], proposal: MapProposal) -> list[str]:
+    """What stamps and fields of joints lack, in words."""
+    what = proposal.key.removesuffix("s")
+    partial = {name: joints for name, joints in proposal.partial.items() if name not in fields}
+    out = [
+        f"{name}: no {what} of numbers of {join_names(joints)}, but of all others" for name, joints in partial.items()
+    ]
+    for name in ("time", "joint_position"):
+        if name not in fields | partial.keys():
+            of_joints = f", of most of {len(robot.joint_names)} joints" * (name != "time")
+            out.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
+    return out
 
 
 def _describe_found(

@@ -13,7 +13,7 @@ from torchid.logs.units import split_unit
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
-    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$",
+    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$",
 )
 _BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
 

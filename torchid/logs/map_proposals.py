@@ -24,12 +24,14 @@ from torchid.logs.units import UNITS, quantities_of, quantities_with, unit_facto
 _GAINS = re.compile(r"\b(kp|kd)\b", re.IGNORECASE)
 _FORCE = re.compile(r"force|(?<![a-z])f\{axis", re.IGNORECASE)
 _MOMENT = re.compile(r"moment|torque|(?<![a-z])[mt]\{axis", re.IGNORECASE)
+_SIDEWAYS = re.compile(r"(?<![a-z])(f[xy]|m[xyz])(?![a-z])", re.IGNORECASE)  # components that tell of no contact
 _FOOT = re.compile(r"foot|feet", re.IGNORECASE)
 _LAW = {"joint_position": "position", "joint_velocity": "velocity", "joint_torque": "feed_forward"}
 _STEP = (2e-4, 0.2)  # [s]: of recordings
 _TURNED = 7.0  # [rad]: no joint's position is as large throughout
 _LEVER = 1.0  # [m]: rms of no torque is as large as that of the robot's weight with it
 _FAR = 60.0  # [m]: no base is recorded as far away
+_SORTED = 0.9  # of the steps of stamps, forwards
 _TOUCH = 0.05  # of the robot's weight, what a contact bears at least
 _SHARE = 0.2  # of the way from the lowest to the highest reading, a threshold of contact
 
@@ -45,6 +47,7 @@ class MapProposal:
         key: columns or topics.
         fields: of the log, that a map of topics gives.
         lacking: joints of the robot without columns, if most have some.
+        partial: by field that is left out for it, joints that have columns of other fields alone.
     """
 
     columns: dict[str, Any] = field(default_factory=dict)
@@ -53,6 +56,7 @@ class MapProposal:
     notes: dict[str, str] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)
+    partial: dict[str, list[str]] = field(default_factory=dict)
 
 
 def propose_map(sample: Columns, robot: KnownRobot, files: Sequence[Collection[str]] = ()) -> MapProposal:
@@ -80,14 +84,14 @@ class _Proposer:
         self.names_stated = bool(stated) and set(stated) <= set(self.joints)
         self.named_joints = set(stated) if self.names_stated else set[str]()
         self.joint_suffix = ""
-        self.factors: dict[str, float] = {}  # of units that columns state, by field
+        self.factors: dict[str, float] = {}  # of units that columns state, by key
 
     def propose(self, foreign: Sequence[str]) -> MapProposal:
         numeric = [name for name in foreign if self._is_numeric(name)]
         families, more = find_families(numeric, self.robot)
         self.out.columns |= {f"{kind}_name": pattern for kind, pattern in more.items()}
         self.joint_suffix = more.get("joint", "").removeprefix("{joint}")
-        self.named_joints = self.named_joints or self._most_named(families)
+        self.named_joints = self.named_joints or self._all_named(families)
         self.out.lacking = [name for name in self.joints if self.named_joints and name not in self.named_joints]
         used: list[Family] = [one for one in families if self._place(one)]
         if "joint_torque" not in {*self.given, *self.out.columns}:
@@ -158,11 +162,10 @@ class _Proposer:
             return set()
         return set(family.by_name) or {f"{name}{self.joint_suffix}" for name in family.names if name}
 
-    def _most_named(self, families: Sequence[Family]) -> set[str]:
-        """Joints that a family of positions names, if more than half of them; none where it names fewer."""
-        of_positions = [self._joints_of(one) for one in families if self._field(one) == "joint_position"]
-        most = max(of_positions, key=len, default=set())
-        return most if 2 * len(most) > len(self.joints) else set()
+    def _all_named(self, families: Sequence[Family]) -> set[str]:
+        """Joints that any column names, if more than half of them; none where columns name fewer."""
+        named = {name for one in families for name in self._joints_of(one)}
+        return named if 2 * len(named) > len(self.joints) else set()
 
     def _field(self, family: Family) -> str:
         """The field that a family probably is."""
@@ -173,13 +176,17 @@ class _Proposer:
         of_force = name == "contact_force_normal" or _FORCE.search(family.pattern) or _MOMENT.search(family.pattern)
         if axes and of_foot and of_force:
             return "contact_wrench_local"
+        if of_foot and (_SIDEWAYS.search(family.words) or quantities_with(family.unit)[:1] == ("torque",)):
+            return ""
         if name == "contact_force_normal" or (not name and of_foot):
             return "contact_active"  # as a threshold: what it is in newtons nobody knows
         return "base_position_world" if name == "joint_position" and axes and not any(family.names) else name
 
     def _increases(self, column: str) -> bool:
         values = self.sample[column]
-        return values is not None and values.ndim == 1 and len(values) > 2 and bool((np.diff(values) > 0).all())
+        return (
+            values is not None and values.ndim == 1 and len(values) > 2 and bool((np.diff(values) > 0).mean() > _SORTED)
+        )
 
     def _fits(self, family: Family, name: str) -> bool:
         """Whether a family has as many columns as a field."""
@@ -193,7 +200,7 @@ class _Proposer:
         if ("{contact}" if name.startswith("joint_") else "{joint}") in family.pattern:
             return False
         if name.startswith("joint_"):
-            return self._fits_joints(family, count)
+            return self._fits_joints(family, name, count)
         if name.startswith("contact_wrench"):
             return count == 6 * len(self.feet)
         if name.startswith("contact_"):
@@ -201,12 +208,14 @@ class _Proposer:
         axes = "".join(sorted(family.axes)).lower()
         return count == (4 if "quat" in name else 3) and (not axes or axes == ("wxyz" if "quat" in name else "xyz"))
 
-    def _fits_joints(self, family: Family, count: int) -> bool:
+    def _fits_joints(self, family: Family, field: str, count: int) -> bool:
         """Whether a family has a column for each joint, or for each that positions are there of."""
         named = self._joints_of(family)
         slots = {MOTORS[JOINT_ORDERS[name].message] for name in suitable_orders(self.joints)}
         if named:
             whole = named == (self.named_joints or set(self.joints))
+            if not whole and 2 * len(named) > len(self.joints):
+                self.out.partial[field] = [x for x in self.joints if x in self.named_joints - named]
         else:
             whole = count in (len(self.joints), *slots, *([len(self.named_joints)] if self.names_stated else []))
         enough = count >= len(self.joints) if family.numbers else whole
@@ -313,9 +322,8 @@ class _Proposer:
         if position is not None and not is_stated and np.nanpercentile(np.abs(position), 98) > _TURNED:
             self._set_unit("joint_position", "deg", f"from values up to {np.nanmax(np.abs(position)):.3g}")
             factor = UNITS["angle"]["deg"]
-        both = None if position is None or velocity is None or self.files else (position, velocity)
-        if both is not None and both[0].shape == both[1].shape:  # not of several files, whose stamps may differ
-            self._add_speed_unit(both[1], factor * np.gradient(both[0], seconds, axis=0))
+        if position is not None and velocity is not None and not self.files:  # whose stamps may differ
+            self._add_speed_unit(velocity, factor * position, seconds)
         for name, is_it, unit, why in (
             ("joint_torque", lambda x: _rms(x) > _LEVER * self.robot.weight, "N mm", "as they are too large for N m"),
             ("base_position_world", lambda x: np.nanmax(np.abs(x)) > _FAR, "mm", "as it is too far away for m"),
@@ -326,8 +334,13 @@ class _Proposer:
             if values is not None and is_it(values):
                 self._set_unit(name, unit, why)
 
-    def _add_speed_unit(self, velocity: NDArray[np.float64], slope: NDArray[np.float64]) -> None:
-        ratio = float(np.sqrt(np.nanmean(velocity**2) / max(np.nanmean(slope**2), 1e-12)))
+    def _add_speed_unit(
+        self, velocity: NDArray[np.float64], position: NDArray[np.float64], seconds: NDArray[np.float64]
+    ) -> None:
+        if position.shape != velocity.shape:
+            return
+        slope = np.gradient(position, seconds, axis=0)
+        ratio = float(np.sqrt(np.nanmean(velocity**2) / max(float(np.nanmean(slope**2)), 1e-12)))
         units = {unit: 1.0 / UNITS["angular velocity"][unit] for unit in ("rad/s", "deg/s", "rpm", "rev/s")}
         unit = min(units, key=lambda unit: abs(np.log(max(ratio, 1e-9) / units[unit])))
         self._set_unit("joint_velocity", unit, f"as they are {ratio:.3g} times the slope of the positions")
@@ -338,7 +351,7 @@ class _Proposer:
             return
         if isinstance(entry, dict) and {"column", "columns"} & set(entry):
             entry["unit"] = unit
-            self.out.notes[name] = f"{unit}, {why}"
+            self.out.notes[name] = "; ".join(filter(None, (f"{unit}, {why}", self.out.notes.get(name))))
 
     def _values(self, name: str) -> NDArray[np.float64] | None:
         """Numbers (N, k) of an entry, in the order of its columns."""

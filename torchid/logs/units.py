@@ -15,7 +15,7 @@ _DEG, _TURN, _GRAVITY, _POUND = math.pi / 180.0, 2.0 * math.pi, 9.80665, 4.44822
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
     "angle": {"rad": 1.0, "mrad": 1e-3, "deg": _DEG, "rev": _TURN},
-    "angular velocity": {"rad/s": 1.0, "deg/s": _DEG, "rpm": _TURN / 60.0, "rev/s": _TURN},
+    "angular velocity": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEG, "rpm": _TURN / 60.0, "rev/s": _TURN},
     "angular acceleration": {"rad/s2": 1.0, "deg/s2": _DEG, "rpm/s": _TURN / 60.0, "rev/s2": _TURN},
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
     "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
