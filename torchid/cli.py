@@ -126,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     init.add_argument(
         "log",
         metavar="LOG",
-        help="table, arrays or bag: .csv, .parquet, .npz, .h5, .mcap, .db3, .bag; or several as one, 'FILE + FILE@SECONDS'",
+        help="table, arrays or bag: .csv, .parquet, .npz, .h5, .mcap, .db3, .bag; or several, 'FILE + FILE@SECONDS'",
     )
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")
     init.set_defaults(command=_init)
