@@ -119,7 +119,11 @@ def _parser() -> argparse.ArgumentParser:
     convert.set_defaults(command=_convert)
     init = commands.add_parser("init", help=_INIT, description=_INIT)
     init.add_argument("urdf", metavar="URDF", help="the robot")
-    init.add_argument("log", metavar="LOG", help="table, arrays or bag: .csv, .parquet, .npz, .h5, .mcap, .db3 or .bag")
+    init.add_argument(
+        "log",
+        metavar="LOG",
+        help="table, arrays or bag: .csv, .parquet, .npz, .h5, .mcap, .db3, .bag; or several, 'FILE + FILE@SECONDS'",
+    )
     init.add_argument("--output", default="experiment.yaml", metavar="FILE", help="file to write, a new one")
     init.set_defaults(command=_init)
     for name, command in commands.choices.items():

@@ -166,7 +166,7 @@ def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     shown = capsys.readouterr().out
     for text in (
         "missing       time: no columns that look like it",
-        "missing       joint_position: no columns that look like it, of all 12 joints",
+        "missing       joint_position: no columns that look like it, of most of 12 joints",
         "missing       forces: neither joint torques nor contact wrenches",
         "missing       motion of the base: neither its pose nor an IMU",
         "missing       contact_active: which foot touches when; set to touch throughout",

@@ -192,7 +192,7 @@ def test_an_array_of_feet_and_flags_of_some(tmp_path: Path) -> None:
 def test_a_bag_without_anything_is_answered_by_what_is_missing(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "x.mcap", [("/chatter", 1, "std_msgs/msg/String", {"data": "hello"})])
     said = init(URDF, path, tmp_path / "x.yaml")
-    assert "time: no topics that look like it, of all 12 joints" in said.missing
+    assert "time: no topics that look like it" in said.missing
     topics = load_config(tmp_path / "x.yaml").logs.topics
     assert topics is not None
     assert topics.by_role.keys() == {"joint_states", *(f"contact_active.{x}" for x in topics.contacts)}

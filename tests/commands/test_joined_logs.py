@@ -116,7 +116,6 @@ def test_no_sample_of_the_first_file_is_used_twice(demo: Path, capsys: pytest.Ca
 def test_what_several_files_are_not_for_is_refused(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     large = f"logs.train={json.dumps([JOINED])}", "preprocessing.memory_gb=1e-4"
     assert "file: several files with arrays of" in refusal(capsys, "identify", "quadruped.yaml", *large)
-    assert "several files" in refusal(capsys, "init", "quadruped.urdf", NAME, "--output", "new.yaml")
     assert "belongs to what is read" in refusal(capsys, "convert", NAME, "plates.npz", "--overwrite")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -19,13 +20,15 @@ from torchid.errors import ConfigError, InputError, LogError, about_file, excerp
 from torchid.logs import Columns, Topics, read_log
 from torchid.logs.bag_samples import read_bag_sample
 from torchid.logs.column_proposals import OF_PLATES, propose_field
+from torchid.logs.column_samples import read_sample, stated_names, texts_in
 from torchid.logs.containers import LogKind, atomic_output, existing_log_kind
-from torchid.logs.map_proposals import MapProposal, propose_map, read_sample, stated_names, texts_in
+from torchid.logs.map_proposals import MapProposal, propose_map
 from torchid.logs.name_matching import KnownRobot, within
 from torchid.logs.time_range import split_range
 from torchid.logs.topic_proposals import USED_TYPES, frame_of, propose_topics
 from torchid.regressor.kinematics import GRAVITY_WORLD
 from torchid.robot import CollisionShapes, Robot, load_robot
+from torchid.robot.urdf import position_limits
 
 _FEET = (r"foot|feet", r"sole", r"ankle_roll|ankle_flexion", r"toe|ankle|paw|hoof")
 """Words in names of links that touch the ground, the surest first."""
@@ -36,6 +39,8 @@ _FORCES = ("joint_torque", "contact_wrench_local", "contact_wrench_world", "cont
 _POSE = ("base_quat_wxyz", "base_quat_xyzw")
 _IMU = ("imu_specific_force", "imu_angular_velocity")
 _WHAT = {"columns": "names, units and orders of the file", "topics": "what the messages of the bag hold"}
+_WELDED = "joints that the log lacks, held still; one that moves needs columns"
+_OTHER_FILE = "; if another file has it: torchid init URDF 'FILE + FILE@SECONDS', docs/logs.md"
 _LINE = 118
 
 
@@ -72,7 +77,7 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
 
     Args:
         urdf: of the robot.
-        log: a table or arrays, in the log format or not, or a bag.
+        log: a table or arrays, in the log format or not, several of these as one log, or a bag.
         output: the file; nothing that is there is replaced.
 
     Raises:
@@ -83,14 +88,12 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
         raise ConfigError("command line", "--output", f"'{target}'", "a file name that ends in .yaml or .yml")
     if os.path.lexists(target):
         raise ConfigError(target, "--output", "exists", "a new file: torchid init replaces none")
-    check_free_file(target, "--output", False, [urdf, path])
-    file = split_range(path).file
-    kind = existing_log_kind(file)
-    if kind is LogKind.JOINED:
-        raise ConfigError("command line", "LOG", f"several files, '{excerpt(str(log))}'", "one of them at a time")
-    is_bag = kind is LogKind.BAG
+    part = split_range(path)
+    files = [file.path for file in part.files]
+    check_free_file(target, "--output", False, [urdf, *files])
+    is_bag = existing_log_kind(part.file) is LogKind.BAG
     robot = load_robot(urdf)
-    contacts, fields, proposal = _of_bag(file, robot) if is_bag else _of_columns(file, robot)
+    contacts, fields, proposal = _of_bag(part.file, robot) if is_bag else _of_columns(files, robot)
     out = Initiated(target)
     text = _text(robot, urdf, path, target, contacts, fields, proposal)
     _describe(out, robot, contacts, fields, proposal)
@@ -100,15 +103,19 @@ def init(urdf: str | Path, log: str | Path, output: str | Path) -> Initiated:
     return out
 
 
-def _of_columns(file: Path, robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
-    """Contacts, fields and a map of a table or arrays."""
-    size = memory_needed(file, PreprocessingConfig().memory_gb)
-    if size > PreprocessingConfig().memory_gb:
-        accepted = "a log of a part of the recording, whose map holds for all of it"
-        raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
-    sample = read_sample(file)
+def _of_columns(files: Sequence[Path], robot: Robot) -> tuple[list[_Contact], set[str], MapProposal]:
+    """Contacts, fields and a map of a table or arrays, or of several that are one log."""
+    samples, size = [], 0.0
+    for file in files:
+        size = memory_needed(file, PreprocessingConfig().memory_gb, size)
+        if size > PreprocessingConfig().memory_gb:
+            accepted = "a log of a part of the recording, whose map holds for all of it"
+            raise LogError(file, "file", f"arrays of {size:.2g} GB", accepted)
+        with about_file(file):
+            samples.append(read_sample(file))
+    sample = {name: values for of_file in reversed(samples) for name, values in of_file.items()}
     contacts = _guess_contacts(robot, _stated_contacts(sample, robot), texts_in(sample))
-    proposal = propose_map(sample, _known(robot, contacts))
+    proposal = propose_map(sample, _known(robot, contacts), samples if len(files) > 1 else ())
     fields = _fields_of(sample, proposal)
     _add_imu_frame(robot, fields, proposal)
     return contacts, fields, proposal
@@ -230,11 +237,11 @@ def _describe(
         out.guessed.append("contacts: from names of links; point where there is a ball or more than two of them")
     if _is_fixed(contacts, fields):
         out.guessed.append("robot.fixed_base: true, as there is neither a foot nor a motion of the base")
+    if proposal.lacking:
+        out.guessed.append(f"robot.weld: {_WELDED}: {join_names(proposal.lacking)}")
     if proposal.left_out:
         out.guessed.append(f"{format_count(len(proposal.left_out), what)} not needed: {join_names(proposal.left_out)}")
-    for name in ("time", "joint_position"):
-        if name not in fields:
-            out.missing.append(f"{name}: no {what}s that look like it, of all {len(robot.joint_names)} joints")
+    out.missing += _missing_columns(robot, fields, proposal)
     if not set(_FORCES) & fields:
         out.missing.append("forces: neither joint torques nor contact wrenches")
     _describe_plates(out, proposal)
@@ -245,6 +252,20 @@ def _describe(
     if _lacks_base_motion(contacts, fields):
         instead = "; taken from the feet that stand" if "base_motion" in from_feet else ""
         out.missing.append(f"motion of the base: neither its pose nor an IMU{instead}")
+
+
+def _missing_columns(robot: Robot, fields: set[str], proposal: MapProposal) -> list[str]:
+    """What stamps and fields of joints lack, in words."""
+    what = proposal.key.removesuffix("s")
+    partial = {name: joints for name, joints in proposal.partial.items() if name not in fields}
+    out = [
+        f"{name}: no {what} of numbers of {join_names(joints)}, but of all others" for name, joints in partial.items()
+    ]
+    for name in ("time", "joint_position"):
+        if name not in fields | partial.keys():
+            of_joints = f", of most of {len(robot.joint_names)} joints" * (name != "time")
+            out.append(f"{name}: no {what}s that look like it{of_joints}{_OTHER_FILE * (what == 'column')}")
+    return out
 
 
 def _describe_found(
@@ -292,10 +313,14 @@ def _text(
         always = [contact.frame for contact in contacts]
         proposal.columns["contact_active"] = {"always": always} if is_map else dict.fromkeys(always, True)
         proposal.notes["contact_active"] = "every foot touches throughout, as nothing recorded says otherwise"
-    own = {"urdf": _relative(Path(urdf), output)} | ({"fixed_base": True} if _is_fixed(contacts, fields) else {})
+    own: dict[str, object] = {"urdf": _relative(Path(urdf), output)} | (
+        {"fixed_base": True} if _is_fixed(contacts, fields) else {}
+    )
+    own |= {"weld": weld} if (weld := _weld(robot, proposal)) else {}
     names = f"{excerpt(log.name)} and {excerpt(robot.path.name)}"
     lines = [f"# {names}, by torchid init; what is marked as guessed should be checked"]
     lines += _entry("robot", own)
+    lines += [f"  # guessed: weld: {_WELDED}"] if weld else []
     if contacts:
         lines.append("contacts:  # guessed: from names of links")
         lines += [f"  - {_flow({'frame': contact.frame, 'type': contact.type})}" for contact in contacts]
@@ -315,6 +340,14 @@ def _text(
     lines += _entry("estimator", {"name": "consistent", "ridge": "auto"})
     lines += _entry("output", f"runs/{output.stem}")
     return "\n".join(lines) + "\n"
+
+
+def _weld(robot: Robot, proposal: MapProposal) -> list[str] | dict[str, float]:
+    """Joints that a log lacks, each at 0, or at the middle of its range if that is elsewhere."""
+    limits = position_limits(robot.path)
+    ranges = {name: limits.get(name, (-math.inf, math.inf)) for name in proposal.lacking}
+    at = {name: 0.0 if low <= 0.0 <= high else float(f"{(low + high) / 2:.4g}") for name, (low, high) in ranges.items()}
+    return at if any(at.values()) else list(at)
 
 
 def _relative(path: Path, output: Path) -> str:

@@ -201,12 +201,8 @@ _STANCE_END_S, _MIN_STANCE_S = 0.05, 0.15
 _MAX_COMPARED_SAMPLES, _MIN_BASE_MOTION = 1500, 0.01
 _LENGTH_UNIT_M = 0.3
 _CORRECTED_FIELDS = (
-    "joint_names",
-    "joint_position",
-    "base_quat_xyzw",
-    "base_position_world",
-    "contact_names",
-    "contact_active",
+    *("joint_names", "joint_position", "base_quat_xyzw", "base_position_world"),
+    *("contact_names", "contact_active"),
 )
 _STANDING_FEET_CHECK = "feet that stand"
 

@@ -9,11 +9,13 @@ from dataclasses import dataclass, field
 
 from torchid.logs.column_map import PLACEHOLDER
 from torchid.logs.name_matching import SUFFIXES, KnownRobot, spelled, within
+from torchid.logs.units import split_unit
 
 _NUMBER = re.compile(r"\d+")
 _AXIS = re.compile(
-    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-z_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-z])([wxyz])$",
+    r"(?<=[._\-/\[ ])([wxyz])(?=$|[\]])|(?<=[a-zFM_.\-/\[ ])([WXYZ])(?=$|[\]])|(?<=[a-zFM])([wxyz])$",
 )
+_BEHIND = re.compile(r"[_./ \[-]*\{[^{}]*\}\]?$")  # a unit: the axis in `acc_g.{axis}`
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,11 @@ class Family:
     def words(self) -> str:
         """All that is neither a name nor a number nor an axis."""
         return PLACEHOLDER.sub(" ", self.pattern)
+
+    @property
+    def unit(self) -> str:
+        """What the columns say of their unit, "" if nothing."""
+        return split_unit(_BEHIND.sub("", self.pattern))[1] or split_unit(self.pattern)[1]
 
     @property
     def entry(self) -> dict[str, object]:
@@ -135,9 +142,11 @@ def _pattern(column: str, kinds: Sequence[_Stems], split_axes: bool = True) -> t
     name, of = max(fitting, key=lambda pair: len(pair[0]), default=("", _Stems("")))
     if name:
         column = of.find(name).sub(f"{{{of.kind}}}", column, count=1)
+    stem, _ = split_unit(column)
+    column, behind = stem, column[len(stem) :]
     if not name and (found := _NUMBER.search(column)):
         column, number = f"{column[: found.start()]}{{index}}{column[found.end() :]}", found[0]
     if split_axes and (found := _AXIS.search(column)):
         axis = found[0]
         column = f"{column[: found.start()]}{{{'axis' if axis.islower() else 'AXIS'}}}{column[found.end() :]}"
-    return column, name, number, axis
+    return column + behind, name, number, axis

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 
 from torchid.errors import LogError, excerpt
 from torchid.logs.log import NAME_FIELDS, POINTS, SHAPES, VARIANTS, WRENCHES
+from torchid.logs.units import quantities_with, split_unit
 
 _FIELDS = tuple(name for name in (*SHAPES, *VARIANTS) if name not in NAME_FIELDS)
 _LISTED, _LONGEST = 12, 60
 #: What force plates read; under which foot each lies, no name of a column says.
 OF_PLATES = (WRENCHES[1], POINTS)
-_BASE = r"\b(base|root|trunk|torso|pelvis|floating base)"
+_BASE = r"\b(base|root|trunk|torso|pelvis|body|floating base)"
 #: Words that recordings have for a field, by what the name of a column contains; the first that fits counts.
 _WORDS = (
     (POINTS, r"\b(cop[xyz]?|ground force p[xyz])\b"),
@@ -33,6 +34,11 @@ _WORDS = (
     ("joint_position", r"\b(qs?|qpos|pos|positions?|angles?)\b"),
     ("time", r"\b(t|ts|time|timestamps?|stamps?|ticks?|clock|sec|secs|seconds)\b"),
 )
+#: Fields that a unit alone tells: of `LF_HAA [deg]`, `LF_HAA [deg/s]`.
+_BY_QUANTITY = {
+    "angle": "joint_position", "angular velocity": "joint_velocity", "angular acceleration": "joint_acceleration",
+    "torque": "joint_torque",
+}  # fmt: skip
 _APART = (("linear", "angular"), ("position", "velocity", "acceleration", "torque"), ("world", "base", "local"))
 _DESIRED = re.compile(r"\b(des|desired|cmd|command|ref|target|goal|setpoint|ff)\b")
 _SPLIT = re.compile(r"[^A-Za-z]+|(?<=[a-z])(?=[A-Z])")
@@ -50,13 +56,15 @@ def propose_field(column: str, desired: bool = False) -> str:
         column: its name.
         desired: whether a desired value counts as one that was measured.
     """
+    column, unit = split_unit(column)
     words = " ".join(_words(column))
     close = difflib.get_close_matches(column.partition(".")[0], _FIELDS, n=1, cutoff=0.8)
     if close and not _contradicts(words, " ".join(_words(close[0]))):
         return close[0]
     if not desired and _DESIRED.search(words):
         return ""
-    return next((field for field, pattern in _WORDS if re.search(pattern, words)), "")
+    named = next((field for field, pattern in _WORDS if re.search(pattern, words)), "")
+    return named or next((_BY_QUANTITY[x] for x in quantities_with(unit) if x in _BY_QUANTITY), "")
 
 
 def _contradicts(words: str, others: str) -> bool:
@@ -73,7 +81,7 @@ def name_unknown(columns: Sequence[str]) -> str:
     """Columns, with what each may be, in one line: `'timestamp' (time?), 'q_0' and 11 like it (joint_position?)`."""
     alike: dict[tuple[str, ...], list[str]] = {}
     for column in columns:
-        proposed, words = propose_field(column), _words(column) or [column]
+        proposed, words = propose_field(column), _words(split_unit(column)[0]) or [column]
         if proposed and len(words) > 1 and words[-1] in ("w", "x", "y", "z"):
             words.pop()
         alike.setdefault((proposed, words[-1], "" if proposed else words[0]), []).append(column)

@@ -15,7 +15,7 @@ _DEG, _TURN, _GRAVITY, _POUND = math.pi / 180.0, 2.0 * math.pi, 9.80665, 4.44822
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
     "angle": {"rad": 1.0, "mrad": 1e-3, "deg": _DEG, "rev": _TURN},
-    "angular velocity": {"rad/s": 1.0, "deg/s": _DEG, "rpm": _TURN / 60.0, "rev/s": _TURN},
+    "angular velocity": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEG, "rpm": _TURN / 60.0, "rev/s": _TURN},
     "angular acceleration": {"rad/s2": 1.0, "deg/s2": _DEG, "rpm/s": _TURN / 60.0, "rev/s2": _TURN},
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
     "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
@@ -39,16 +39,14 @@ _OF_JOINTS = {
     "joint_torque": ("torque", "force"),
 }
 _SPELLINGS = {
-    "°": "deg",
-    "µ": "u",
-    "μ": "u",
-    "²": "2",
-    "kgf": "kg",
-    "degrees": "deg",
-    "degree": "deg",
-    "radians": "rad",
-}
+    "°": "deg", "µ": "u", "μ": "u", "²": "2", "⁻": "-", "kgf": "kg", "degrees": "deg", "degree": "deg",
+    "radians": "rad", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "seconds": "s", "sec": "s",
+    "dps": "deg/s",
+}  # fmt: skip
 _MARKS = re.compile(r"[ ·.*^]")
+_POWERS = {"s-1": "/s", "s-2": "/s2", "/s/s": "/s2", "N-m": "Nm", "nm": "Nm"}
+_BRACKETS = re.compile(r"(.*?)\s*(?:\[([^\[\]{}]*)\]|\(([^(){}]*)\))\s*")
+_INSIDE = re.compile(r"\d+|[wxyzWXYZ]|[fm][xyz]")  # of brackets: a number or a component, no unit
 
 
 def quantities_of(field: str, component: str = "") -> tuple[str, ...]:
@@ -90,8 +88,35 @@ def unit_factor(key: str, unit: str, quantities: tuple[str, ...]) -> float:
     raise ConfigError.at_field(key, found, accepted or "no unit, as this is a number without one")
 
 
+def quantities_with(unit: str) -> tuple[str, ...]:
+    """The quantities that have a unit, none for a word that is no unit."""
+    plain = _plain(unit)
+    return tuple(quantity for quantity, units in UNITS.items() if plain in units)
+
+
+def split_unit(column: str) -> tuple[str, str]:
+    """The name of a column and the unit behind it, "" without one: `q1 [deg]`, `tau_hip (Nm)`, `Fz_N`, `vel_deg_s`.
+
+    What brackets hold is a unit, known or not, unless it is a number or an axis; a suffix is one that is known.
+    """
+    found = _BRACKETS.fullmatch(column)
+    if found:
+        inside = (found[2] or found[3] or "").strip()
+        return (column, "") if _INSIDE.fullmatch(inside) else (found[1], inside)
+    for start in (found.start() for found in re.finditer(r"[_ .](?=[^_ .])", column)):
+        text = column[start + 1 :].replace("_per_", "/")
+        for unit in (text.replace("_", "/"), text.replace("_", "")):
+            if quantities_with(unit):
+                return column[:start].rstrip("_ ."), unit
+    return column, ""
+
+
 def _plain(unit: str) -> str:
-    """The unit as the table spells it: without spaces, dots, powers and words in full."""
+    """The unit as the table spells it: without spaces, dots, powers, capitals of long ones, and words in full."""
     for spelling, plain in _SPELLINGS.items():
         unit = unit.replace(spelling, plain)
-    return _MARKS.sub("", unit)
+    unit = _MARKS.sub("", unit)
+    for spelling, plain in _POWERS.items():
+        unit = unit.replace(spelling, plain)
+    lower = unit.lower()
+    return lower if lower.startswith(("deg", "rad", "rpm")) else unit

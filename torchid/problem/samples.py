@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchid.errors import LogError, UnknownNameError, about_file
+from torchid.errors import LogError, UnknownNameError, about_file, join_names
 from torchid.logs import Log
 from torchid.logs.log import FORCE_NORMAL, FloatArray, normalize_normals
 from torchid.logs.preprocess import unloaded_readings
@@ -25,6 +25,7 @@ from torchid.robot import Robot
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE, NORMAL_INDEX
 
+_LISTED = 6
 _JOINT_FIELDS = ("joint_position", "joint_velocity", "joint_acceleration")
 
 
@@ -315,11 +316,12 @@ def joint_order(log: Log, robot: Robot) -> list[int]:
     for name in log.joint_names:
         if name not in known:
             raise UnknownNameError(log.source, "joint_names", name, robot.joint_names)
-    for name in robot.joint_names:
-        if name not in log.joint_names:
-            raise LogError(
-                log.source, "joint_names", f"joint '{name}' of {robot.path.name} missing", "every moving joint"
-            )
+    lacking = [name for name in robot.joint_names if name not in log.joint_names]
+    if lacking:
+        found = f"{join_names(lacking, _LISTED)} of {robot.path.name} missing"
+        listed = ", ".join(lacking) if len(lacking) <= _LISTED else f"{lacking[0]}, ..."
+        accepted = f"every joint that moves, or robot.weld: [{listed}] for those that are held"
+        raise LogError(log.source, "joint_names", found, accepted)
     return [log.joint_names.index(name) for name in robot.joint_names]
 
 

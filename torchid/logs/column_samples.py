@@ -1,0 +1,50 @@
+"""Columns of tables, or arrays, with some of their rows: what a map is proposed from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchid.logs.containers import LogKind, existing_log_kind, open_container, reader_errors_explained
+from torchid.logs.tables import sample_table
+
+Columns = Mapping[str, NDArray[Any] | None]
+"""Columns of a table or arrays with some of their rows, some of them names; None for what is neither."""
+
+
+_NAMES = 300  # elements of a list of names
+
+
+def read_sample(path: Path) -> Columns:
+    """The columns of a table or the arrays of a file, with some of the rows of tables.
+
+    Raises:
+        LogError: it cannot be read, or is a bag.
+    """
+    if existing_log_kind(path) is LogKind.TABLE:
+        return sample_table(path)
+    out: dict[str, NDArray[Any] | None] = {}
+    with open_container(path) as container:
+        for name in container.declared_bytes():
+            with reader_errors_explained(name, "a plain array of numbers, truth values or text"):
+                array = container.load(name)
+            is_list = array.ndim == 1 and len(array) <= _NAMES
+            out[name] = array if array.dtype.kind in "fiub" or is_list else None
+    return out
+
+
+def stated_names(sample: Columns, field: str) -> list[str]:
+    """Names of joints, contacts or sensors that a file of arrays states."""
+    stated = sample.get(field)
+    names = [] if stated is None else np.ravel(stated).tolist()
+    return [name.decode(errors="replace") if isinstance(name, bytes) else str(name) for name in names]
+
+
+def texts_in(sample: Columns) -> list[str]:
+    """Names of columns and arrays, and all that lists of names in them have."""
+    listed = [name for name, x in sample.items() if x is not None and x.dtype.kind not in "fiub"]
+    return [*sample, *(text for name in listed for text in stated_names(sample, name))]
