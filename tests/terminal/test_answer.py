@@ -16,7 +16,8 @@ from torchid.commands.identify import identify
 from torchid.config import load_config
 from torchid.estimators.least_squares import COMBINED, IDENTIFIED
 from torchid.parameters import PER_BODY
-from torchid.problem.metrics import DECISIVE_GROUPS, WorseThanNominal
+from torchid.problem import Metrics
+from torchid.problem.metrics import DECISIVE_GROUPS, WHITENED, WorseThanNominal
 from torchid.terminal.answer import LINES, answer_lines
 
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
@@ -72,6 +73,18 @@ def test_without_test_logs_blocks_left_out_are_judged_and_the_text_says_so(free:
     assert "but the model does not explain these forces" in first
     assert free.validation is not None
     assert f"{free.validation.identified.rms['joint_torque']:.4g}" in text(free)
+
+
+def test_projected_forces_are_shown_where_no_joint_or_base_force_can_be(consistent: Identification) -> None:
+    def without_others(metrics: Metrics) -> Metrics:
+        return replace(metrics, rms={name: metrics.rms[name] for name in ("nullspace", WHITENED)})
+
+    pair = consistent.metrics["test"]
+    fewer = replace(pair, nominal=without_others(pair.nominal), identified=without_others(pair.identified))
+    said = text(replace(consistent, metrics=consistent.metrics | {"test": fewer}))
+    assert f"{pair.identified.rms['nullspace']:.4g}" in said.split("projected [N, N m]")[1].split("\n")[0]
+    assert "base force" not in said
+    assert "projected" not in text(consistent)
 
 
 def test_bodies_that_cannot_exist_are_counted_with_what_to_do(consistent: Identification, free: Identification) -> None:

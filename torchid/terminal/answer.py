@@ -25,6 +25,7 @@ from torchid.terminal.lines import LABEL
 LINES = 20
 """At most so many."""
 
+_FEW_GROUPS = 2
 _MOST_ATTENTION, _ATTENTION_LINES = 2, 2
 _FEWEST_LINES = 4  # of the table of bodies: a heading, a body, how many others there are, what the marks mean
 #: By the least and the largest error of a group of rows, as shares of the URDF's.
@@ -76,9 +77,9 @@ class _Judged:
     nominal: Metrics
     identified: Metrics
 
-    def errors(self) -> Iterator[tuple[str, float, float, float | None]]:
+    def errors(self, groups: Sequence[str] = DECISIVE_GROUPS) -> Iterator[tuple[str, float, float, float | None]]:
         """Groups of rows with both errors, and what noise of the readings leaves."""
-        for group in DECISIVE_GROUPS:
+        for group in groups:
             before, after = self.nominal.rms.get(group), self.identified.rms.get(group)
             if before is not None and after is not None:
                 yield group, before, after, self.identified.noise.get(group)
@@ -107,7 +108,7 @@ def _headline(run: Identification, judged: _Judged) -> str:
     known = [after / floor for _, _, after, floor in judged.errors() if floor]
     floor = ", as near as the sensors' noise allows" if known and max(known) < _AT_THE_FLOOR else ""
     if not run.misfit.explained:
-        floor = ", but the model does not explain these forces"
+        floor = f", {'and' if verdict == _NO_BETTER else 'but'} the model does not explain these forces"
     return f"{verdict} on {judged.text}: errors of {shares} of the URDF's{floor}"
 
 
@@ -120,7 +121,8 @@ def _error_lines(judged: _Judged, width: int) -> list[str]:
     table.add_column("rms error of", no_wrap=True)
     for heading in ("URDF", "identified", "noise alone"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for group, before, after, floor in judged.errors():
+    few = len(list(judged.errors())) < _FEW_GROUPS  # no joint of its own, as all legs stand: their projection
+    for group, before, after, floor in judged.errors(tuple(ERROR_GROUPS) if few else DECISIVE_GROUPS):
         cells = (f"{before:.4g}", f"{after:.4g}", "-" if floor is None else f"{floor:.4g}")
         table.add_row(Text(ERROR_GROUPS[group]), *cells)
     return _lines(table, width) if table.row_count else []
