@@ -80,7 +80,7 @@ def test_projected_forces_are_shown_where_no_joint_or_base_force_can_be(consiste
         return replace(metrics, rms={name: metrics.rms[name] for name in ("nullspace", WHITENED)})
 
     pair = consistent.metrics["test"]
-    fewer = replace(pair, nominal=without_others(pair.nominal), identified=without_others(pair.identified))
+    fewer = pair._replace(nominal=without_others(pair.nominal), identified=without_others(pair.identified))
     said = text(replace(consistent, metrics=consistent.metrics | {"test": fewer}))
     assert f"{pair.identified.rms['nullspace']:.4g}" in said.split("projected [N, N m]")[1].split("\n")[0]
     assert "base force" not in said
