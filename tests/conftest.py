@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from demo import shortened_demo
 from hostile_commands import Commands, commands
+from run_figures import draw, draw_nothing
 from synthetic import load
 
 import torchid
@@ -26,6 +27,20 @@ def _elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         monkeypatch.setenv("PYTHONPATH", str(Path(torchid.__file__).parents[1]), os.pathsep)  # of child processes
         monkeypatch.chdir(tmp_path_factory.mktemp("work"))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _drawing_nothing() -> Iterator[None]:
+    """Of the figures of a run a test sees white ones, unless it asks for `figures`."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        draw_nothing(monkeypatch)
+        yield
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs draw what a user sees."""
+    draw(monkeypatch)
 
 
 @pytest.fixture(scope="module")

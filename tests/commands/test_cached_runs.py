@@ -16,7 +16,7 @@ import pytest
 import yaml
 from demo import DEMO, shortened_demo
 from large import experiment, overrides, recorded
-from trainings import without_figures
+from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cache import FOLDER, content_key
@@ -49,7 +49,7 @@ ESTIMATORS = {
 
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_figures(monkeypatch)
+    trust_new_files(monkeypatch)
 
 
 @pytest.fixture(scope="module")

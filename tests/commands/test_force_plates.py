@@ -19,7 +19,7 @@ from refusals import refusal
 from repository import SHARED
 from scipy.spatial.transform import Rotation
 from simulated import BIPED, feet_of
-from trainings import without_figures
+from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.logs import Log, read_log, write_log
@@ -29,7 +29,7 @@ MOTION = "motion.npz + plates.csv"
 
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_figures(monkeypatch)
+    trust_new_files(monkeypatch)
 
 
 def experiment(folder: Path, log: str, columns: str | None = None, **preprocessing: Any) -> Path:
@@ -64,7 +64,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, dict
     folder = tmp_path_factory.mktemp("soles")
     write_log(walk(), folder / "walk.npz")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        without_figures(monkeypatch)
+        trust_new_files(monkeypatch)
         return identified(experiment(folder, "walk.npz"))
 
 

@@ -12,7 +12,7 @@ import yaml
 from dialects import DIALECTS, with_velocity
 from refusals import refusal
 from repository import DEMO
-from trainings import without_figures
+from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cache import content_key
@@ -29,7 +29,7 @@ SMALL = "preprocessing.memory_gb=0.0001"
 
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_figures(monkeypatch)
+    trust_new_files(monkeypatch)
 
 
 def recorded(name: str) -> Log:
@@ -66,7 +66,7 @@ def identified(folder: Path, dialect: str | None, *overrides: str) -> tuple[dict
 def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
     """What the log in the format gives."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        without_figures(monkeypatch)
+        trust_new_files(monkeypatch)
         return identified(tmp_path_factory.mktemp("format") / "x", None)[0]
 
 

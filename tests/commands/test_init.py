@@ -13,7 +13,7 @@ from dialects import DIALECTS, save_csv, with_velocity
 from refusals import refusal
 from repository import DEMO, SHARED
 from synthetic import ANYMAL, G1, PANDA, ROBOTS, SOLO12
-from trainings import without_figures
+from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.init import init
@@ -79,7 +79,7 @@ def test_names_alone_give_the_log_where_the_file_has_them(tmp_path: Path, dialec
 def test_a_recording_is_identified_without_an_edit_where_names_say_everything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    without_figures(monkeypatch)
+    trust_new_files(monkeypatch)
     name, _, write = DIALECTS["groups"]
     init(URDF, write(tmp_path / name, recorded()), tmp_path / "new.yaml")
     more = ("estimator={name: least_squares, ridge: 0.01}", "preprocessing.cutoff_hz=8", "sensors=joints")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from demo import shortened_demo
-from trainings import without_figures
+from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.config import load_config
@@ -29,7 +29,7 @@ NAME = "motion.npz + plates.npz@-3.0s + torques.npz"
 
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_figures(monkeypatch)
+    trust_new_files(monkeypatch)
 
 
 @pytest.fixture

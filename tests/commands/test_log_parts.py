@@ -14,7 +14,7 @@ import torch
 import yaml
 from demo import shortened_demo
 from large import assert_same, tensors
-from trainings import without_figures
+from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.cached_reading import CachedReader, open_cache
@@ -32,7 +32,7 @@ FEET = [f"{leg}_foot" for leg in ("front_left", "front_right", "rear_left", "rea
 
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_figures(monkeypatch)
+    trust_new_files(monkeypatch)
 
 
 @pytest.fixture(scope="module")

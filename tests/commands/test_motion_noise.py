@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from demo import shortened_demo
-from trainings import without_figures
+from trainings import trust_new_files
 
 from torchid.cli import main
 from torchid.commands.reading import LogReader
@@ -25,7 +25,7 @@ from torchid.problem.motion_noise import MotionNoise
 
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_figures(monkeypatch)
+    trust_new_files(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -150,7 +150,7 @@ def differences(one: Any, other: Any, path: str = "") -> Iterator[tuple[str, flo
 def _main() -> None:
     import torch.distributed as dist  # noqa: TID251
     from matplotlib.figure import Figure
-    from trainings import FIGURES
+    from run_figures import FIGURES
 
     from torchid.commands import results
     from torchid.commands.identify import identify

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from matplotlib.figure import Figure
 from run_folders import names_in
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -18,20 +17,15 @@ from torchid.estimators import Trainer
 EPOCHS, EVERY = 16, 5
 
 
-FIGURES = ("draw_forces", "error_figure", "parameter_figure", "identifiability_figure", "contribution_figure")
-
-
 EVALUATED = sorted({*range(0, EPOCHS + 1, EVERY), EPOCHS})
 
 
 BY_EPOCH = list(range(1, EPOCHS + 1))
 
 
-def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No figures, which take most of the time of a run, and a cache that trusts files that have just been written."""
+def trust_new_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache that trusts files that have just been written."""
     monkeypatch.setattr("torchid.commands.cache._YOUNG", -1.0)
-    for figure in FIGURES:
-        monkeypatch.setattr(f"torchid.commands.results.{figure}", lambda *_: Figure(figsize=(1.0, 1.0)))
 
 
 def command(experiment: Path, output: Path, *more: str) -> list[str]:

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from matplotlib.figure import Figure
 from repository import DEMO
 from tensorboard.summary.writer import event_file_writer
 from trainings import (
     EPOCHS,
     EVERY,
-    FIGURES,
     command,
     interrupt,
     stopped_in,
@@ -63,13 +61,6 @@ def run(experiment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("runs") / "whole"
     assert main(["identify", str(experiment / "experiment.yaml"), f"output={output}"]) == 0
     return output
-
-
-@pytest.fixture
-def plain(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are empty: drawing them is most of the time of so short a run."""
-    for name in FIGURES:
-        monkeypatch.setattr(f"torchid.commands.results.{name}", lambda *_: Figure())
 
 
 @pytest.fixture(scope="module")

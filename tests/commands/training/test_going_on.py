@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from repository import DEMO
+from run_figures import FIGURES
 from run_folders import names_in
 from tensorboard.plugins.custom_scalar import layout_pb2
 from trainings import (
     BY_EPOCH,
     EPOCHS,
     EVALUATED,
-    FIGURES,
     assert_as_uninterrupted,
     command,
     events_in,
@@ -192,7 +192,6 @@ def killed(server: subprocess.Popen[str], arguments: list[str], output: Path, af
     return int(line)
 
 
-@pytest.mark.usefixtures("plain")
 def test_a_run_killed_at_any_moments_ends_as_if_it_had_not_been(
     experiment: Path, run: Path, server: subprocess.Popen[str], tmp_path: Path
 ) -> None:
@@ -212,7 +211,6 @@ def test_a_run_killed_at_any_moments_ends_as_if_it_had_not_been(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.usefixtures("plain")
 def test_a_signal_ends_a_training_with_a_line_on_how_to_go_on(
     experiment: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], number: int
 ) -> None:
@@ -228,7 +226,6 @@ def test_a_signal_ends_a_training_with_a_line_on_how_to_go_on(
     assert_as_uninterrupted(output, run)
 
 
-@pytest.mark.usefixtures("plain")
 def test_what_came_after_the_last_checkpoint_is_done_again(
     experiment: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -244,7 +241,6 @@ def test_what_came_after_the_last_checkpoint_is_done_again(
     assert_as_uninterrupted(output, run)
 
 
-@pytest.mark.usefixtures("plain")
 def test_an_interrupt_before_the_first_checkpoint_leaves_nothing_in_the_way(
     experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,7 +256,7 @@ def test_an_interrupt_before_the_first_checkpoint_leaves_nothing_in_the_way(
 
 
 def test_an_interrupt_while_results_are_written_loses_nothing_of_the_training(
-    experiment: Path, run: Path, output: Path, plain: None
+    experiment: Path, run: Path, output: Path
 ) -> None:
     def stopped(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)

@@ -168,7 +168,6 @@ def test_whatever_bit_of_a_checkpoint_flips_it_is_refused_or_says_the_same(tmp_p
 # ----------------------------------------------------------------------------------------------------- what is replaced
 
 
-@pytest.mark.usefixtures("plain")
 def test_a_run_stays_as_it_is_until_the_one_that_replaces_it_is_complete(
     experiment: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -201,7 +200,6 @@ def test_an_unfinished_training_is_not_overwritten_unless_asked_for(
     assert f"{training_of(output)}: output: an unfinished training; accepted: --resume, overwrite=true" in line
 
 
-@pytest.mark.usefixtures("plain")
 def test_an_unfinished_training_is_begun_anew_if_asked_for(
     experiment: Path, output: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -223,7 +221,6 @@ def test_a_folder_of_that_name_that_is_no_training_stays(
     )
 
 
-@pytest.mark.usefixtures("plain")
 def test_a_descent_that_diverges_ends_in_one_line_and_is_not_in_the_way_of_the_next(
     experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -265,7 +262,6 @@ def test_a_slip_in_the_settings_of_a_descent_is_named_before_anything_is_written
     assert f"experiment.yaml: {expected}" in line
 
 
-@pytest.mark.usefixtures("plain")
 def test_overrides_may_come_before_and_after_options_and_strangers_are_refused(
     experiment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
