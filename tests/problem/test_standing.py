@@ -272,7 +272,7 @@ def test_a_log_that_says_nothing_of_the_base_is_refused_in_one_line() -> None:
     unnamed = replace(log, contact_names=("a", *log.contact_names[1:]))
     refused(lambda: found(case, unnamed), "quadruped: contact_names: contact 'front_left_foot' missing", LogError)
     fewer = replace(log, joint_names=log.joint_names[1:], joint_position=log.joint_position[:, 1:])
-    refused(lambda: found(case, fewer), "quadruped: joint_names: joint 'front_left_hip' of", LogError)
+    refused(lambda: found(case, fewer), "quadruped: joint_names: front_left_hip of", LogError)
     other = replace(log, joint_names=("knie", *log.joint_names[1:]))
     refused(lambda: found(case, other), "quadruped: joint_names: unknown name 'knie'", UnknownNameError)
     wrench = replace(log, contact_wrench_world=np.zeros((len(log), 4, 6)))
