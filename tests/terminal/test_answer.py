@@ -36,8 +36,8 @@ def consistent(tmp_path_factory: pytest.TempPathFactory) -> Identification:
 
 @pytest.fixture(scope="module")
 def free(tmp_path_factory: pytest.TempPathFactory) -> Identification:
+    closest = "estimator={name: least_squares, ridge: 0.001, friction: false}"
     with pytest.warns(match="identified.urdf"):
-        closest = "estimator={name: least_squares, ridge: 0.001, friction: false}"
         return run_demo(tmp_path_factory.mktemp("free"), "logs.test=[]", closest)
 
 
