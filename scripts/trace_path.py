@@ -119,7 +119,7 @@ def library_path(file: Path) -> None:
     samples = torchid.bind_log(log, robot, contacts, required=sensor_set)
     builder = torchid.RowBuilder(robot, contacts, sensor_set)
     problem = torchid.linear_problem(torchid.compress([samples], builder), builder, robot)
-    torchid.LeastSquares(ridge=settings["estimator"]["ridge"]).solve(problem)
+    torchid.Consistent(ridge=0.01).solve(problem)
 
 
 def main() -> int:

@@ -23,18 +23,32 @@ def _has_name(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-def _positive_or_auto(value: object) -> float | str | None:
-    try:
-        return value if value is None or value == "auto" else TypeAdapter(Positive).validate_python(value)
-    except ValueError as error:
-        raise ValueError("auto, null, or a number greater than 0") from error
+def _number_or(words: tuple[str | None, ...], number: Any, accepted: str) -> PlainValidator:
+    """A validator of some words, and of a type of number beside them: messages name both."""
 
+    def validate(value: object) -> float | str | None:
+        try:
+            return value if value in words else TypeAdapter(number).validate_python(value)
+        except ValueError as error:
+            raise ValueError(accepted) from error
+
+    return PlainValidator(validate)
+
+
+AUTO: Literal["auto"] = "auto"
+"""A value that the data choose."""
 
 Number = Annotated[float, BeforeValidator(_not_bool), Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
-PositiveOrAuto = Annotated[float | Literal["auto"] | None, PlainValidator(_positive_or_auto)]
+PositiveOrAuto = Annotated[
+    float | Literal["auto"] | None, _number_or((AUTO, None), Positive, "auto, null, or a number greater than 0")
+]
 """A positive number, one that the data choose, or none."""
 NotNegative = Annotated[Number, Field(ge=0.0)]
+NotNegativeOrAuto = Annotated[
+    float | Literal["auto"], _number_or((AUTO,), NotNegative, "auto, or a number of at least 0")
+]
+"""A number that is not negative, or one that the data choose."""
 BelowOne = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Tolerance = Annotated[Number, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, BeforeValidator(_not_bool), Field(ge=1)]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from demo import FAST_ESTIMATOR
 from dialects import DIALECTS, with_velocity
 from refusals import refusal
 from repository import DEMO
@@ -40,7 +41,8 @@ def recorded(name: str) -> Log:
 
 def experiment(folder: Path, dialect: str | None, **more: Any) -> Path:
     """An experiment file with logs in a dialect and their map; None: in the format."""
-    settings = yaml.safe_load((DEMO / "quadruped.yaml").read_text()) | {"output": str(folder / "run")}
+    settings = yaml.safe_load((DEMO / "quadruped.yaml").read_text())
+    settings |= {"output": str(folder / "run"), "estimator": FAST_ESTIMATOR}
     settings["robot"]["urdf"] = str(DEMO / "quadruped.urdf")
     file, text, write = DIALECTS[dialect or PARQUET]
     suffix, logs = Path(file).suffix if dialect else ".npz", {}

@@ -153,7 +153,14 @@ def test_tensorboard_shows_train_and_test_before_and_after(run: Path) -> None:
         scalar = events.Scalars(f"relative_error_{name}/base_force")
         assert [event.step for event in scalar] == [0, 1]
         assert scalar[1].value < scalar[0].value
-    assert set(events.Tags()["images"]) == {"forces", "errors", "parameters", "identifiability", "contributions"}
+    assert set(events.Tags()["images"]) == {
+        "forces",
+        "errors",
+        "parameters",
+        "identifiability",
+        "contributions",
+        "ridge",
+    }
 
 
 def test_tensorboard_shows_what_is_identified_and_by_what(run: Path) -> None:

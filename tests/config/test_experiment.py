@@ -74,7 +74,7 @@ def test_the_least_experiment_has_four_keys_and_the_documented_defaults(file: Pa
     noise = config.sensors.noise
     assert all(x is None for x in dataclasses.asdict(noise).values()), "estimated"
     assert config.sensors.on_base_lost == "error"
-    assert (config.estimator.name, config.estimator.ridge, config.estimator.friction) == ("least_squares", 0.0, True)
+    assert (config.estimator.name, config.estimator.ridge, config.estimator.friction) == ("consistent", "auto", True)
     assert (config.device, config.overwrite) == ("cpu", False)
 
 

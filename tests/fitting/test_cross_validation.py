@@ -96,7 +96,8 @@ def test_parts_of_folds_together_are_those_of_the_logs(demo: tuple[RowBuilder, S
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("runs") / "demo"
-    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={output}", "estimator.ridge=auto"]) == 0
+    closest = "estimator={name: least_squares, ridge: auto}"
+    assert main(["identify", str(DEMO / "quadruped.yaml"), f"output={output}", closest]) == 0
     return output
 
 

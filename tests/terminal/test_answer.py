@@ -31,14 +31,14 @@ def run_demo(folder: Path, *settings: str) -> Identification:
 
 @pytest.fixture(scope="module")
 def consistent(tmp_path_factory: pytest.TempPathFactory) -> Identification:
-    settings = ("estimator.name=consistent", "estimator.ridge=auto")
-    return run_demo(tmp_path_factory.mktemp("consistent"), *settings)
+    return run_demo(tmp_path_factory.mktemp("consistent"))
 
 
 @pytest.fixture(scope="module")
 def free(tmp_path_factory: pytest.TempPathFactory) -> Identification:
+    closest = "estimator={name: least_squares, ridge: 0.001, friction: false}"
     with pytest.warns(match="identified.urdf"):
-        return run_demo(tmp_path_factory.mktemp("free"), "logs.test=[]", "estimator.friction=false")
+        return run_demo(tmp_path_factory.mktemp("free"), "logs.test=[]", closest)
 
 
 def text(run: Identification, width: int = 100) -> str:

@@ -82,7 +82,7 @@ def _output(run: Path, logs: Sequence[str | Path]) -> Path:
     """The folder of an evaluation of some logs.
 
     Raises:
-        ConfigError: the folder is no run, two logs have one name, or something else stands where results go.
+        ConfigError: the folder is no run, two logs have one name, a name that no folder can have, or something else stands where results go.
     """
     if not (run / "config.yaml").is_file():
         raise ConfigError(run, "RUN", "no config.yaml in it", "a folder that torchid identify wrote")
@@ -91,6 +91,10 @@ def _output(run: Path, logs: Sequence[str | Path]) -> Path:
     again = [name for name in names if names.count(name) > 1]
     if again:
         raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
+    if names[0] in (".", ".."):
+        raise ConfigError(
+            "command line", "--log", f"'{logs[0]}', whose name is of dots alone", "another name of the file"
+        )
     output = run / RUN.inner_folder / names[0]
 
     def check() -> None:

@@ -18,6 +18,7 @@ from torchid.errors import (
     join_names,
     warn_about_file,
 )
+from torchid.estimators import LeastSquares
 from torchid.fitting.experiment import Scene
 from torchid.fitting.fit import Fit
 from torchid.fitting.misfit import beyond_models
@@ -65,8 +66,10 @@ def require_plausible(fit: Fit, scene: Scene) -> TotalMass:
     if fit.assembly.homogeneous:
         _require_scales(fit)
     block_error = 0.0 if fit.scatter is None else fit.scatter.mass_error
-    mass = total_mass(fit.assembly, estimate, scene.config.estimator.rank_tolerance, block_error)
-    reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass, scene.robot)
+    tolerance = scene.config.estimator.rank_tolerance
+    by_data = LeastSquares(rank_tolerance=tolerance).solve(fit.assembly.problem)
+    mass, mass_by_data = (total_mass(fit.assembly, x, tolerance, block_error) for x in (estimate, by_data))
+    reason = implausibility(fit.assembly.data or fit.assembly.problem, estimate.phi, mass_by_data, scene.robot)
     unexplained = beyond_models(estimate, fit.assembly.problem, fit.assembly.forces)
     if reason is None and unexplained is None:
         return mass
@@ -129,7 +132,7 @@ def implausibility(problem: LinearProblem, phi: Array, mass: TotalMass, robot: R
     Args:
         problem: that was solved.
         phi: (12 L,), its solution.
-        mass: how well the total mass is known.
+        mass: by the data alone: a ridge and conditions would hide that they want another.
         robot: the robot.
     """
     gain = force_gain(problem)

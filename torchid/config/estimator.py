@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import BeforeValidator, Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from torchid.config.sensors import STRICT
@@ -15,7 +15,7 @@ from torchid.estimators.conditions import EnclosureKind
 from torchid.estimators.conic_formulation import Prior
 from torchid.estimators.consistent import Method
 from torchid.estimators.sgd import Consistency
-from torchid.settings import BelowOne, Count, NotNegative, Number, Positive, Seed, Tolerance
+from torchid.settings import AUTO, BelowOne, Count, NotNegative, NotNegativeOrAuto, Number, Positive, Seed, Tolerance
 
 ESTIMATORS: dict[str, type[LeastSquares | Consistent | Sgd]] = {
     "least_squares": LeastSquares,
@@ -96,22 +96,6 @@ ROBUST_ACCEPTED = f"{', '.join(get_args(Loss))}, or a mapping with loss, tuning 
 Robust = Annotated[RobustConfig, BeforeValidator(_by_loss)]
 
 
-AUTO = "auto"
-"""The ridge that the data choose."""
-
-
-def _number_or_auto(value: object, check: ValidatorFunctionWrapHandler) -> object:
-    try:
-        return value if value == AUTO else check(value)
-    except ValidationError as error:
-        raise ValueError(f"a finite number of at least 0, or {AUTO}") from error
-
-
-if TYPE_CHECKING:
-    Ridge = float | str
-else:
-    Ridge = Annotated[NotNegative, WrapValidator(_number_or_auto)]
-
 Settings = TypeVar("Settings", LeastSquares, Consistent, Sgd)
 
 
@@ -124,8 +108,8 @@ class _FitConfig:
     fit. `total_mass` and `masses` of bodies by name are known, as from a scale.
     """
 
-    name: Literal["least_squares", "consistent", "sgd"] = "least_squares"
-    ridge: Ridge = LeastSquares.ridge
+    name: Literal["least_squares", "consistent", "sgd"] = "consistent"
+    ridge: NotNegativeOrAuto = AUTO
     rank_tolerance: Tolerance = LeastSquares.rank_tolerance
     friction: bool = True
     frozen: list[str] = dataclasses.field(default_factory=list)

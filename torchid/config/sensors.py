@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 from torchid.errors import ConfigError
 from torchid.logs.signal_noise import STATED_FIELDS
 from torchid.problem.extras import CHANNELS
-from torchid.settings import NotNegative, Number, Positive
+from torchid.settings import AUTO, NotNegative, NotNegativeOrAuto, Number, Positive
 
 STRICT = ConfigDict(extra="forbid")
 
@@ -54,14 +54,6 @@ def _plain(value: float | tuple[float, float, float]) -> float | list[float]:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _radius(value: object) -> float | str:
-    """A number of at least 0, or auto."""
-    try:
-        return "auto" if value == "auto" else _NOT_NEGATIVE.validate_python(value)
-    except ValueError as error:
-        raise ValueError("auto, or a number of at least 0 [m]") from error
-
-
 def _normal(value: object) -> list[float] | None:
     """Three numbers, not all 0, or none."""
     try:
@@ -73,7 +65,6 @@ def _normal(value: object) -> list[float] | None:
     return normal
 
 
-_NOT_NEGATIVE: TypeAdapter[float] = TypeAdapter(NotNegative)
 _VECTOR: TypeAdapter[list[float]] = TypeAdapter(Annotated[list[Number], Field(min_length=3, max_length=3)])
 _POSITIVE: TypeAdapter[float] = TypeAdapter(Positive)
 PerAxis = Annotated[float | tuple[float, float, float], PlainValidator(_per_axis), PlainSerializer(_plain)]
@@ -91,7 +82,7 @@ class ContactConfig:
     frame: str
     type: Literal["point", "line", "flat"]
     line_axis: Literal["x", "y", "z"] = "y"
-    radius: Annotated[float | Literal["auto"], PlainValidator(_radius)] = "auto"
+    radius: NotNegativeOrAuto = AUTO
     normal: Annotated[list[float] | None, PlainValidator(_normal)] = None
 
 

@@ -164,7 +164,7 @@ class Scene:
         try:
             return choose_ridge(parts, blocks, fitter, estimators, self.loss)
         except LogError as error:
-            accepted = "a number, or longer logs"
+            accepted = "a number, 0.001 say, or longer logs"
             raise ConfigError.at_field("estimator.ridge", f"auto, but {error.found}", accepted) from error
 
 

@@ -47,8 +47,8 @@ DECISIVE_GROUPS = ("joint_torque", "base_force", "base_moment", WHITENED)
 """Groups of rows by which parameters are compared with the nominal ones."""
 
 ADVICE = (
-    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge (auto "
-    "chooses one), or record more and other motion"
+    "do not use them before you know why: run torchid check on the same file, set a larger estimator.ridge than "
+    "that of its config.yaml, or record more and other motion"
 )
 """Advice for parameters that predict worse than the nominal ones."""
 

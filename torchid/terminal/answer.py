@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchid.commands.results import Identification
+from torchid.errors import join_names
 from torchid.estimators import Estimate
 from torchid.estimators.least_squares import COMBINED, FIXED, IDENTIFIED, PRIOR, UNOBSERVABLE
 from torchid.fitting.calibration import list_confounded
@@ -135,6 +136,11 @@ def _bodies_text(run: Identification) -> str:
             names.append(robot.body_names[one.body])
     count = len(robot.body_names)
     if not run.violations:
+        mass = run.estimate.phi.reshape(-1, PER_BODY)[:, _MASS]
+        moving = slice(int(run.experiment.config.robot.fixed_base), None)
+        empty = [name for name, x in zip(robot.body_names[moving], mass[moving], strict=True) if not x]
+        if empty:
+            return f"all that have mass can exist; MuJoCo refuses those that move without: {join_names(empty)}"
         return f"all {count} can exist, and simulators take them"
     which = f"{len(names)} of {count}" if names else "all together"
     advice = "; estimator.name=consistent finds the best that can" if type(run.estimate) is Estimate else ""
