@@ -17,7 +17,7 @@ from hostile_runs import checkpoints, parameter_files
 from hostile_settings import DOCUMENTS
 
 from torchid.cli import main
-from torchid.commands.training import CHECKPOINT, load_checkpoint
+from torchid.commands.checkpoint import CHECKPOINT, load_checkpoint
 from torchid.estimators.sgd import require_same_structure
 from torchid.report.parameter_files import read_parameters
 from torchid.robot import load_robot

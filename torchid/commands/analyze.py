@@ -67,7 +67,7 @@ class ScenarioAnalysis:
 
 @dataclass(frozen=True)
 class Analysis:
-    """Results by scenario, and the accuracy of sensor sets on logs.
+    """Results by scenario, the accuracy of sensor sets on logs, and the folder that they were written to, if any.
 
     Of processes that share the work, the first alone has the scenarios: to look for sensors is the work of one.
     """
@@ -75,7 +75,7 @@ class Analysis:
     scene: Scene
     scenarios: tuple[ScenarioAnalysis, ...]
     accuracies: dict[str, SetAccuracy]
-    output: Path
+    output: Path | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,18 +129,16 @@ class AnalysisRequest:
 
 
 def analyze(config: AnalyzeConfig) -> Analysis:
-    """Plan and check sensors as an experiment file says under `analysis`, and write a folder with the results.
+    """Plan and check sensors as an experiment file says under `analysis`, and write a folder if there is an output.
 
     Raises:
         InputError: whatever does not fit; nothing has been written then.
     """
-    output = analysis_folder(config.output)
-    if not config.output.name:
-        found = f"'{config.output}', no name for a folder"
-        raise ConfigError.at_field("output", found, "a path to a new folder")
     if config.logs is not None:
         config.logs.require_samples("analyze")
-    ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
+    output = None if config.output is None else analysis_folder(config.output)
+    if output is not None:
+        ranks.from_first(partial(check_free, output, config.overwrite, ANALYSIS, inputs_of(config)), "output")
     scene = set_up_scene(config)
     request = AnalysisRequest.of(scene)
     with progress_bars() as bars:
@@ -161,13 +159,20 @@ def analyze(config: AnalyzeConfig) -> Analysis:
         sets = ranks.from_first(plan, "sensor sets")
         compared = accuracies(scene, sets, train, test, bars) if train else {}
         analysis = Analysis(scene, tuple(results), compared, output)
-        bars.add_task("writing", total=None)
-        ranks.from_first(partial(write_analysis, analysis), "analysis folder")
+        if output is not None:
+            bars.add_task("writing", total=None)
+            ranks.from_first(partial(write_analysis, analysis, output, config.overwrite), "analysis folder")
     return analysis
 
 
 def analysis_folder(output: Path) -> Path:
-    """Where an analysis goes: beside the run of the same experiment file."""
+    """Where an analysis goes: beside the run of the same experiment file.
+
+    Raises:
+        ConfigError: the output has no name.
+    """
+    if not output.name:
+        raise ConfigError.at_field("output", f"'{output}', no name for a folder", "a path to a new folder")
     return output.parent / f"{output.name}.analysis"
 
 
@@ -288,8 +293,8 @@ def is_planned(plan: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]
     return same and not planned_along_normals(plan, contacts)
 
 
-def write_analysis(analysis: Analysis) -> None:
-    """Write the folder."""
+def write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
+    """Write the folder; one that stands there may be replaced with `overwrite`."""
     scene, names = analysis.scene, analysis.scene.robot.body_names
     document: dict[str, Any] = {"scenarios": {}, "accuracy": None}
     texts, figures = [], {}
@@ -305,7 +310,7 @@ def write_analysis(analysis: Analysis) -> None:
     if analysis.accuracies:
         document["accuracy"] = {name: accuracy.as_dict() for name, accuracy in analysis.accuracies.items()}
         figures["accuracy"] = accuracy_figure(analysis.accuracies)
-    with during("writing", analysis.output), new_folder(analysis.output, scene.config.overwrite, ANALYSIS) as folder:
+    with during("writing", output), new_folder(output, overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(scene.config))
         write_json(folder / "analysis.json", document)
         (folder / "base_parameters.txt").write_text("\n\n".join(texts))
