@@ -20,7 +20,7 @@ from torchid.commands.folder import ANALYSIS, check_free, new_folder, write_json
 from torchid.commands.reading import LogReader, check_parts
 from torchid.commands.sensor_set_accuracy import accuracies
 from torchid.config import AnalyzeConfig, dump_config, inputs_of
-from torchid.errors import ConfigError, SensorError, UnknownNameError, during, warn
+from torchid.errors import ConfigError, SensorError, UnknownNameError, during, join_names, warn
 from torchid.fitting.experiment import Scene, set_up_scene, with_noise
 from torchid.identifiability.base_parameters import BaseParameters, base_parameters
 from torchid.parameters import WRENCH_COMPONENTS
@@ -40,6 +40,7 @@ from torchid.report.analysis import (
 )
 from torchid.report.figures import save_figure, tree_figure
 from torchid.report.tables import progress_bars
+from torchid.reprs import short_repr
 from torchid.sensing import Contact, SensorSet
 from torchid.sensing.sensors import NORMAL_FORCE
 from torchid.sensor_planning.demands import Candidate, candidates, count_channels, sensor_set
@@ -64,6 +65,15 @@ class ScenarioAnalysis:
     proposed: tuple[BaseObservability, ...] | None
     base: BaseParameters
 
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        plan = self.plan
+        proof = "no cheaper set exists" if plan.proven else "not proven to be the cheapest"
+        names = join_names([one.name for one in plan.chosen])
+        what = f"{len(plan.chosen)} sensors at a cost of {plan.cost:g} ({proof}): {names}"
+        return f"{self.name}, {len(self.states)} contact states, {what}"
+
 
 @dataclass(frozen=True)
 class Analysis:
@@ -76,6 +86,25 @@ class Analysis:
     scenarios: tuple[ScenarioAnalysis, ...]
     accuracies: dict[str, SetAccuracy]
     output: Path | None
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        sets = f"; accuracy of {join_names(list(self.accuracies))}" if self.accuracies else ""
+        chosen = [f"{one.name}: {len(one.plan.chosen)} sensors, cost {one.plan.cost:g}" for one in self.scenarios]
+        return f"{self.scene.robot.path.name}; {'; '.join(chosen)}{sets}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """What `analysis.json` has."""
+        names, scenarios = self.scene.robot.body_names, {}
+        for scenario in self.scenarios:
+            proposed = scenario.proposed
+            scenarios[scenario.name] = sensor_plan_document(scenario.plan) | {
+                "proposed": None if proposed is None else observability_document(proposed),
+                "base_parameters": base_parameters_document(scenario.base, names),
+            }
+        accuracies = {name: accuracy.as_dict() for name, accuracy in self.accuracies.items()}
+        return {"scenarios": scenarios, "accuracy": accuracies or None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,23 +325,16 @@ def is_planned(plan: SensorPlan, sensors: SensorSet, contacts: Sequence[Contact]
 def write_analysis(analysis: Analysis, output: Path, overwrite: bool = False) -> None:
     """Write the folder; one that stands there may be replaced with `overwrite`."""
     scene, names = analysis.scene, analysis.scene.robot.body_names
-    document: dict[str, Any] = {"scenarios": {}, "accuracy": None}
     texts, figures = [], {}
     for scenario in analysis.scenarios:
-        plan, proposed = scenario.plan, scenario.proposed
-        document["scenarios"][scenario.name] = sensor_plan_document(plan) | {
-            "proposed": None if proposed is None else observability_document(proposed),
-            "base_parameters": base_parameters_document(scenario.base, names),
-        }
-        which = "planned" if proposed is None else "proposed"
+        which = "planned" if scenario.proposed is None else "proposed"
         texts.append(base_parameters_text(f"{scenario.name}, {which} sensors", scenario.base, names))
         figures[f"sensors-{scenario.name}"] = _picture(scene, scenario)
     if analysis.accuracies:
-        document["accuracy"] = {name: accuracy.as_dict() for name, accuracy in analysis.accuracies.items()}
         figures["accuracy"] = accuracy_figure(analysis.accuracies)
     with during("writing", output), new_folder(output, overwrite, ANALYSIS) as folder:
         (folder / "config.yaml").write_text(dump_config(scene.config))
-        write_json(folder / "analysis.json", document)
+        write_json(folder / "analysis.json", analysis.to_dict())
         (folder / "base_parameters.txt").write_text("\n\n".join(texts))
         for name, figure in figures.items():
             save_figure(figure, folder / f"{name}.png")

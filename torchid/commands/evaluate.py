@@ -24,10 +24,12 @@ from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
 from torchid.problem import Metrics
+from torchid.problem.metrics import DECISIVE_GROUPS, describe_errors
 from torchid.report.figures import error_figure, save_figure
 from torchid.report.forces import ForceSeries
 from torchid.report.parameter_files import read_parameters, read_shared_extras
 from torchid.report.tables import progress_bars
+from torchid.reprs import short_repr
 from torchid.robot import Robot
 
 
@@ -48,6 +50,17 @@ class EvaluatedRun:
     forces: ForceSeries
     robot: Robot
     output: Path | None = None
+
+    __repr__ = short_repr
+
+    def _headline(self) -> str:
+        texts = [
+            f"{name}: {describe_errors(group, pair.identified.rms.get(group), pair.nominal.rms.get(group))}"
+            for name, pair in self.metrics.items()
+            for group in DECISIVE_GROUPS
+            if pair.identified.rms.get(group) is not None
+        ]
+        return f"identified against URDF; {'; '.join(texts)}"
 
     def to_dict(self) -> dict[str, dict[str, object]]:
         """What `metrics.json` has, by name of a log."""
@@ -181,10 +194,10 @@ def _log_names(logs: Sequence[str | Path]) -> list[str]:
     """
     names = [split_range(log).name for log in logs]
     if not names:
-        raise ConfigError("command line", "--log", "no log", "logs to evaluate")
+        raise ConfigError.at_field("logs", "none", "logs to evaluate")
     again = [name for name in names if names.count(name) > 1]
     if again:
-        raise ConfigError("command line", "--log", f"several logs named '{again[0]}'", "logs of different names")
+        raise ConfigError.at_field("logs", f"several logs named '{again[0]}'", "logs of different names")
     return names
 
 

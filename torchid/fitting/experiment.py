@@ -30,6 +30,7 @@ from torchid.problem import Evaluation, ExtraTerms, RowBuilder, Samples
 from torchid.problem.compressed_log import Block
 from torchid.problem.compression import Part
 from torchid.problem.sampled_rows import LogElsewhere
+from torchid.reprs import short_repr
 from torchid.robot import Robot, body_extents, load_robot, mirror_pairs
 from torchid.robot.tree import FT_FIELD
 from torchid.sensing import Contact, SensorNoise, SensorSet, chosen_sensors, named_sensors, with_ft_sensors
@@ -53,6 +54,8 @@ class Scene:
     robot: Robot
     contacts: tuple[Contact, ...]
     rolling: str = ""
+
+    __repr__ = short_repr
 
     @property
     def noise(self) -> SensorNoise:
@@ -168,7 +171,7 @@ class Scene:
             raise ConfigError.at_field("estimator.ridge", f"auto, but {error.found}", accepted) from error
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Experiment(Scene):
     """A scene with the sensors of its fit."""
 
