@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +16,7 @@ from torchid.commands.evaluate import evaluate as evaluate_folder
 from torchid.commands.identify import identify as identify_settings
 from torchid.commands.results import Identification
 from torchid.config import load_analysis, load_config
-from torchid.config.keywords import FileName, Sections, plain_sections
+from torchid.config.keywords import Sections, StrPath, plain_sections
 from torchid.errors import ConfigError, UnknownNameError, about_file
 from torchid.log_checks import Checked
 from torchid.log_checks.check import check as check_samples
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 _OF_LOG = {"urdf", "base_link", "fixed_base"}
 
 
-def identify(file: FileName | None = None, /, *, resume: bool = False, **sections: Unpack[Sections]) -> Identification:
+def identify(file: StrPath | None = None, /, *, resume: bool = False, **sections: Unpack[Sections]) -> Identification:
     """Identify a robot's parameters, as `torchid identify` does.
 
     For example::
@@ -56,7 +57,7 @@ def identify(file: FileName | None = None, /, *, resume: bool = False, **section
 
 
 def evaluate(
-    run: FileName | Identification, logs: FileName | Sequence[FileName], device: str | None = None, write: bool = False
+    run: StrPath | Identification, logs: StrPath | Sequence[StrPath], device: str | None = None, write: bool = False
 ) -> EvaluatedRun:
     """Evaluate the parameters of a run on further logs, as `torchid evaluate` does.
 
@@ -69,20 +70,18 @@ def evaluate(
     Raises:
         InputError: a folder that is no run, or a log that does not fit its robot.
     """
-    paths = [Path(logs)] if isinstance(logs, (str, Path)) else [Path(log) for log in _listed(logs)]
+    paths = [Path(log) for log in ([logs] if isinstance(logs, (str, os.PathLike)) else logs)]
     with _about("evaluate", None):
         if isinstance(run, Identification):
             if not write:
                 return evaluate_identification(run, paths, device)
             if run.experiment.config.output is None:
-                raise ConfigError.at_field(
-                    "write", "True, of a run without a folder", "the folder of run.write(folder)"
-                )
+                raise ConfigError.at_field("write", "True, of a run without a folder", "run.write(folder) before")
             run = run.experiment.config.output
         return evaluate_folder(Path(run), paths, device, write)
 
 
-def analyze(file: FileName | None = None, /, **sections: Unpack[Sections]) -> Analysis:
+def analyze(file: StrPath | None = None, /, **sections: Unpack[Sections]) -> Analysis:
     """Analyze what sensors and motion determine, and plan sensors, as `torchid analyze` does.
 
     Args:
@@ -107,10 +106,10 @@ def check(
 
 
 @overload
-def check(what: FileName | None = None, **sections: Unpack[Sections]) -> CheckedLogs: ...
+def check(what: StrPath | None = None, **sections: Unpack[Sections]) -> CheckedLogs: ...
 
 
-def check(what: Log | FileName | None = None, *of_log: Any, **sections: Any) -> Checked | CheckedLogs:
+def check(what: Log | StrPath | None = None, *of_log: Any, **sections: Any) -> Checked | CheckedLogs:
     """Check logs for errors, as `torchid check` does.
 
     Args:
@@ -123,6 +122,8 @@ def check(what: Log | FileName | None = None, *of_log: Any, **sections: Any) -> 
     """
     if isinstance(what, Log):
         return check_samples(what, *of_log, **sections)
+    if of_log:
+        raise TypeError("check: robot and contacts by position go with a Log; of files they are keywords")
     with _about("check", what):
         if what is None or Path(what).suffix.lower() in EXPERIMENTS:
             return CheckedLogs(check_experiment(_path(what), (), sections))
@@ -131,22 +132,17 @@ def check(what: Log | FileName | None = None, *of_log: Any, **sections: Any) -> 
         robot = plain_sections(sections).get("robot", {})
         robot = {"urdf": robot} if isinstance(robot, str) else robot
         if not isinstance(robot, Mapping) or not robot.keys() <= _OF_LOG or (robot and "urdf" not in robot):
-            raise ConfigError.at_field(
-                "robot", f"found {robot!r}", "a URDF, or {urdf: ..., base_link: ..., fixed_base: ...}"
-            )
+            accepted = "a URDF, or a mapping with urdf, and base_link or fixed_base"
+            raise ConfigError.at_field("robot", f"found {robot!r}", accepted)
         return CheckedLogs([check_log(Path(what), **robot)])
 
 
 @contextmanager
-def _about(function: str, file: FileName | None) -> Iterator[None]:
+def _about(function: str, file: StrPath | None) -> Iterator[None]:
     """Let errors be about the file, or the function where there is none."""
     with about_file(f"torchid.{function}" if file is None else file):
         yield
 
 
-def _path(file: FileName | None) -> Path | None:
+def _path(file: StrPath | None) -> Path | None:
     return None if file is None else Path(file)
-
-
-def _listed(logs: object) -> Sequence[Any]:
-    return logs if isinstance(logs, (list, tuple)) else [logs]

@@ -251,6 +251,14 @@ def test_a_missing_keyword_is_named(result: torchid.Identification) -> None:
         torchid.check(robot=DEMO / "quadruped.urdf")
     with pytest.raises(ConfigError, match="^torchid.evaluate: logs: none; accepted: logs to evaluate"):
         torchid.evaluate(result, [])
+    with pytest.raises(ConfigError, match="^torchid.evaluate: device: 'tpu' is not available here; accepted: cpu, "):
+        torchid.evaluate(result, DEMO / "sway_test.npz", device="tpu")
+    with pytest.raises(ConfigError, match="^torchid.evaluate: write: True, of a run without a folder; accepted: run.w"):
+        torchid.evaluate(result, DEMO / "sway_test.npz", write=True)
+    with pytest.raises(UnknownNameError, match="sway_test.npz: key: 'logs', which goes with an experiment"):
+        torchid.check(DEMO / "sway_test.npz", logs=[])
+    with pytest.raises(ConfigError, match="sway_test.npz: robot: found {'base_link': 'a'}; accepted: a URDF, or a map"):
+        torchid.check(DEMO / "sway_test.npz", robot={"base_link": "a"})
     with pytest.raises(ConfigError, match="^nowhere.yaml: file: cannot be read"):
         torchid.identify("nowhere.yaml")
 

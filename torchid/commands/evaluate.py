@@ -19,7 +19,7 @@ from torchid.config import load_config
 from torchid.errors import ConfigError, about_file, during, warn
 from torchid.fitting.calibration import Calibration, Comparison
 from torchid.fitting.cross_validation import Scorer
-from torchid.fitting.experiment import Experiment, set_up
+from torchid.fitting.experiment import Experiment, require_device, set_up
 from torchid.guards import MAX_JSON, MAX_YAML, read_bytes
 from torchid.logs.time_range import split_range
 from torchid.parameters import Array
@@ -128,6 +128,7 @@ def evaluate_identification(run: Identification, logs: Sequence[str | Path], dev
     """As `evaluate`, of a run that need not have been written; nothing is."""
     experiment = run.experiment
     if device is not None:
+        require_device(device)
         experiment = replace(experiment, config=replace(experiment.config, device=device))
     shared = [(one.extra.label, one) for one in run.extras if not one.log]
     values = Comparison({x: one.nominal_value for x, one in shared}, {x: one.value for x, one in shared})

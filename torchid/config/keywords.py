@@ -12,14 +12,14 @@ from torchid.config.reading import Settings, check_text
 from torchid.errors import ConfigError, excerpt
 from torchid.guards import MAX_DEPTH
 
-FileName = str | os.PathLike[str]
+StrPath = str | os.PathLike[str]
 
 
 class Sections(TypedDict, total=False):
     """The keys of an experiment file, with values as Python has them."""
 
-    robot: FileName | Mapping[str, object]
-    logs: FileName | Sequence[FileName | Mapping[str, object]] | Mapping[str, object]
+    robot: StrPath | Mapping[str, object]
+    logs: StrPath | Sequence[StrPath | Mapping[str, object]] | Mapping[str, object]
     sensors: str | Mapping[str, object]
     contacts: Sequence[Mapping[str, object]]
     preprocessing: Mapping[str, object]
@@ -27,7 +27,7 @@ class Sections(TypedDict, total=False):
     estimator: Mapping[str, object]
     analysis: Mapping[str, object]
     device: str
-    output: FileName | None
+    output: StrPath | None
     overwrite: bool
 
 

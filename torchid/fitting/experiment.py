@@ -194,17 +194,21 @@ def with_noise(scene: S, summary: NoiseSummary) -> S:
     return stated
 
 
+def require_device(device: str) -> None:
+    """Refuse a device that this machine has not."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError.at_field("device", f"'{device}' is not available here", "cpu, cuda, cuda:0, ...") from error
+
+
 def set_up_scene(config: ExperimentConfig | AnalyzeConfig) -> Scene:
     """Load the robot of an experiment file and look its contacts up.
 
     Raises:
         InputError: whatever in the file does not fit the robot.
     """
-    try:
-        torch.empty(0, device=config.device)
-    except (RuntimeError, AssertionError) as error:
-        found = f"'{config.device}' is not available here"
-        raise ConfigError.at_field("device", found, "cpu, cuda, cuda:0, ...") from error
+    require_device(config.device)
     try:
         of = config.robot
         robot = load_robot(of.urdf, of.base_link, of.fixed_base, _ft_joints(config), of.weld)
