@@ -7,9 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import wrap
 
-import numpy as np
-import torch
-
 from torchid.errors import join_names
 
 LINES, _WIDTH = 10, 110
@@ -44,8 +41,8 @@ def _fields(thing: object, title: str) -> Iterator[str]:
 
 def _brief(value: object) -> str:
     """A value in a few words, "" for one that says nothing."""
-    if isinstance(value, (np.ndarray, torch.Tensor)):
-        return str(tuple(value.shape))
+    if (shape := getattr(value, "shape", None)) is not None and hasattr(value, "dtype"):  # of NumPy or torch
+        return str(tuple(shape))
     if value is None or (isinstance(value, (str, Sequence, Mapping, frozenset)) and not len(value)):
         return ""
     if isinstance(value, (bool, int, float)):
