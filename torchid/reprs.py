@@ -15,14 +15,17 @@ _TEXT = 60  # characters of one value
 
 
 def short_repr(thing: object) -> str:
-    """The class with its `_headline()`, if it has one, and below what its fields hold: numbers, names, shapes.
+    """The class with its `_headline()`, if it has one, and what its fields hold: numbers, names, shapes.
 
     `__repr__ = short_repr` in the body of a class; a dataclass keeps it. What is None or empty is left out.
     """
-    headline = getattr(thing, "_headline", None)
-    title = type(thing).__name__ + (f": {headline()}" if headline is not None else "")
-    lines = wrap(title, _WIDTH, subsequent_indent="  ")
-    lines += wrap(", ".join(_fields(thing, title)), _WIDTH, initial_indent="  ", subsequent_indent="  ")
+    name, headline = type(thing).__name__, getattr(thing, "_headline", None)
+    if headline is None:
+        lines = wrap(f"{name}({', '.join(_fields(thing, ''))})", _WIDTH, subsequent_indent="  ")
+    else:
+        title = f"{name}: {headline()}"
+        lines = wrap(title, _WIDTH, subsequent_indent="  ")
+        lines += wrap(", ".join(_fields(thing, title)), _WIDTH, initial_indent="  ", subsequent_indent="  ")
     lines = [line.replace(_UNBROKEN, " ") for line in lines]
     return "\n".join(lines if len(lines) <= LINES else [*lines[: LINES - 1], "  ..."])
 

@@ -22,6 +22,7 @@ from torchid.report import identified_urdf
 
 FILE = DEMO / "quadruped.yaml"
 KNEE, SHANK = "front_left_knee", "front_left_shank_link"
+LOG = torchid.Log(source="log", time=np.zeros(1), joint_names=("a",), joint_position=np.zeros((1, 1)))
 UNPHYSICAL = "ignore:identified.urdf:torchid.errors.TorchidWarning"
 
 
@@ -230,6 +231,7 @@ def test_an_analysis_has_what_the_command_writes(tmp_path: Path) -> None:
         ({"logs": "no*.npz"}, ConfigError, "torchid.identify: logs.train: no file matches"),
         ({"logs": ["none.npz"]}, LogError, "none.npz: file: no such file"),
         ({"logs": [object()]}, ConfigError, "torchid.identify: logs.0: found <object"),
+        ({"logs": {"train": [LOG]}}, ConfigError, "experiment file; torchid.write_log makes a file of a Log"),
         ({"robot": "${oc.env:HOME}/x.urdf"}, ConfigError, "torchid.identify: robot: '${oc.env:HOME}/x.urdf', but"),
         ({"robot": None}, ConfigError, "torchid.identify: robot: found None; accepted: a mapping with urdf"),
         ({"overwrite": "often"}, ConfigError, "torchid.identify: overwrite: found 'often'"),

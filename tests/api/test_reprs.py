@@ -125,4 +125,4 @@ def test_what_says_nothing_is_left_out_and_what_is_long_is_cut() -> None:
     many = torchid.Conditions(names=tuple(f"body{number}" for number in range(1000)))
     assert "and 996 more" in repr(many)
     assert len(repr(many).splitlines()) <= 2
-    assert short_repr(torch.zeros(3)) == "Tensor"
+    assert short_repr(torch.zeros(3)) == "Tensor()"

@@ -11,6 +11,7 @@ import numpy as np
 from torchid.config.reading import Settings, check_text
 from torchid.errors import ConfigError, excerpt
 from torchid.guards import MAX_DEPTH
+from torchid.logs import Log
 
 StrPath = str | os.PathLike[str]
 
@@ -62,4 +63,5 @@ def _plain(value: object, field: str, depth: int) -> Any:
         return str(value)
     if value is None or isinstance(value, (bool, int, float)):
         return value
-    raise ConfigError.at_field(field, f"found {excerpt(repr(value))}", _ACCEPTED)
+    accepted = f"{_ACCEPTED}; torchid.write_log makes a file of a Log" if isinstance(value, Log) else _ACCEPTED
+    raise ConfigError.at_field(field, f"found {excerpt(' '.join(repr(value).split()))}", accepted)
