@@ -189,7 +189,8 @@ def run_lines(run: Identification) -> list[str]:
     counts = ", ".join(f"{count} {verdict}" for verdict, count in estimate.verdict_counts().items() if count)
     said = [("data", f"{format_count(run.samples, 'sample')} of {format_count(len(config.logs.train), 'log')}")]
     said += [("parameters", f"{estimate.phi.size}: {counts}")]
-    said += [("total mass", f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)")]
+    if not robot.fixed_base:
+        said.append(("total mass", f"{run.mass} (URDF: {run.mass.nominal:.3f} kg)"))
     sets = {name: (pair.identified, pair.nominal) for name, pair in run.metrics.items()}
     if run.validation is not None:
         sets["left out"] = (run.validation.identified, run.validation.nominal)
