@@ -188,7 +188,7 @@ def _analyze(options: argparse.Namespace) -> None:
         from torchid.config import load_analysis
         from torchid.report.analysis import accuracy_table, confounded_lines
         from torchid.report.tables import print_tables
-        from torchid.terminal.lines import print_rolling, written_to
+        from torchid.terminal.lines import print_rolling
 
     analysis = analyze(load_analysis(options.file, options.overrides))
     print_rolling(analysis.scene.rolling)
@@ -198,7 +198,7 @@ def _analyze(options: argparse.Namespace) -> None:
         print_tables(accuracy_table(analysis.accuracies))
         for line in confounded_lines(analysis.accuracies):
             print(line)
-    print(f"written to    {written_to(analysis.output)}")
+    print(f"written to    {analysis.output}")
 
 
 def _print_scenario(scenario: ScenarioAnalysis) -> None:

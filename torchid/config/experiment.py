@@ -80,7 +80,7 @@ class ActuatorsConfig:
 
 @dataclass(config=STRICT, frozen=True, kw_only=True)
 class _Common:
-    """The keys of identification and analysis alike; without an `output` (null) nothing is written."""
+    """The keys of identification and analysis alike; no `output`, as Python alone may say: nothing is written."""
 
     robot: RobotConfig
     sensors: Sensors = dataclasses.field(default_factory=SensorsConfig)
@@ -213,7 +213,10 @@ def _loaded(
     given = plain_sections(sections or {})
     if path is None:
         return load(kind, None, overrides, {"output": None} | given), nullcontext()
-    return load(kind, Path(path), overrides, given), about_file(path)
+    config, about = load(kind, Path(path), overrides, given), about_file(path)
+    if config.output is None and given.get("output", config) is not None:  # left empty in the file or by the shell
+        raise ConfigError(path, "output", "found None", "a path")
+    return config, about
 
 
 def inputs_of(config: ExperimentConfig | AnalyzeConfig) -> list[Path]:

@@ -20,7 +20,7 @@ from torchid.problem import Metrics
 from torchid.problem.metrics import ADVICE, DECISIVE_GROUPS, ERROR_GROUPS, describe_worse
 from torchid.report.tables import noise_advice, table_text, terminal_width
 from torchid.robot import Robot
-from torchid.terminal.lines import LABEL, written_to
+from torchid.terminal.lines import LABEL
 
 LINES = 20
 """At most so many."""
@@ -63,7 +63,7 @@ def answer_lines(run: Identification, width: int) -> list[str]:
         lines += _labelled("attention", one, width)
     if len(attention) > _MOST_ATTENTION:
         lines += _labelled("", f"and {len(attention) - _MOST_ATTENTION} more: --verbose", width)
-    end = [f"{'written to':{LABEL}}{written_to(run.experiment.config.output)}"]
+    end = [f"{'written to':{LABEL}}{run.experiment.config.output}"]
     bodies = _body_lines(run.experiment.robot, run.estimate, LINES - len(lines) - len(end) - 1, width)
     return [*lines, *(["", *bodies] if bodies else []), *end]
 

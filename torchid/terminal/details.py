@@ -22,7 +22,7 @@ from torchid.report.tables import (
     verdict_table,
     violation_table,
 )
-from torchid.terminal.lines import print_labelled, print_noise, print_rolling, written_to
+from torchid.terminal.lines import print_labelled, print_noise, print_rolling
 
 
 def print_details(run: Identification) -> None:
@@ -53,7 +53,7 @@ def print_details(run: Identification) -> None:
     print_labelled("time", f"{run.samples} samples: {timed}")
     if run.reused:
         print_labelled("from cache", ", ".join(run.reused))
-    print(f"written to    {written_to(run.experiment.config.output)}")
+    print(f"written to    {run.experiment.config.output}")
 
 
 def _print_worse(worse: list[WorseThanNominal]) -> None:

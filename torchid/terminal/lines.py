@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 from textwrap import fill
 
 from torchid.fitting.noise import NoiseSummary
@@ -11,11 +10,6 @@ from torchid.report.tables import WIDTH, noise_advice, noise_table, print_tables
 
 LABEL = 14
 """Columns of the words before what they are about."""
-
-
-def written_to(output: Path | None) -> str:
-    """Where results are, or why they are nowhere."""
-    return "nothing (output: null)" if output is None else str(output)
 
 
 def print_labelled(label: str, text: str) -> None:
